@@ -49,6 +49,7 @@ from deltalight.protocol.scene import SceneDocument, parse_scene, resolve_asset
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 RECORD_TOPICS = (FRAME_TOPIC, FISHEYE_RECORD_TOPIC)
+LAST_NS = 2**63 - 1  # of times in arrays, which have a sign; those of MCAP have none
 RECORD_HEAD = struct.Struct("<BQ")
 # Exceptions of the mcap package for damaged records (the last three come from wrong offsets and lengths).
 DAMAGE = (McapError, ZstdError, struct.error, ValueError, LookupError, OverflowError, OSError, MemoryError)
@@ -89,6 +90,10 @@ class RecordingReader:
         self._ends_ns = np.array([span.end_ns for span in self._spans], np.uint64)
         if not self.timestamps_ns:
             raise DeltalightError(f"{path} holds no complete Deltalight frame; record it again.")
+        if self.timestamps_ns[-1] > LAST_NS:
+            raise DeltalightError(
+                f"{path} has a frame after the year 2262, so it is damaged; record it again."
+            )
         session = self._read_session()
         self.board = board or session.board
         self.extrinsics = Extrinsics.from_dict(session.extrinsics, str(path))

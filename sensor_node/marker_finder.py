@@ -1,8 +1,8 @@
 """Marker detection in pictures, and the two poses of a flat target, for board, lamps and calibration."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +26,13 @@ LEAST_SIDE_PX = 10
 Quads = dict[int, Float64[np.ndarray, "4 2"]]
 
 
+class Seen(NamedTuple):
+    """Corners of markers that were read, by id, and of quads of which nothing was read (pixels, clockwise)."""
+
+    quads: Quads
+    unread: Float64[np.ndarray, "n 4 2"]
+
+
 class MarkerFinder:
     """Finds the markers of one board's dictionary and refines their corners."""
 
@@ -34,14 +41,18 @@ class MarkerFinder:
 
     def quads(self, gray: UInt8[np.ndarray, "h w"], wanted: Collection[int]) -> Quads:
         """Return the corners of every wanted marker that is large enough to be read, by id."""
-        found, ids, _ = self._detector.detectMarkers(gray)
-        named = zip(() if ids is None else ids.ravel(), found, strict=True)
-        quads = {int(name): quad.reshape(4, 2).astype(np.float64) for name, quad in named}
-        return {
-            name: quad
-            for name, quad in quads.items()
-            if name in wanted and shortest_side(quad) >= LEAST_SIDE_PX
-        }
+        return self.seen(gray, wanted).quads
+
+    def seen(self, gray: UInt8[np.ndarray, "h w"], wanted: Collection[int]) -> Seen:
+        """Return the wanted markers that are large enough to be read, and what may be others, of the same size."""
+        found, ids, others = self._detector.detectMarkers(gray)
+        names = [] if ids is None else ids.ravel().tolist()
+        quads, unread = _stacked(found), _stacked(others)
+        read = zip(names, quads, shortest_sides(quads), strict=True)
+        return Seen(
+            {name: quad for name, quad, side in read if name in wanted and side >= LEAST_SIDE_PX},
+            unread[shortest_sides(unread) >= LEAST_SIDE_PX],
+        )
 
     def refined(
         self, light: Float32[np.ndarray, "h w"], camera: CameraModel, corners: Float64[np.ndarray, "n 4 2"]
@@ -67,7 +78,7 @@ class MarkerFinder:
         if ids is None:
             return np.zeros(0, np.int64), np.zeros((0, 2))
         # The window must not reach the markers, which begin half a separation away.
-        side = min(shortest_side(quad) for quad in quads.values())
+        side = float(shortest_sides(np.array(list(quads.values()))).min())
         gap = side * self._board.separation_m / self._board.marker_length_m / 2
         half = int(np.clip(round(WINDOW_FRACTION * gap), *WINDOW_HALF_PX))
         start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
@@ -91,9 +102,13 @@ class MarkerFinder:
         )
 
 
-def shortest_side(quad: Float64[np.ndarray, "4 2"]) -> float:
-    """Return the shortest side of a quad, in pixels."""
-    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())
+def _stacked(found: Sequence[np.ndarray]) -> Float64[np.ndarray, "n 4 2"]:
+    return np.array(found, np.float64).reshape(-1, 4, 2)
+
+
+def shortest_sides(quads: Float64[np.ndarray, "*n 4 2"]) -> Float64[np.ndarray, " *n"]:
+    """Return the shortest side of each quad, in pixels."""
+    return np.asarray(np.linalg.norm(quads - np.roll(quads, 1, axis=-2), axis=-1).min(axis=-1))
 
 
 def linear_luminance(

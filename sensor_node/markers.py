@@ -11,7 +11,13 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose
 from deltalight.protocol.poses import rigid_matrix
-from deltalight.sensor_node.marker_finder import MarkerFinder, linear_luminance, planar_poses
+from deltalight.sensor_node.marker_finder import (
+    MarkerFinder,
+    Quads,
+    linear_luminance,
+    planar_poses,
+    shortest_sides,
+)
 
 # Corners with larger residuals, and above three times the median, are occluded and left out.
 OUTLIER_PX, OUTLIER_MEDIANS = 1.5, 3.0
@@ -20,6 +26,9 @@ MAX_ERROR_PX = 8.0
 # Solutions of the planar ambiguity are told apart by history if their errors, each with the noise of a corner added,
 # differ by less than this factor.
 AMBIGUOUS_RATIO, CORNER_NOISE_PX = 1.5, 0.05
+# A quad is the marker expected there if no corner is farther off: less than the inner edge of the border (1/6 of
+# the side away in either direction) of what can be read.
+NEAR_PX, NEAR_FRACTION = 1.0, 0.1
 
 
 class _Matches(NamedTuple):
@@ -31,6 +40,9 @@ class _Matches(NamedTuple):
 
     def only(self, kept: Bool[np.ndarray, " n"]) -> "_Matches":
         return _Matches(*(values[kept] for values in self))
+
+    def with_(self, others: "_Matches") -> "_Matches":
+        return _Matches(*(np.concatenate(both) for both in zip(self, others, strict=True)))
 
 
 class _Solution(NamedTuple):
@@ -83,20 +95,48 @@ class BoardDetector:
 
     def _find(self, color: UInt8[np.ndarray, "h w 3"]) -> _Matches | None:
         gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
-        quads = self._finder.quads(gray, self._corners)
+        quads, unread = self._finder.seen(gray, self._corners)
         if not quads:
             return None
         light = linear_luminance(color, self._response)
         if self._board.type == "charuco":
             numbers, pixels = self._finder.inner_corners(gray, light, quads)
-            world = self._chessboard[numbers]
-        else:
-            world = np.concatenate([self._corners[name] for name in quads])
-            corners = np.array(list(quads.values()))
-            pixels = self._finder.refined(light, self._camera, corners).reshape(-1, 2)
-        if len(world) < 4:
-            return None
+            if len(numbers) < 4:
+                return None
+            return _Matches(self._chessboard[numbers], pixels, self._camera.unproject(pixels))
+        matches = self._matched(light, quads)
+        others = self._recognized(matches, quads, unread)
+        return matches.with_(self._matched(light, others)) if others else matches
+
+    def _matched(self, light: Float32[np.ndarray, "h w"], quads: Quads) -> _Matches:
+        """Match markers' corners, refined."""
+        world = np.concatenate([self._corners[name] for name in quads])
+        corners = np.array(list(quads.values()))
+        pixels = self._finder.refined(light, self._camera, corners).reshape(-1, 2)
         return _Matches(world, pixels, self._camera.unproject(pixels))
+
+    def _recognized(self, matches: _Matches, quads: Quads, unread: Float64[np.ndarray, "n 4 2"]) -> Quads:
+        """Return the quads that lie where the markers that were read place one of the others.
+
+        A small marker is read in some pictures and not in the next: with and without it, a resting camera's pose
+        would jump by a pixel.
+        """
+        solutions = self._solve(matches) if len(unread) else []
+        missing = [name for name in self._corners if name not in quads]
+        if not solutions or not missing:
+            return {}
+        places = self._projected(
+            solutions[0].camera_from_world, np.array([self._corners[n] for n in missing])
+        )
+        turned = np.concatenate([np.roll(unread, turn, axis=1) for turn in range(4)])
+        found: Quads = {}
+        limits = NEAR_PX + NEAR_FRACTION * shortest_sides(places)
+        for name, place, limit in zip(missing, places, limits, strict=True):
+            misses = np.linalg.norm(turned - place, axis=-1).max(axis=-1)
+            nearest = int(misses.argmin())
+            if misses[nearest] <= limit:
+                found[name] = turned[nearest]
+        return found
 
     def _solve_seen(self, matches: _Matches) -> list[_Solution]:
         """Return the poses by the corners that are not occluded."""
@@ -126,9 +166,15 @@ class BoardDetector:
     def _misses_px(
         self, camera_from_world: Float64[np.ndarray, "4 4"], matches: _Matches
     ) -> Float64[np.ndarray, " n"]:
-        points = matches.world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-        distances = np.linalg.norm(self._camera.project(points) - matches.pixels, axis=1)
+        distances = np.linalg.norm(self._projected(camera_from_world, matches.world) - matches.pixels, axis=1)
         return np.asarray(np.nan_to_num(distances, nan=np.inf))
+
+    def _projected(
+        self, camera_from_world: Float64[np.ndarray, "4 4"], world: Float64[np.ndarray, "*n 3"]
+    ) -> Float64[np.ndarray, "*n 2"]:
+        """Return where points of the world are seen, pixels; NaN behind the camera."""
+        points = world.reshape(-1, 3) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        return self._camera.project(points).reshape(*world.shape[:-1], 2)
 
     def _choose(self, solutions: list[_Solution]) -> tuple[_Solution, _Solution | None]:
         """Return the solution with the smaller error; if that is inconclusive, the one nearer to the last pose."""

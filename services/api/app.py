@@ -28,9 +28,20 @@ from deltalight.services.api.pools import make_pools
 from deltalight.services.api.problems import Problems, describe_problems, responses
 from deltalight.services.api.recording_session import RecordingSession, RecordingSessions
 from deltalight.services.api.recording_store import RecordingStore
+from deltalight.services.api.recording_videos import RecordingVideos
 from deltalight.services.api.render_link import RenderLink
 from deltalight.services.api.replay_control import ReplayControl
-from deltalight.services.api.routes import assets, live, recordings, room, scenes, shelf, snapshots, state
+from deltalight.services.api.routes import (
+    assets,
+    live,
+    recording_videos,
+    recordings,
+    room,
+    scenes,
+    shelf,
+    snapshots,
+    state,
+)
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.static_page import StaticPage
@@ -47,6 +58,7 @@ ROUTERS = (
     *shelf.ROUTERS,
     *live.ROUTERS,
     *recordings.ROUTERS,
+    *recording_videos.ROUTERS,
     *snapshots.ROUTERS,
     *state.ROUTERS,
 )
@@ -116,6 +128,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         yield
         await run_in_threadpool(context.replay.close)
         await run_in_threadpool(context.recording_sessions.close)
+        await run_in_threadpool(context.videos.close)
         await run_in_threadpool(streams.close)
         await run_in_threadpool(context.link.close)
 
@@ -196,6 +209,7 @@ def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
         cameras=CameraFinder(),
         tickets=Tickets(),
         recordings=recording_store,
+        videos=RecordingVideos(recording_store),
         recording_sessions=RecordingSessions(recording_store, settings.subscribe, publish_recording),
         replay=replay,
         snapshots=SnapshotStore(store.folder / "snapshots"),

@@ -20,6 +20,7 @@ from deltalight.services.api.pools import Pool, PoolName
 from deltalight.services.api.problems import ProblemError, Problems
 from deltalight.services.api.recording_session import RecordingSessions
 from deltalight.services.api.recording_store import RecordingStore
+from deltalight.services.api.recording_videos import RecordingVideos
 from deltalight.services.api.render_link import RenderLink
 from deltalight.services.api.replay_control import ReplayControl
 from deltalight.services.api.settings import ApiSettings
@@ -60,6 +61,7 @@ class Context:
     cameras: CameraFinder
     tickets: Tickets
     recordings: RecordingStore
+    videos: RecordingVideos
     recording_sessions: RecordingSessions
     replay: ReplayControl
     snapshots: SnapshotStore

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
 from deltalight.protocol.cached_files import read_cached, write_cached
@@ -22,6 +22,9 @@ from deltalight.services.storage.asset_kinds import clean_name
 from deltalight.services.storage.asset_sandbox import MEMORY_LIMIT_BYTES, run_limited
 from deltalight.services.storage.assets import Incoming, disk_faults
 from deltalight.services.storage.faults import ConflictError, NotFoundError, TooLargeError
+
+if TYPE_CHECKING:  # readers of recordings take 0.1 s
+    from deltalight.services.recording_copies import Track
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
 POSTER_EDGE = 640
@@ -64,7 +67,6 @@ class RecordingStore:
             if left.stat().st_mtime < time.time() - UPLOAD_LEFT_OVER_AFTER_S:
                 shutil.rmtree(left, ignore_errors=True)
         self._naming_new = Lock()
-        self._encoding = Lock()  # of one video at a time, because that occupies all cores
         self._reading = Lock()  # recordings are read one at a time, because reading occupies the disk
         for path in folder.glob(f".*.tmp{SUFFIX}*"):
             if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
@@ -187,16 +189,14 @@ class RecordingStore:
                 write_cached(cached, _first_picture(path))
         return cached
 
-    def video(self, name: str) -> Path:
-        """Return the relit pictures of a recording as an mp4 file, created on first request.
+    def made_video(self, name: str) -> Path | None:
+        """Return the video of a recording's relit pictures; None if none was made since it changed.
 
         Raises:
             NotFoundError: there is no such recording.
             ConflictError: it was interrupted, or has no relit pictures.
-            DeltalightError: PyAV is missing, or the recording cannot be read.
+            DeltalightError: PyAV is missing.
         """
-        from deltalight.protocol.source import open_source
-        from deltalight.services.exports.video import export_video
         from deltalight.services.video_file import require_video_support
 
         recording = self.get(name)
@@ -207,12 +207,36 @@ class RecordingStore:
             raise ConflictError(
                 f"{name} has no relit pictures; record with `composites`, or render it by `deltalight render`."
             )
-        cached = self._cache / f"{name}.mp4"
-        with self._encoding, _naming(recording.path):
-            if not cached.is_file() or cached.stat().st_mtime_ns < recording.changed_ns:
-                cached.unlink(missing_ok=True)
-                export_video(open_source(recording.path), cached, lambda numbers: numbers)
-        return cached
+        path = self._video_path(name)
+        is_made = path.is_file() and path.stat().st_mtime_ns >= recording.changed_ns
+        return path if is_made else None
+
+    def make_video(self, name: str, track: "Track") -> Path:
+        """Make the video of a recording's relit pictures, one at a time; what `track` raises leaves nothing.
+
+        Raises:
+            NotFoundError: there is no such recording.
+            DeltalightError: the recording cannot be read, or the disk refuses.
+        """
+        from deltalight.protocol.source import open_source
+        from deltalight.services.exports.video import export_video
+
+        recording, path = self._path(name), self._video_path(name)
+        with _naming(recording):
+            for left in (
+                path,
+                *self._cache.glob(f".{name}.*.tmp{path.suffix}"),
+            ):  # of an earlier, killed process
+                left.unlink(missing_ok=True)
+            export_video(open_source(recording), path, track)
+        return path
+
+    def remove_video(self, name: str) -> None:
+        """Delete a video, if there is one."""
+        self._video_path(name).unlink(missing_ok=True)
+
+    def _video_path(self, name: str) -> Path:
+        return self._cache / f"{name}.mp4"
 
     def recover(self, name: str) -> StoredRecording:
         """Recover an interrupted recording; the result replaces its remains.
@@ -314,7 +338,7 @@ def _naming(path: Path) -> Iterator[None]:
     """Name recordings instead of paths in errors, because clients know no paths."""
     try:
         yield
-    except NotFoundError:
+    except (NotFoundError, ConflictError):
         raise
     except FileNotFoundError as fault:  # deleted while being read
         raise _absent(path.name.split(".")[0]) from fault

@@ -1,8 +1,10 @@
 """Uploaded .zip archives: what they hold is checked before anything is unpacked."""
 
+import lzma
 import posixpath
 import shutil
 import stat
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -11,6 +13,17 @@ from pathlib import Path
 
 from deltalight.protocol.errors import DeltalightError
 
+# What damaged archives raise; a name that is no UTF-8 is a UnicodeDecodeError.
+DAMAGE = (
+    zipfile.BadZipFile,
+    NotImplementedError,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    UnicodeDecodeError,
+    EOFError,
+    OSError,
+)
 _ENCRYPTED = 1  # general purpose flag, bit 0 (APPNOTE 4.4.4)
 
 
@@ -23,7 +36,7 @@ def unpacking(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (zipfile.BadZipFile, NotImplementedError, zlib.error, EOFError, OSError) as error:
+    except DAMAGE as error:
         raise DeltalightError(
             f"{path} is a damaged or unusual .zip ({error!s:.300}); pack it again."
         ) from error

@@ -12,7 +12,6 @@ import shutil
 import sqlite3
 import time
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -22,6 +21,7 @@ from typing import BinaryIO
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.files import appearing
+from deltalight.services.storage.archive import DAMAGE
 from deltalight.services.storage.asset_kinds import BY_NAME
 from deltalight.services.storage.data_folder import (
     ASSETS,
@@ -213,7 +213,7 @@ def _unpack(path: Path, to: Path) -> Contents:
                 _extract(archive, entry, to / entry.name, path)
     except OSError as fault:
         raise DeltalightError(f"{path} cannot be restored ({fault.strerror or fault}).") from fault
-    except (zipfile.BadZipFile, zlib.error, KeyError, ValueError, TypeError, EOFError, RuntimeError) as fault:
+    except (*DAMAGE, KeyError, ValueError, TypeError, RuntimeError) as fault:
         raise DeltalightError(f"{path} is no whole backup ({fault}); give another one.") from fault
     contents, digests = _examined(to / DATABASE, path)
     for digest, name in digests.items():

@@ -3,6 +3,10 @@
 import json
 import re
 import runpy
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -49,3 +53,54 @@ def test_what_runs_has_hashes_and_a_licence_that_goes_with_ours(bill: dict[str, 
         if each["purl"].startswith("pkg:pypi/"):
             assert all(re.fullmatch("[0-9a-f]{64}", known["content"]) for known in each["hashes"])
             assert each["hashes"]
+
+
+def audited(database: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, ROOT / ".ci" / "audit.py", database], capture_output=True, text=True, check=False
+    )
+
+
+def record(name: str, *events: dict[str, str], ecosystem: str = "PyPI", **more: Any) -> dict[str, Any]:  # noqa: ANN401
+    ranges = [{"type": "ECOSYSTEM", "events": list(events)}]
+    affected = [{"package": {"ecosystem": ecosystem, "name": name}, "ranges": ranges}]
+    return {"id": f"TEST-{name}", "summary": "made for this test", "affected": affected, **more}
+
+
+def test_known_weaknesses_of_locked_versions_are_found_in_a_database(tmp_path: Path) -> None:
+    """By a range that is open or ends behind the version, or a list; not if fixed before, withdrawn, or another's."""
+    listed = record("Pillow")
+    pillow = next(
+        line for line in (ROOT / "requirements.lock").read_text().splitlines() if "pillow==" in line
+    )
+    listed["affected"][0]["versions"] = [pillow.partition("==")[2].split()[0]]
+    records = [
+        listed,
+        record("NumPy", {"introduced": "0"}),
+        record("three", {"introduced": "0.1.0"}, {"last_affected": "99.0.0"}, ecosystem="npm"),
+        record("zeroconf", {"introduced": "0"}, {"fixed": "0.1"}),
+        record("fastapi", {"introduced": "0"}, withdrawn="2026-01-01T00:00:00Z"),
+        record("scipy", {"introduced": "999"}),
+        record("typer", {"introduced": "0"}, ecosystem="npm"),
+    ]
+    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+        for each in records:
+            archive.writestr(f"{each['id']}.json", json.dumps(each))
+    done = audited(tmp_path / "all.zip")
+    assert done.returncode == 1, done.stderr
+    *found, total = done.stdout.splitlines()
+    assert [line.split()[0] for line in found] == ["numpy", "pillow", "three"]
+    assert all("(runs): TEST-" in line for line in found)
+    assert total.startswith("3 weaknesses")
+    (tmp_path / "one.json").write_text(json.dumps(records[3]))
+    assert audited(tmp_path / "one.json").returncode == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"{", b"PK\3\4"])
+def test_what_is_no_database_is_one_sentence(tmp_path: Path, content: bytes) -> None:
+    for name in ("a.json", "a.zip"):
+        (tmp_path / name).write_bytes(content)
+        done = audited(tmp_path / name)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.count("\n") == 1
+        assert "no database in the format of OSV" in done.stderr

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,6 +19,8 @@ import pytest
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import open_source
 from deltalight.services import ports
+from deltalight.services.api.routes import recording_videos
+from deltalight.services.video_file import VideoWriter
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.record_samples import HEIGHT, WIDTH, Feed, feeding, frames, write
 
@@ -130,6 +133,65 @@ def test_relit_pictures_are_kept_where_wanted_and_downloaded_as_a_video(tmp_path
         assert (part.status_code, part.content) == (206, video.content[:4])
         relit.client.delete("/recordings/both").raise_for_status()
         assert not list((tmp_path / "recordings").glob("**/both*"))
+
+
+def test_a_video_is_made_in_the_background_and_can_be_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With an encoder that stands still after the first picture, until it is told to go on."""
+    pytest.importorskip("av")
+    folder, go_on, is_encoding = tmp_path / "recordings", threading.Event(), threading.Event()
+    folder.mkdir()
+    write(folder / "take.mcap", frames(4))
+    added = VideoWriter.add
+
+    def add(self: VideoWriter, *picture: Any) -> None:  # noqa: ANN401
+        added(self, *picture)
+        is_encoding.set()
+        assert go_on.wait(20)
+
+    monkeypatch.setattr(VideoWriter, "add", add)
+    monkeypatch.setattr(recording_videos, "WAIT_S", 0.1)
+    with running_api(tmp_path) as api:
+        path, get = "/recordings/take/video", api.client.get
+        assert get(path).json() == {"state": "absent", "progress": 0.0, "detail": ""}
+        assert api.client.post(path).json()["state"] == "making"
+        assert is_encoding.wait(10)
+        waiting = get(f"{path}.mp4")
+        assert "is being made" in sentence(waiting, 503)
+        assert waiting.headers["retry-after"] == "5"
+        threading.Timer(0.1, go_on.set).start()
+        assert api.client.delete(path).status_code == 204
+        assert not list((folder / ".cache").glob("*take*mp4"))
+        assert get(path).json()["state"] == "absent"
+        monkeypatch.setattr(recording_videos, "WAIT_S", 20.0)
+        video = get(f"{path}.mp4")
+        assert (video.status_code, video.content[4:8]) == (200, b"ftyp")
+        assert get(path).json() == {"state": "ready", "progress": 1.0, "detail": ""}
+        assert api.client.delete(path).status_code == 204
+        assert get(path).json()["state"] == "absent"
+
+
+def test_an_end_of_the_service_leaves_nothing_of_a_video(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("av")
+    folder, is_encoding = tmp_path / "recordings", threading.Event()
+    (folder / ".cache").mkdir(parents=True)
+    write(folder / "take.mcap", frames(4))
+    (folder / ".cache" / ".take.1.tmp.mp4").write_bytes(b"of a killed process")
+    added = VideoWriter.add
+
+    def add(self: VideoWriter, *picture: Any) -> None:  # noqa: ANN401
+        added(self, *picture)
+        is_encoding.set()
+        time.sleep(0.2)
+
+    monkeypatch.setattr(VideoWriter, "add", add)
+    with running_api(tmp_path) as api:
+        api.client.post("/recordings/take/video").raise_for_status()
+        assert is_encoding.wait(10)
+    assert not list((folder / ".cache").glob("*.mp4"))
 
 
 def test_a_video_without_pyav_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,6 +64,14 @@ def test_every_view_is_taken_by_default_and_kept(api: RunningApi, folder: Path) 
     moving = client.get(f"/snapshots/{snapshot['id']}/before-after.gif")
     assert (moving.status_code, moving.headers["content-type"]) == (200, "image/gif")
     assert Image.open(BytesIO(moving.content)).size == (6, 4)
+    pytest.importorskip("av")
+    video = client.get(f"/snapshots/{snapshot['id']}/before-after.mp4")
+    assert (video.status_code, video.headers["content-type"], video.content[4:8]) == (
+        200,
+        "video/mp4",
+        b"ftyp",
+    )
+    assert not list(folder.parent.glob(".video-*"))
     assert sorted(path.name for path in folder.iterdir()) == [snapshot["id"]]
     assert client.delete(f"/snapshots/{snapshot['id']}").status_code == 204
     assert not list(folder.iterdir())

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, Route
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.services.api.static_page import DASHBOARD
@@ -155,6 +155,23 @@ def test_the_room_is_looked_at_from_anywhere(stack: Stack, page: Desk) -> None:
     page.shows_newest()
 
 
+def test_the_room_of_fused_depth_is_shown_too(stack: Stack, page: Desk) -> None:
+    """Its surfaces come from all frames so far, and most of them have the newest picture on them."""
+    page.named("button", "Room in 3-D").click()
+    canvas = page.page.locator("canvas.room[data-shown=true]")
+    canvas.wait_for()
+    page.until(lambda: seen(page).std() > 20, "the room of the newest depth")
+    of_depth, document = seen(page), stack.document()
+    page.page.locator("body").press("o")
+    stack.client.put(stack.path, json={**document, "real": {"geometry": "fused"}}).raise_for_status()
+    page.until(lambda: stack.header()["scene"]["revision"] > document["revision"], "the fused scene")
+    page.named("button", "Room in 3-D").click()
+    canvas.wait_for()
+    page.until(lambda: seen(page).std() > 20, "the fused room")
+    page.photograph("room_fused")
+    assert np.abs(seen(page) - of_depth).mean() < 25, "the same room from the same place"
+
+
 def test_a_room_that_is_not_known_yet_says_so(page: Desk) -> None:
     refusal = {"status": 422, "title": "Refused", "type": "urn:deltalight:problem:refused"}
     sentence = "No surface of the room is known yet; ask again when depth shows some."
@@ -197,4 +214,32 @@ def test_relit_pictures_are_recorded_and_downloaded_as_a_video(stack: Stack, pag
         page.named("menuitem", "Download .mp4").click()
     assert saved.value.suggested_filename == f"{take['id']}.mp4"
     assert b"ftyp" in Path(saved.value.path()).read_bytes()[:16]
+    is_stopped = False
+
+    def answer(route: Route) -> None:
+        nonlocal is_stopped
+        is_stopped |= route.request.method == "DELETE"
+        state = {"state": "absent" if is_stopped else "making", "progress": 0.4, "detail": ""}
+        route.fulfill(status=204) if route.request.method == "DELETE" else route.fulfill(json=state)
+
+    page.page.route("**/video", answer)
+    page.named("button", f"Actions for {take['id']}").click()
+    page.named("menuitem", "Download .mp4").click()
+    shown = page.page.get_by_label("Making the video")
+    shown.wait_for()
+    assert shown.get_attribute("value") == "0.4"
+    page.named("button", "Cancel").click()
+    shown.wait_for(state="detached")
+    assert is_stopped
     stack.client.delete(f"/recordings/{take['id']}").raise_for_status()
+
+
+def test_before_and_after_of_a_snapshot_are_downloaded_as_a_video(page: Desk) -> None:
+    pytest.importorskip("av")
+    page.named("tab", "Snapshots").click()
+    page.named("button", "Take a snapshot").first.click()
+    page.page.get_by_role("button", name="Files of frame").click()
+    with page.page.expect_download() as saved:
+        page.named("menuitem", "before-after.mp4").click()
+    assert saved.value.suggested_filename.endswith("-before-after.mp4")
+    assert b"ftyp" in Path(saved.value.path()).read_bytes()[:16]

@@ -34,9 +34,6 @@ Seconds = Annotated[float, Field(ge=0, le=1e6, description="From the recording's
 POSTER_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}
 }
-VIDEO_ANSWER: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"video/mp4": {"schema": {"type": "string", "format": "binary"}}}}
-}
 _UPLOAD_BODY = {
     "requestBody": {
         "required": True,
@@ -289,7 +286,7 @@ def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer
 @in_pool("recordings")
 def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
     """Mend an interrupted recording: all frames that can be read, finished."""
-    _require_at_rest(shared, recording_id)
+    require_at_rest(shared, recording_id)
     return RecordingAnswer.stored(shared.recordings.recover(recording_id))
 
 
@@ -301,28 +298,12 @@ def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAns
 @in_pool("recordings")
 def download_recording(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
     """Download the .mcap file; ranges of it too."""
-    _require_at_rest(shared, recording_id)
+    require_at_rest(shared, recording_id)
     recording = shared.recordings.get(recording_id)
     if recording.state == "interrupted":
         raise ConflictError(f"{recording.id} was interrupted; recover it, then download it.")
     path = recording.path
     return StoredFileResponse(path, media_type="application/octet-stream", filename=path.name)
-
-
-@router.get(
-    "/{recording_id}/video.mp4",
-    response_class=StoredFileResponse,
-    responses=responses(404, 409, 416, 422) | VIDEO_ANSWER,
-)
-@in_pool("recordings")
-def recording_video(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
-    """Download the relit pictures that were recorded along as a video (H.264); ranges of it too.
-
-    It is made when it is asked for first, which takes a while, and kept. The package `av` makes it (extra `video`).
-    """
-    _require_at_rest(shared, recording_id)
-    path = shared.recordings.video(recording_id)
-    return StoredFileResponse(path, media_type="video/mp4", filename=path.name)
 
 
 @router.get(
@@ -333,7 +314,7 @@ def recording_video(shared: Shared, recording_id: RecordingId) -> StoredFileResp
 @in_pool("recordings")
 def recording_poster(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
     """Return the first colour picture, at most 640 pixels wide or high."""
-    _require_at_rest(shared, recording_id)
+    require_at_rest(shared, recording_id)
     return StoredFileResponse(shared.recordings.poster(recording_id), media_type="image/jpeg")
 
 
@@ -341,9 +322,10 @@ def recording_poster(shared: Shared, recording_id: RecordingId) -> StoredFileRes
 @in_pool("recordings")
 def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
     """Delete a recording for good; not one that grows or is shown."""
-    _require_at_rest(shared, recording_id)
+    require_at_rest(shared, recording_id)
     if shared.replay.recording == recording_id:
         raise ConflictError(f"{recording_id} is being replayed; go back to live, then delete it.")
+    shared.videos.stop(recording_id)
     shared.recordings.remove(recording_id)
 
 
@@ -364,7 +346,7 @@ def start_replay(
 ) -> ReplayAnswer:
     """Show a recording instead of the live nodes, or of the recording that is shown."""
     new = checked(NewReplay, wanted, "the replay")
-    _require_at_rest(shared, new.recording)
+    require_at_rest(shared, new.recording)
     recording = shared.recordings.get(new.recording)
     order = ReplayOrder(recording.id, recording.path, new.position_s, new.playing, new.rate, new.loop)
     return replay_answer(shared.replay.start(order))
@@ -410,6 +392,11 @@ def _growing(shared: Context, recording_id: str) -> RecordingSession | None:
     return next((each for each in shared.recording_sessions.running() if each.id == recording_id), None)
 
 
-def _require_at_rest(shared: Context, recording_id: str) -> None:
+def require_at_rest(shared: Context, recording_id: str) -> None:
+    """Refuse what needs a finished recording.
+
+    Raises:
+        ConflictError: it is still growing.
+    """
     if _growing(shared, recording_id) is not None:
         raise ConflictError(f"{recording_id} is still being recorded; stop it first.")

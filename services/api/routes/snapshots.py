@@ -1,6 +1,7 @@
 """Routes of snapshots: one frame in any number of views, as pictures to keep."""
 
 from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, get_args
 
 import numpy as np
@@ -20,7 +21,7 @@ from deltalight.services.api.request_bodies import AS_SENT, checked
 from deltalight.services.api.routes.assets import UNCHANGING
 from deltalight.services.api.routes.live import NO_ANSWER
 from deltalight.services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
-from deltalight.services.before_after import before_after_gif
+from deltalight.services.before_after import before_after_gif, write_before_after_video
 
 router = APIRouter(tags=["snapshots"], prefix="/snapshots")
 ROUTERS = (router,)
@@ -119,6 +120,21 @@ def snapshot_before_after(shared: Shared, snapshot_id: SnapshotId) -> Response:
     """Return a moving picture in which a line divides the camera's picture from the composite."""
     before, after = (_picture(shared.snapshots.file(snapshot_id, f"{view}.png")) for view in BEFORE_AFTER)
     return Response(before_after_gif(before, after), media_type="image/gif", headers=UNCHANGING)
+
+
+@router.get(
+    "/{snapshot_id}/before-after.mp4",
+    response_class=Response,
+    responses=responses(404, 422) | {200: {"content": {"video/mp4": {}}}},
+)
+@in_pool("thumbnails")
+def snapshot_before_after_video(shared: Shared, snapshot_id: SnapshotId) -> Response:
+    """Return the same as a video (H.264) of a few seconds, in full size. The package `av` makes it."""
+    before, after = (_picture(shared.snapshots.file(snapshot_id, f"{view}.png")) for view in BEFORE_AFTER)
+    with TemporaryDirectory(prefix=".video-", dir=shared.store.folder) as folder:
+        path = FilePath(folder) / "before-after.mp4"
+        write_before_after_video(path, before, after)
+        return Response(read_bytes(path), media_type="video/mp4", headers=UNCHANGING)
 
 
 @router.get(

@@ -30,6 +30,7 @@ export type {
   ReplayChange,
   ShelfAnswer as ShelfItem,
   SnapshotFacts as Snapshot,
+  VideoAnswer as Video,
   TicketAnswer as Ticket,
 } from "./schema";
 

@@ -1,13 +1,17 @@
 // Recordings, replay and snapshots.
 import { computed, signal } from "@preact/signals";
-import { API, request, requestBytes } from "../api/http";
-import type { Recording, Replay, ReplayChange, Snapshot, WantedPicture } from "../api/types";
+import { API, request } from "../api/http";
+import type { Recording, Replay, ReplayChange, Snapshot, Video, WantedPicture } from "../api/types";
 import { uploadRecording } from "../api/upload";
 import { sendShown } from "./assets";
 import { openDrawer, recordsRelit } from "./preferences";
-import { announce, attempt } from "./toasts";
+import { announce, attempt, toast } from "./toasts";
+
+const VIDEO_POLL_MS = 300;
 
 export const recordings = signal<readonly Recording[]>([]);
+/** Share of each video that is being made, by recording. */
+export const videos = signal<ReadonlyMap<string, number>>(new Map());
 export const replay = signal<Replay | null>(null);
 export const snapshots = signal<readonly Snapshot[]>([]);
 export const isTakingSnapshot = signal(false);
@@ -43,11 +47,22 @@ export async function stopRecording(id: string): Promise<void> {
   await readRecordings();
 }
 
-/** Have the service make the video of a recording's relit pictures, which takes a while; false where it refuses. */
-export async function makeVideo(path: string, name: string): Promise<boolean> {
-  announce(`${name} is being made.`);
-  const begin = await attempt(() => requestBytes(path, "bytes=0-0"));
-  return begin !== undefined;
+/** Have the service make the video of a recording's relit pictures, its progress shown; whether it is there. */
+export async function makeVideo(id: string): Promise<boolean> {
+  const path = `${API}/recordings/${id}/video`;
+  let video = await attempt(() => request<Video>("POST", path));
+  while (video?.state === "making") {
+    videos.value = new Map(videos.value).set(id, video.progress);
+    await new Promise((resolve) => setTimeout(resolve, VIDEO_POLL_MS));
+    video = await attempt(() => request<Video>("GET", path));
+  }
+  videos.value = new Map([...videos.value].filter(([each]) => each !== id));
+  if (video?.state === "failed") toast(video.detail, "error");
+  return video?.state === "ready";
+}
+
+export async function stopVideo(id: string): Promise<void> {
+  await attempt(() => request("DELETE", `${API}/recordings/${id}/video`));
 }
 
 export async function deleteRecording(id: string): Promise<void> {

@@ -2,7 +2,16 @@ import { API } from "../../api/http";
 import { role } from "../../api/session";
 import type { Recording } from "../../api/types";
 import { bytes, clock } from "../../math/units";
-import { deleteRecording, isGrowing, makeVideo, replay, showRecording, stopRecording } from "../../state/takes";
+import {
+  deleteRecording,
+  isGrowing,
+  makeVideo,
+  replay,
+  showRecording,
+  stopRecording,
+  stopVideo,
+  videos,
+} from "../../state/takes";
 import { Button } from "../ui/Button";
 import { download } from "../ui/download";
 import { Icon } from "../ui/Icon";
@@ -19,8 +28,8 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
     {
       label: "Download .mp4",
       icon: "film",
-      disabled: recording.composites === 0,
-      onClick: () => downloadVideo(`${path}/video.mp4`, `${recording.id}.mp4`),
+      disabled: recording.composites === 0 || videos.value.has(recording.id),
+      onClick: () => downloadVideo(path, recording.id),
     },
     { label: "Delete", icon: "trash", disabled: !mayChange || isShown, onClick: () => deleteRecording(recording.id) },
   ];
@@ -35,6 +44,7 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
         <h3 class="cut">{recording.id}</h3>
         <p class="quiet small">{recording.detail || factsText(recording)}</p>
         <Checklist recording={recording} />
+        <VideoProgress id={recording.id} />
         <div class="row">
           {isRunning ? (
             <Button icon="stop" disabled={!mayChange} onClick={() => stopRecording(recording.id)}>
@@ -60,8 +70,25 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
   );
 }
 
-async function downloadVideo(path: string, name: string): Promise<void> {
-  if (await makeVideo(path, name)) await download(path, name);
+async function downloadVideo(path: string, id: string): Promise<void> {
+  if (await makeVideo(id)) await download(`${path}/video.mp4`, `${id}.mp4`);
+}
+
+/** How far the video of a recording is that is being made. */
+function VideoProgress({ id }: { readonly id: string }) {
+  const share = videos.value.get(id);
+  if (share === undefined) return null;
+  return (
+    <div class="row small">
+      <label class="upload">
+        <span>Making the video</span>
+        <progress value={share} />
+      </label>
+      <Button icon="stop" onClick={() => stopVideo(id)}>
+        Cancel
+      </Button>
+    </div>
+  );
 }
 
 /** What relighting needs of a recording, and what to do without. */

@@ -2,10 +2,12 @@ import { API } from "../../api/http";
 import { role } from "../../api/session";
 import type { Snapshot } from "../../api/types";
 import { deleteSnapshot } from "../../state/takes";
-import { download } from "../ui/download";
+import { save } from "../ui/download";
 import { Icon } from "../ui/Icon";
 import { Menu, type MenuEntry } from "../ui/Menu";
 import { SecureImage } from "../ui/SecureImage";
+
+const MOVING = ["before-after.gif", "before-after.mp4"];
 
 export function SnapshotCard({ snapshot }: { readonly snapshot: Snapshot }) {
   const path = `${API}/snapshots/${snapshot.id}`;
@@ -13,12 +15,12 @@ export function SnapshotCard({ snapshot }: { readonly snapshot: Snapshot }) {
     ? "composite.png"
     : snapshot.files.find((file) => file.endsWith(".png"));
   const hasBoth = ["camera.png", "composite.png"].every((file) => snapshot.files.includes(file));
-  const files = hasBoth ? [...snapshot.files, "before-after.gif"] : snapshot.files;
+  const files = hasBoth ? [...snapshot.files, ...MOVING] : snapshot.files;
   const entries: MenuEntry[] = [
     ...files.map((file): MenuEntry => ({
       label: file,
       icon: "download",
-      onClick: () => download(`${path}/${file}`, `frame-${snapshot.frame_id}-${file}`),
+      onClick: () => save(`${path}/${file}`, `frame-${snapshot.frame_id}-${file}`),
     })),
     {
       label: "Delete",
