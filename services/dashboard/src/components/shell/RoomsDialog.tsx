@@ -56,10 +56,10 @@ function RoomCard({ room }: { readonly room: RoomAnswer }) {
           <span class="no-image" />
         )}
       </button>
-      <header class="spread">
+      <div class="spread">
         <h3 class="cut">{room.title}</h3>
         <span class={`badge ${room.state === "failed" ? "bad" : room.state}`}>{room.state}</span>
-      </header>
+      </div>
       <p class="quiet small">{factsOf(room)}</p>
       {room.why && <p class="small">{room.why}</p>}
       {entries.length > 0 && (
