@@ -47,8 +47,10 @@ class StrictModel(BaseModel):
         return type(self).model_validate({**dict(self), **changes})
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path, *, unique_keys: bool = False) -> dict[str, Any]:
     """Read a JSON (`.json`) or YAML document whose top level is a mapping.
+
+    With `unique_keys` a key that comes twice is refused, where otherwise the last one counts.
 
     Raises:
         DeltalightError: the file is missing, unreadable, malformed, or not a mapping.
@@ -61,10 +63,11 @@ def read_mapping(path: Path) -> dict[str, Any]:
         ) from error
     except UnicodeDecodeError as error:
         raise DeltalightError(f"{path} is not a text file; give a JSON or YAML document.") from error
-    return parse_mapping(text, str(path), is_json=path.suffix.lower() == ".json")
+    is_json = path.suffix.lower() == ".json"
+    return parse_mapping(text, str(path), is_json=is_json, unique_keys=unique_keys)
 
 
-def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
+def parse_mapping(text: str, name: str, *, is_json: bool, unique_keys: bool = False) -> dict[str, Any]:
     """Parse the text of a document called `name` whose top level is a mapping.
 
     Raises:
@@ -72,7 +75,10 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
     """
     kind = "JSON" if is_json else "YAML"
     try:
-        data = json.loads(text) if is_json else parse_yaml(text)
+        if is_json:
+            data = json.loads(text, object_pairs_hook=_unique if unique_keys else None)
+        else:
+            data = parse_yaml(text, unique_keys=unique_keys)
     except (ValueError, RecursionError) as error:
         detail = " ".join(str(error).split())[:160]
         raise DeltalightError(f"{name} is not valid {kind} ({detail}); correct it there.") from error
@@ -81,6 +87,14 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
             f"{name} must hold keys and values, not a {type(data).__name__}; write `key: value` lines."
         )
     return data
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        doubled = next(key for key in found if sum(key == other for other, _ in pairs) > 1)
+        raise ValueError(f"`{doubled[:LONGEST_WORD]}` comes twice")
+    return found
 
 
 def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: bool = False) -> Model:

@@ -25,6 +25,7 @@ UNREADABLE_ID = "unreadable"
 REMEMBERED_REPLIES = 256
 MAX_PIECE_BYTES = MAX_PAYLOAD_BYTES + 4096  # CURVE adds to each piece
 REMEMBERED_BYTES = 16 * 1024 * 1024
+ABANDONED_AFTER_MS = 100
 
 Handler = Callable[[ControlRequest], dict[str, object]]
 _log = structlog.get_logger(__name__)
@@ -208,6 +209,7 @@ class RequestClient:
         self._keys = keys
         self._context = zmq.Context()
         self._lock = threading.Lock()
+        self._abandoned = threading.Event()
         self._socket: zmq.Socket[bytes] | None = None
         try:
             self._connected()
@@ -227,7 +229,7 @@ class RequestClient:
             raise DeltalightError(f"{self.endpoint} is still busy with another request: try again")
         try:
             socket = self._connected()
-            if not _exchange(socket, multipart, deadline):
+            if not _exchange(socket, multipart, deadline, self._abandoned):
                 trust = "" if self._keys is None else f" and trusts {self._keys.name}.key"
                 raise DeltalightError(
                     f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs{trust}"
@@ -238,6 +240,10 @@ class RequestClient:
             raise
         finally:
             self._lock.release()
+
+    def abandon(self) -> None:
+        """Wait for no answers any more: the server is gone; requests end soon, without one (any thread)."""
+        self._abandoned.set()
 
     def close(self) -> None:
         """Close the socket."""
@@ -259,15 +265,23 @@ class RequestClient:
             self._socket = None
 
 
-def _exchange(socket: "zmq.Socket[bytes]", multipart: list[bytes], deadline: float) -> bool:
-    """Send a request; return whether an answer arrived before `deadline` (`time.monotonic`)."""
+def _exchange(
+    socket: "zmq.Socket[bytes]", multipart: list[bytes], deadline: float, abandoned: threading.Event
+) -> bool:
+    """Send a request; return whether an answer arrived before `deadline` (`time.monotonic`), or it was abandoned."""
     # If the other end refused the connection no pipe is left, and a plain send would block forever.
     socket.sndtimeo = _left_ms(deadline)
     try:
         socket.send_multipart(multipart)
     except zmq.Again:
         return False
-    return bool(socket.poll(_left_ms(deadline), zmq.POLLIN))
+    while not abandoned.is_set():
+        left_ms = _left_ms(deadline)
+        if socket.poll(min(left_ms, ABANDONED_AFTER_MS), zmq.POLLIN):
+            return True
+        if left_ms <= ABANDONED_AFTER_MS:
+            return False
+    return False
 
 
 def _left_ms(deadline: float) -> int:

@@ -12,6 +12,7 @@ MAX_DEPTH = 32
 MAX_TEXT = 4096  # characters of one value: the longest that a scene document may hold
 MAX_SECONDS = 5.0
 MAX_INTEGER = 2**64
+MAX_KEY_SHOWN = 64
 
 
 # Ten times as fast as the loader in Python; a PyYAML that was built without libyaml has that one only.
@@ -29,15 +30,15 @@ for _kind in (_Loader, _Dumper):
     )
 
 
-def parse_yaml(text: str) -> Any:  # noqa: ANN401 - whatever the text holds
-    """Return the data of a YAML document.
+def parse_yaml(text: str, *, unique_keys: bool = False) -> Any:  # noqa: ANN401 - whatever the text holds
+    """Return the data of a YAML document; with `unique_keys` a mapping may hold each key once only.
 
     Raises:
         ValueError: the text is no YAML, or takes more than a document may.
     """
     try:
         _require_limits(text)
-        return yaml.load(text, _Loader)
+        return yaml.load(text, _UniqueLoader if unique_keys else _Loader)
     except (yaml.YAMLError, ArithmeticError, RecursionError) as error:  # 1:60:60... is a number in YAML 1.1
         raise ValueError(str(error)) from error
 
@@ -52,6 +53,23 @@ def _integer(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+
+
+class _UniqueLoader(_Loader):
+    """Refuses a key that a mapping already has, where YAML would keep the last one."""
+
+
+def _unique_mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+    doubled = next((key for index, key in enumerate(keys) if key in keys[:index]), None)
+    if doubled is not None:
+        raise yaml.constructor.ConstructorError(
+            None, None, f"`{doubled[:MAX_KEY_SHOWN]}` comes twice", node.start_mark
+        )
+    return loader.construct_mapping(node, deep=True)
+
+
+_UniqueLoader.add_constructor("tag:yaml.org,2002:map", _unique_mapping)
 
 
 def yaml_text(data: Mapping[str, Any]) -> str:

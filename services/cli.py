@@ -34,6 +34,7 @@ from deltalight.services.commands.record import record
 from deltalight.services.commands.recordings import recordings
 from deltalight.services.commands.render import render
 from deltalight.services.commands.replay import replay
+from deltalight.services.commands.rooms import rooms
 from deltalight.services.commands.schema import schema
 from deltalight.services.commands.server import server
 from deltalight.services.commands.up import up
@@ -91,6 +92,7 @@ for command in (
     app.command(epilog=examples_of(command.__name__))(command)
 app.add_typer(api, name="api")
 app.add_typer(recordings, name="recordings")
+app.add_typer(rooms, name="rooms")
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(keys, name="keys")
 app.add_typer(bench, name="bench")

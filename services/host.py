@@ -1,20 +1,72 @@
 """The processes of one host and their connections: node -> render server -> web process, on loopback."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys, KeySettings
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.protocol.source import Source
 from deltalight.services import ports
-from deltalight.services.supervisor import ChildSpec, Watch
+from deltalight.services.child import ChildSpec, Watch
 
 PREPARED = {  # by spares of a command
     "node": ("deltalight.services.node_process", "pydantic_settings"),
     "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings"),
     "api": ("deltalight.services.api.serve", "pydantic_settings"),
 }
+
+
+@dataclass(frozen=True)
+class HostCommands:
+    """Command lines of processes of this host, which talk over loopback.
+
+    `config` is the configuration file of all; None = the one they find, which overrides the defaults here. With
+    `spares`, a process that dies is replaced by one that has imported what it needs (some 100 MB each).
+    """
+
+    config: Path | None = Path(os.devnull)
+    log_level: str = "info"
+    spares: bool = False
+    allow_software: bool = False
+
+    def child(self, label: str, command: str, *options: str) -> ChildSpec:
+        """Return a process that runs a command, with the configuration of all."""
+        config = [] if self.config is None else ["--config", str(self.config.absolute())]
+        spec = ChildSpec.deltalight(label, "--log-level", self.log_level, command, *config, *options)
+        return replace(spec, warm=PREPARED[command]) if self.spares else spec
+
+    def node(self, label: str, source: str, publish: str, clock: str, *more: str) -> ChildSpec:
+        """Return a sensor node."""
+        return self.child(label, "node", "--source", source, "--publish", publish, "--clock", clock, *more)
+
+    def server(
+        self, label: str, session: Path, publish: str, control: str, device: int | None, *more: str
+    ) -> ChildSpec:
+        """Return a render server; `more` says where its frames come from."""
+        options = ["--session", str(session), *more, "--publish", publish, "--control", control]
+        if device is not None:
+            options += ["--device", str(device)]
+        if self.allow_software:
+            options += ["--allow-software"]
+        return self.child(label, "server", *options)
+
+    def web(self, data: Path, page_port: int, *more: str) -> ChildSpec:
+        """Return a web process."""
+        options = ("--data", str(data.absolute()), *more, "--port", str(page_port))
+        return self.child("web process", "api", *options)
+
+    def keys(self, endpoints: Sequence[str]) -> Keys | None:
+        """Return the keys that connections to these endpoints take.
+
+        Raises:
+            DeltalightError: they are missing.
+        """
+        from deltalight.services.settings import load_configuration
+
+        return load_configuration(self.config).section("keys", KeySettings).load(endpoints)
 
 
 @dataclass(frozen=True)
@@ -60,60 +112,40 @@ class HostPlan:
         if self.data is not None:
             ports.require_free(self.page_port, "dashboard", "--port")
 
-    def _child(self, name: str, command: str, *options: str) -> ChildSpec:
-        spec = ChildSpec.deltalight(name, "--log-level", self.log_level, command, *options)
-        return replace(spec, warm=PREPARED[command]) if self.spares else spec
-
     @property
-    def _config(self) -> list[str]:
-        return [] if self.config is None else ["--config", str(self.config.absolute())]
+    def _commands(self) -> HostCommands:
+        return HostCommands(self.config, self.log_level, self.spares, self.allow_software)
 
     def _node(self, source: str) -> ChildSpec:
-        options = [
-            *self._config,
-            *("--source", source),
-            *("--publish", ports.endpoint(self.node_port)),
-            *("--clock", ports.endpoint(self.control_port)),
-        ]
-        return self._child("sensor node", "node", *options, *(["--loop"] if self.loop else []))
+        publish, clock = ports.endpoint(self.node_port), ports.endpoint(self.control_port)
+        return self._commands.node("sensor node", source, publish, clock, *(["--loop"] if self.loop else []))
 
     def _server(self) -> ChildSpec:
-        has_node = self.source is not None
-        options = [
-            *self._config,
-            *("--session", str(self.session_file)),
-            *(("--subscribe", ports.endpoint(self.node_port)) if has_node else ("--node", self.remote_node)),
-            *("--publish", ports.endpoint(self.composite_port)),
-            *("--control", ports.endpoint(self.control_port)),
-        ]
-        if self.device is not None:
-            options += ["--device", str(self.device)]
-        if self.allow_software:
-            options += ["--allow-software"]
-        return replace(self._child("render server", "server", *options), watch=self._watchdog)
+        publish, control = ports.endpoint(self.composite_port), ports.endpoint(self.control_port)
+        spec = self._commands.server(
+            "render server", self.session_file, publish, control, self.device, *self._frames
+        )
+        return replace(spec, watch=self._watchdog)
+
+    @property
+    def _frames(self) -> tuple[str, str]:
+        if self.source is None:
+            return "--node", self.remote_node
+        return "--subscribe", ports.endpoint(self.node_port)
 
     def _watchdog(self, process_id: int) -> Watch:
-        from deltalight.protocol.keys import KeySettings
-        from deltalight.services.settings import load_configuration
         from deltalight.services.watchdog import Watchdog
 
         endpoints = ports.endpoint(self.composite_port), ports.endpoint(self.control_port)
-        keys = load_configuration(self.config).section("keys", KeySettings).load(endpoints)
-        return Watchdog(process_id, *endpoints, keys)
+        return Watchdog(process_id, *endpoints, self._commands.keys(endpoints))
 
     def _web(self, data: Path) -> ChildSpec:
-        node = (
-            ("--subscribe", ports.endpoint(self.node_port)) if self.source else ("--node", self.remote_node)
-        )
-        return self._child(
-            "web process",
-            "api",
-            *self._config,
-            *("--data", str(data.absolute())),
+        return self._commands.web(
+            data,
+            self.page_port,
             *("--control", ports.endpoint(self.control_port)),
             *("--subscribe", ports.endpoint(self.composite_port)),
-            *node,
-            *("--port", str(self.page_port)),
+            *self._frames,
         )
 
 
@@ -128,3 +160,16 @@ def choose_scene(source: Source | None, path: Path | None) -> SceneDocument:
     if source is None or source.scene is None:
         raise DeltalightError("The source carries no scene document; name one with --scene.")
     return source.scene
+
+
+def recording_of(source: str | None) -> Source | None:
+    """Return the recording that a source names, None if it is a camera, or another host's.
+
+    Raises:
+        DeltalightError: it is not there, or cannot be read.
+    """
+    from deltalight.protocol.source import open_source
+    from deltalight.sensor_node.cameras.drivers import SYNTHETIC
+    from deltalight.sensor_node.cameras.open import is_live
+
+    return None if source is None or source == SYNTHETIC or is_live(source) else open_source(Path(source))

@@ -23,8 +23,13 @@ def session_file(scene: SceneDocument) -> Iterator[Path]:
     """Yield a temporary file with the scene document, for the render server's `--session`."""
     with TemporaryDirectory(prefix="deltalight-") as folder:
         path = Path(folder) / "scene.json"
-        write_bytes(path, scene.model_dump_json(indent=1).encode())
+        write_scene(path, scene)
         yield path
+
+
+def write_scene(path: Path, scene: SceneDocument) -> None:
+    """Write a scene document for the render server's `--session`."""
+    write_bytes(path, scene.model_dump_json(indent=1).encode())
 
 
 def activate_document(store: Store, document: SceneDocument) -> SceneDocument:

@@ -9,6 +9,7 @@ LOOPBACK = "127.0.0.1"
 NODE_PORT = 5601  # a sensor node publishes
 COMPOSITE_PORT = 5602  # the render server publishes
 CONTROL_PORT = 5603  # the render server answers
+ROOMS_PORT = 5604  # the directory of rooms answers
 PAGE_PORT = 8000  # the web process serves dashboard, REST API and live video
 PRIVATE_PORTS = range(20_000, 32_000)  # below the kernel's range for outgoing connections
 

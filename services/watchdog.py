@@ -11,16 +11,18 @@ import threading
 import time
 import uuid
 from collections import deque
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from deltalight.protocol.clock import CLOCK_OP
+from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.messages import ControlRequest, StatsMessage
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
+from deltalight.protocol.subscriber import ReceivedMultipart
 
 RECEIVE_TIMEOUT_S = 0.5
 ANSWER_TIMEOUT_S = 1.0
@@ -109,6 +111,7 @@ class Watchdog:
         self._client = RequestClient(control, keys=keys)
         self._receiver = Receiver([reports], ["stats"], keys=keys)
         self._closing = threading.Event()
+        self.newest: StatsMessage | None = None  # report
         self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
         self._thread.start()
 
@@ -127,10 +130,17 @@ class Watchdog:
 
     def _watch(self, heartbeat: Heartbeat) -> None:
         while not self._closing.is_set():
-            if self._receiver.latest(RECEIVE_TIMEOUT_S):
+            if reports := self._receiver.latest(RECEIVE_TIMEOUT_S):
                 heartbeat.note_report(time.monotonic())
+                for multipart in reports.values():
+                    self._keep(multipart)
             elif heartbeat.unreported_s(time.monotonic()) > LATE_AFTER_S:
                 self._examine()
+
+    def _keep(self, multipart: ReceivedMultipart) -> None:
+        with suppress(DeltalightError):  # not understood, but a sign of life
+            message = decode(multipart)[0]
+            self.newest = message if isinstance(message, StatsMessage) else self.newest
 
     def _examine(self) -> None:
         if self._works():

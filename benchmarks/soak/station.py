@@ -24,11 +24,12 @@ from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services import ports
+from deltalight.services.child import ChildSpec
 from deltalight.services.demo import RECORDING, demo_scene
 from deltalight.services.host import HostPlan
 from deltalight.services.host_store import activate_document, session_file
 from deltalight.services.storage.store import Store
-from deltalight.services.supervisor import ChildSpec, Supervisor
+from deltalight.services.supervisor import Supervisor
 
 SERVER, WEB = "render server", "web process"
 REQUEST_TIMEOUT_S = 10.0
@@ -164,10 +165,12 @@ def running_station(profile: Profile, thread: LoopThread, seed: int) -> Iterator
         yield station
 
 
-def write_take(path: Path, size: tuple[int, int], frames_per_s: float) -> None:
+def write_take(
+    path: Path, size: tuple[int, int], frames_per_s: float, frames: Sequence[int] = STANDING
+) -> None:
     """Write what the nodes replay: frames of the demo in which nothing moves but noise, at another size and rate.
 
-    Pictures before and after a fault can be compared.
+    Pictures before and after a fault can be compared. `frames` are their numbers in the demo's recording.
 
     Raises:
         DeltalightError: the demo's recording is missing, or the file cannot be written.
@@ -175,9 +178,9 @@ def write_take(path: Path, size: tuple[int, int], frames_per_s: float) -> None:
     reader = RecordingReader(RECORDING)
     began_ns, period_ns = reader.timestamps_ns[0], round(1e9 / frames_per_s)
     with RecordingWriter(path, board=reader.board, extrinsics=reader.extrinsics) as writer:
-        for number in STANDING:
+        for number, shown in enumerate(frames):
             now_ns = began_ns + number * period_ns
-            frame = resized(reader[number], size)
+            frame = resized(reader[shown], size)
             writer.add(replace(frame, frame_id=number, timestamp_ns=now_ns, depth_timestamp_ns=now_ns))
 
 

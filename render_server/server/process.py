@@ -62,6 +62,11 @@ class ServerSettings(StrictModel):
     publish: str = Field(description="Endpoint for composites and stats.")
     control: str = Field(description="Endpoint for commands.")
     name: Name = Field(default="render-server", description="Name in topics and messages.")
+    epoch: int | None = Field(
+        default=None,
+        ge=1,
+        description="Which start of its room's render server this is; `ping` answers with it. null = no room's.",
+    )
     device: int | None = Field(default=None, ge=0, description="EGL device; null = the driver's first.")
     allow_software: bool = Field(default=False, description="Accept a renderer without a GPU.")
     jpeg_quality: int = Field(default=90, ge=1, le=100, description="Quality of published composites.")
@@ -251,6 +256,7 @@ def serve(
             scene,
             assembler=FrameAssembler(settings.pairing),
             name=settings.name,
+            epoch=settings.epoch,
             renderer_name=renderer_name,
             keep_scene=lambda kept: _keep(settings.session, kept),
             use_source=use_source,

@@ -101,9 +101,10 @@ class RenderSession:
     """Holds one scene, its renderer and the frames that wait for it.
 
     Frames are rendered in the views `watched`, too. `scene_id` is the sender's id of the scene, if given; `instance`
-    distinguishes this session from those before a restart. `keep_scene` is called with every accepted scene, so that
-    a restart can resume with it; `mailbox_drops` returns what the receiver dropped, by topic; `use_source` makes it
-    read other endpoints (None: those configured); `count_objects` returns what the GPU holds, by kind.
+    distinguishes this session from those before a restart, and `epoch` orders the render servers of a room.
+    `keep_scene` is called with every accepted scene, so that a restart can resume with it; `mailbox_drops` returns
+    what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those configured);
+    `count_objects` returns what the GPU holds, by kind.
     """
 
     def __init__(
@@ -113,6 +114,7 @@ class RenderSession:
         *,
         assembler: FrameAssembler | None = None,
         name: str = "render-server",
+        epoch: int | None = None,
         renderer_name: str = "",
         keep_scene: Callable[[SceneDocument], None] = lambda _scene: None,
         mailbox_drops: Callable[[], Mapping[str, int]] = dict,
@@ -130,6 +132,7 @@ class RenderSession:
         self._assembler = assembler or FrameAssembler()
         self._assembler.needs_depth = _needs_depth(scene)
         self._name = name
+        self._epoch = epoch
         self._renderer_name = renderer_name
         self._keep_scene = keep_scene
         self._mailbox_drops = mailbox_drops
@@ -238,7 +241,13 @@ class RenderSession:
         return commands[request.op](request)
 
     def _ping(self, _request: ControlRequest) -> dict[str, object]:
-        return {"scene_id": self.scene_id, "revision": self.scene.revision, "instance": self.instance}
+        epoch = {} if self._epoch is None else {"epoch": self._epoch}
+        return {
+            "scene_id": self.scene_id,
+            "revision": self.scene.revision,
+            "instance": self.instance,
+            **epoch,
+        }
 
     def _set_view(self, request: ControlRequest) -> dict[str, object]:
         """Changes the view; the sender of the previous scene does not know the result, so its id is dropped."""

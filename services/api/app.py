@@ -1,9 +1,8 @@
 """The web application: assembles routes, middleware and problem details."""
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +13,26 @@ from starlette.middleware import Middleware
 
 from deltalight import __version__
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import CompositeMessage, Message, StatsMessage
 from deltalight.services.api.auth import AuthMiddleware, AuthRules
-from deltalight.services.api.camera_finder import CameraFinder
-from deltalight.services.api.context import Context
-from deltalight.services.api.credentials import SecretToken, Tickets
-from deltalight.services.api.events import EventHub
-from deltalight.services.api.fisheye import FisheyeView
-from deltalight.services.api.live_hub import LiveHub
-from deltalight.services.api.metrics import Meter, Metrics
-from deltalight.services.api.models import ProcessAnswer
-from deltalight.services.api.pools import make_pools
-from deltalight.services.api.problems import Problems, describe_problems, responses
-from deltalight.services.api.recording_session import RecordingSession, RecordingSessions
-from deltalight.services.api.recording_store import RecordingStore
-from deltalight.services.api.recording_videos import RecordingVideos
-from deltalight.services.api.render_link import RenderLink
-from deltalight.services.api.replay_control import ReplayControl
+from deltalight.services.api.credentials import SecretToken
+from deltalight.services.api.metrics import Meter
+from deltalight.services.api.problems import describe_problems, responses
+from deltalight.services.api.room_paths import RoomPaths
+from deltalight.services.api.rooms import Rooms
 from deltalight.services.api.routes import (
     assets,
     live,
     recording_videos,
     recordings,
     room,
+    rooms,
     scenes,
     shelf,
     snapshots,
     state,
 )
 from deltalight.services.api.settings import ApiSettings
-from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.static_page import StaticPage
-from deltalight.services.api.streams import ProcessWatch, Sink, Streams
 from deltalight.services.live_message import LiveHeader
 from deltalight.services.storage.store import Store
 from deltalight.services.storage.tokens import Role
@@ -60,6 +47,7 @@ ROUTERS = (
     *recordings.ROUTERS,
     *recording_videos.ROUTERS,
     *snapshots.ROUTERS,
+    *rooms.ROUTERS,
     *state.ROUTERS,
 )
 ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # raised by the middleware, by a body, or by the disk
@@ -88,6 +76,11 @@ TAGS = [
     {"name": "recordings", "description": "Recordings of nodes, and the replay of one in place of them."},
     {"name": "snapshots", "description": "Pictures of one frame to keep, in any number of views."},
     {"name": "nodes", "description": "Nodes, render servers and cameras."},
+    {
+        "name": "rooms",
+        "description": "Rooms that run at once. `/rooms/NAME/...` is every route of this description, for the room "
+        "NAME; without, a route is for the first one.",
+    },
     {"name": "state", "description": "How the processes are doing."},
 ]
 
@@ -116,21 +109,17 @@ def _live_header_schemas() -> dict[str, Any]:
 
 def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) -> FastAPI:
     """Create the application, which talks to the render server while it runs. The caller closes the store."""
-    context = _context(settings, store, keys)
-    streams = Streams(settings.subscribe, _sinks(context), keys)
-    context.link.on_source = streams.use_source
+    all_rooms = Rooms(settings, store, keys)
+    contexts = all_rooms.contexts
+    context = next(iter(contexts.values()))
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        context.live.attach(asyncio.get_running_loop())
-        context.link.start()
-        streams.start()
+        for each in contexts.values():
+            each.live.attach(asyncio.get_running_loop())
+        all_rooms.start()
         yield
-        await run_in_threadpool(context.replay.close)
-        await run_in_threadpool(context.recording_sessions.close)
-        await run_in_threadpool(context.videos.close)
-        await run_in_threadpool(streams.close)
-        await run_in_threadpool(context.link.close)
+        await run_in_threadpool(all_rooms.close)
 
     rules = AuthRules(
         needs_token=settings.leaves_host,
@@ -149,6 +138,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         separate_input_output_schemas=False,
         generate_unique_id_function=lambda route: route.name,
         middleware=[
+            Middleware(RoomPaths),
             Middleware(Meter, metrics=context.metrics),
             Middleware(
                 AuthMiddleware,
@@ -160,7 +150,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
             ),
         ],
     )
-    app.state.context = context
+    app.state.context, app.state.contexts, app.state.rooms = context, contexts, all_rooms
     context.problems.install(app)
     for router in ROUTERS:
         app.include_router(router, prefix=PREFIX, responses=responses(*ANYWHERE))
@@ -175,66 +165,3 @@ def _secret_tokens(settings: ApiSettings) -> list[SecretToken]:
         (settings.view_token_file, "view"),
     )
     return [SecretToken(path, role) for path, role in files if path is not None]
-
-
-def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
-    events, watch, problems = EventHub(), ProcessWatch(), Problems()
-    link = RenderLink(
-        store,
-        settings.control,
-        keys,
-        on_delivery=lambda status: events.publish("picture", asdict(status)),
-    )
-    live_hub = LiveHub(link.watch)
-    recording_store = RecordingStore(store.folder / "recordings")
-
-    def publish_recording(session: RecordingSession, is_growing: bool) -> None:
-        body = recordings.recording_event(recording_store, session, is_growing=is_growing)
-        events.publish("recording", body)
-
-    replay = ReplayControl(
-        link,
-        settings.control,
-        publish=lambda position: events.publish("replay", recordings.replay_answer(position).model_dump()),
-        notice=lambda text: events.publish("notice", {"text": text}),
-        keys=keys,
-    )
-    return Context(
-        store=store,
-        link=link,
-        events=events,
-        live=live_hub,
-        fisheye=FisheyeView(),
-        watch=watch,
-        cameras=CameraFinder(),
-        tickets=Tickets(),
-        recordings=recording_store,
-        videos=RecordingVideos(recording_store),
-        recording_sessions=RecordingSessions(recording_store, settings.subscribe, publish_recording),
-        replay=replay,
-        snapshots=SnapshotStore(store.folder / "snapshots"),
-        settings=settings,
-        problems=problems,
-        metrics=Metrics(problems, watch, link, live_hub, events),
-        pools=make_pools(),
-    )
-
-
-def _sinks(context: Context) -> dict[str, Sink]:
-    """Route composites to viewers, radiance to the fish-eye view, and reports to the watch and to event listeners."""
-    return {
-        "composite": lambda message, parts: _publish_composite(context, message, parts),
-        "radiance": context.fisheye.note,
-        "stats": lambda message, _parts: _publish_report(context, message),
-    }
-
-
-def _publish_composite(context: Context, message: Message, parts: Sequence[memoryview]) -> None:
-    if isinstance(message, CompositeMessage) and message.encoding == "jpeg":
-        context.live.publish(message, [bytes(part) for part in parts], context.watch.detail(message.node))
-
-
-def _publish_report(context: Context, message: Message) -> None:
-    if isinstance(message, StatsMessage):
-        report = context.watch.note(message)
-        context.events.publish("process", ProcessAnswer.of(report).model_dump())

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 from typing import Annotated, Any, ParamSpec, TypeVar
 
@@ -27,6 +27,7 @@ from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.streams import ProcessWatch
 from deltalight.services.storage.documents import Edit
+from deltalight.services.storage.faults import NotFoundError
 from deltalight.services.storage.scenes import StoredScene
 from deltalight.services.storage.store import Store
 
@@ -50,7 +51,7 @@ class Precondition:
 
 @dataclass(frozen=True)
 class Context:
-    """The parts of the service that routes use."""
+    """The parts of the service that routes use, in one `room`; `others` are those of the other rooms."""
 
     store: Store
     link: RenderLink
@@ -69,6 +70,9 @@ class Context:
     problems: Problems
     metrics: Metrics
     pools: Mapping[PoolName, Pool]
+    room: str
+    server_name: str  # in its render server's messages, until there is one
+    others: list["Context"] = field(default_factory=list)
 
     def change(
         self, scene_id: str, edit: Edit, what: str, precondition: Precondition, response: Response
@@ -89,10 +93,22 @@ class Context:
         head = scene.head
         body = {"id": head.id, "revision": head.revision, "name": head.name, "what": scene.what}
         self.events.publish("scene", {**body, "active": head.is_active})
+        for other in self.others:
+            is_active = other.store.scenes.active_id() == head.id
+            other.events.publish("scene", {**body, "active": is_active})
+            if is_active:
+                other.link.look_again()
+
+
+ROOM_KEY = "deltalight.room"  # of a request's scope
 
 
 async def _context(connection: HTTPConnection) -> Context:
-    context = connection.app.state.context
+    contexts = connection.app.state.contexts
+    room = connection.scope.get(ROOM_KEY, next(iter(contexts)))
+    if room not in contexts:
+        raise NotFoundError(f"there is no room {room!r:.80}; list the rooms for their names.")
+    context = contexts[room]
     assert isinstance(context, Context)
     return context
 

@@ -3,7 +3,7 @@
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
@@ -22,8 +22,10 @@ EventType = Literal[
     "replay",
     "snapshot",
     "notice",
+    "rooms",
     "lost",
 ]
+IN_ALL_ROOMS: frozenset[EventType] = frozenset({"asset", "recording", "snapshot", "rooms"})
 
 
 @dataclass(eq=False)
@@ -60,20 +62,29 @@ class EventQueue:
 
 
 class EventHub:
-    """Publishes events to all listeners; each is encoded once, and slow listeners delay nobody."""
+    """Publishes events to all listeners; each is encoded once, and slow listeners delay nobody.
+
+    What all rooms share (assets, recordings) the `others`' listeners hear too.
+    """
 
     def __init__(self) -> None:
+        self.others: Sequence[EventHub] = ()
         self._queues: set[EventQueue] = set()
         self._lock = threading.Lock()
 
     def publish(self, type: EventType, body: Mapping[str, object]) -> None:
         """Publish an event (any thread); `body` is anything that pydantic serialises, models and times included."""
-        with self._lock:
-            queues = tuple(self._queues)
+        hubs = (self, *self.others) if type in IN_ALL_ROOMS else (self,)
+        queues = [queue for hub in hubs for queue in hub.queues()]
         if queues:
             text = packed(type, body)
             for queue in queues:
                 queue.put(text)
+
+    def queues(self) -> tuple[EventQueue, ...]:
+        """Return the queues of its own listeners."""
+        with self._lock:
+            return tuple(self._queues)
 
     @property
     def listeners(self) -> int:

@@ -54,6 +54,10 @@ class RecordingSessions:
         self._running: dict[str, RecordingSession] = {}
         self._lock = Lock()
 
+    def use_endpoints(self, endpoints: Sequence[str]) -> None:
+        """Record from these endpoints, in recordings that start from now on."""
+        self._endpoints = tuple(endpoints)
+
     def running(self) -> list[RecordingSession]:
         """Return the recordings in progress."""
         with self._lock:

@@ -61,20 +61,23 @@ class RenderLink:
     """Sends the active scene to the render server, immediately after a change and again after its restart.
 
     One thread always sends the newest revision: it skips changes that come faster than the server takes them.
-    Commands run in between, each after the changes that preceded it.
+    Commands run in between, each after the changes that preceded it. `control` is the server's endpoint, None while
+    there is no server.
     """
 
     def __init__(
         self,
         store: Store,
-        control: str,
+        control: str | None,
         keys: Keys | None = None,
         *,
         on_delivery: Callable[[DeliveryStatus], None] = lambda _status: None,
     ) -> None:
         self._store = store
         self._on_delivery = on_delivery
-        self._client = RequestClient(control, keys=keys)
+        self._keys = keys
+        self._client = None if control is None else RequestClient(control, keys=keys)
+        self._epoch: int | None = None  # that the server must have; None = any
         self._asking = FifoLock()  # held during requests to the server; guards the fields below
         self._changed = threading.Event()
         self._deliveries = Deliveries()
@@ -100,8 +103,25 @@ class RenderLink:
         if self._thread.is_alive():
             self._thread.join(timeout=ALIVE_TIMEOUT_S)
         # Otherwise it waits for a renderer that hangs: the process ends without it.
-        if not self._thread.is_alive():
+        if not self._thread.is_alive() and self._client is not None:
             self._client.close()
+
+    def follow(self, control: str | None, epoch: int | None) -> None:
+        """Talk to another render server from now on, of this epoch; one of another is taken for silent.
+
+        Requests to the one before end without an answer. The new one gets source, views and scene.
+        """
+        client = None if control is None else RequestClient(control, keys=self._keys)
+        before, self._client = self._client, client
+        if before is not None:
+            before.abandon()
+        with self._asking:
+            self._epoch, self._instance, self._has_scene = epoch, None, False
+            self._answers, self._look_due_s, self._sent_watched = None, 0.0, None
+            self._deliveries.forget()
+        self._changed.set()
+        if before is not None:
+            before.close()
 
     @property
     def is_reachable(self) -> bool:
@@ -149,6 +169,10 @@ class RenderLink:
     def watch(self, views: Sequence[ShownView]) -> None:
         """Have frames rendered in these views beside the scene's own, as soon as the server takes it."""
         self._watched = tuple(views)
+        self._changed.set()
+
+    def look_again(self) -> None:
+        """Send the active scene if it is not what the server has: somebody else changed it."""
         self._changed.set()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
@@ -247,7 +271,10 @@ class RenderLink:
         self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
     def _server_instance(self) -> str:
-        return str(self._request("ping", COMMAND_TIMEOUT_S)["instance"])
+        server = self._request("ping", COMMAND_TIMEOUT_S)
+        if self._epoch is not None and server.get("epoch") != self._epoch:
+            raise UnansweredError(f"The render server there is not the one of epoch {self._epoch}.")
+        return str(server["instance"])
 
     def _run(self) -> None:
         """Send changes; check the server at first, and after each second of silence."""
@@ -320,8 +347,11 @@ class RenderLink:
             scene_id=scene_id,
             revision=revision,
         )
+        client = self._client
+        if client is None:
+            raise UnansweredError("There is no render server now; see what the room waits for.")
         try:
-            reply = self._client.request(request, timeout_s)
+            reply = client.request(request, timeout_s)
         except EnvelopeError:
             raise
         except DeltalightError as fault:

@@ -42,7 +42,8 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
     ):
         if scene is not None:
             store.scenes.activate(import_scene(store, scene))
-        make_first_scene(store, settings, keys)
+        if settings.rooms is None:
+            make_first_scene(store, settings, keys)
         if settings.leaves_host:
             _announce_access(settings, store)
         for fault in PLUGINS.faults.values():
@@ -58,7 +59,8 @@ class _Server(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop serving."""
         assert isinstance(self.config.app, FastAPI)
-        self.config.app.state.context.live.close()
+        for context in self.config.app.state.contexts.values():
+            context.live.close()
         await super().shutdown(sockets)
 
 

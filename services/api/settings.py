@@ -37,6 +37,11 @@ class ApiSettings(StrictModel):
         default=(endpoint(COMPOSITE_PORT), endpoint(NODE_PORT)),
         description="Endpoints of the render server and of the nodes: pictures, and how they are doing.",
     )
+    rooms: str | None = Field(
+        default=None,
+        description="Endpoint of the directory of rooms, which says where their render servers and nodes are; null = "
+        "one room, at `control` and `subscribe`.",
+    )
     upload_limit_mb: int = Field(default=256, ge=1, le=512, description="Greatest size of an upload, MB.")
     recording_limit_mb: int = Field(
         default=4096, ge=1, le=65_536, description="Greatest size of an uploaded recording, MB."

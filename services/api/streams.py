@@ -114,6 +114,12 @@ class Streams:
         if before is not None:
             before.close()
 
+    def follow(self, endpoints: Sequence[str]) -> None:
+        """Listen to these endpoints in place of the earlier ones."""
+        with self._changing:
+            before, self._receiver = self._receiver, Receiver(endpoints, list(self._sinks), keys=self._keys)
+        before.close()
+
     def close(self) -> None:
         """Stop listening."""
         self._stop.set()

@@ -60,6 +60,9 @@ def serve(
         ),
     ] = None,
     node: NodeName = None,
+    rooms: Annotated[
+        str | None, typer.Option(help="Endpoint of the directory of rooms, for several rooms.")
+    ] = None,
     config_file: ConfigFile = None,
 ) -> None:
     """Serve the dashboard at /, and scenes, assets, live video and state at /api/v1, until Ctrl-C."""
@@ -77,12 +80,14 @@ def serve(
         "token_file": token_file,
         "view_token_file": view_token_file,
         "control": control,
+        "rooms": rooms,
     }
     configuration = load_configuration(config_file)
     key_settings = configuration.section("keys", KeySettings)
     given["subscribe"] = _subscriptions(subscribe, node, key_settings)
     settings = configuration.section("api", ApiSettings, {k: v for k, v in given.items() if v is not None})
-    run_api(settings, key_settings.load([settings.control, *settings.subscribe]), scene)
+    endpoints = [settings.control, *settings.subscribe] if settings.rooms is None else [settings.rooms]
+    run_api(settings, key_settings.load(endpoints), scene)
 
 
 @api.command()

@@ -8,7 +8,11 @@ EXAMPLES = {
     "demo": ("deltalight demo", "deltalight demo --headless --frames 30 -o pictures"),
     "node": ("deltalight node --source synthetic", "deltalight node --source take.mcap"),
     "server": ("deltalight server --scene scene.json",),
-    "up": ("deltalight up --source synthetic", "deltalight up --source take.mcap --scene scene.json"),
+    "up": (
+        "deltalight up --source synthetic",
+        "deltalight up --source take.mcap --scene scene.json",
+        "deltalight up --rooms rooms.yaml",
+    ),
     "record": ("deltalight record -o take.mcap --duration 10",),
     "replay": ("deltalight replay take.mcap",),
     "backup": ("deltalight backup station.zip",),

@@ -31,6 +31,10 @@ def server(
     control: Annotated[
         str | None, typer.Option(help="Endpoint for commands. Default: tcp://127.0.0.1:5603.")
     ] = None,
+    name: Annotated[str | None, typer.Option(help="Name in its messages. Default: render-server.")] = None,
+    epoch: Annotated[
+        int | None, typer.Option(min=1, help="Which start of its room's render server this is.")
+    ] = None,
     device: Annotated[
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
     ] = None,
@@ -52,6 +56,8 @@ def server(
         "subscribe": _subscriptions(subscribe, node, key_settings),
         "publish": publish,
         "control": control,
+        "name": name,
+        "epoch": epoch,
         "device": device,
         "allow_software": allow_software,
     }

@@ -1,16 +1,17 @@
 """`deltalight up`: all processes of one host, supervised."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.commands.options import ConfigFile, Data, NodeName, data_folder
-from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT
+from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT, ROOMS_PORT
 
 if TYPE_CHECKING:
-    from deltalight.protocol.source import Source
+    from deltalight.services.host import HostCommands
 
 
 def up(
@@ -48,17 +49,34 @@ def up(
             help="Keep a spare of each process, which replaces a dead one sooner (some 350 MB).",
         ),
     ] = True,
+    rooms: Annotated[
+        Path | None,
+        typer.Option(help="Rooms file: several rooms at once, each with nodes and a scene of its own."),
+    ] = None,
+    rooms_port: Annotated[
+        int, typer.Option(min=1, max=65535, help="Port of the directory of rooms, with --rooms.")
+    ] = ROOMS_PORT,
     config_file: ConfigFile = None,
 ) -> None:
     """Run node, render server and dashboard on this machine until Ctrl-C, and restart what fails.
 
-    With --node, no node is started: the render server uses one that is found on the network.
+    With --node, no node is started: the render server uses one that is found on the network. With --rooms, a file
+    says which nodes and render servers there are.
     """
-    from deltalight.services.host import HostPlan
+    from deltalight.services.host import HostCommands, HostPlan, recording_of
     from deltalight.services.host_store import scene_to_show, session_file
     from deltalight.services.storage.store import Store
     from deltalight.services.supervisor import Supervisor
 
+    if rooms is not None:
+        if source is not None or node is not None or scene is not None or device is not None:
+            raise DeltalightError(
+                "the rooms file says which sources, scenes and devices there are; leave out --source, --node,"
+                " --scene and --device."
+            )
+        commands = HostCommands(config_file, "info", spares, allow_software)
+        _run_rooms(rooms, commands, data_folder(data, config_file), port, rooms_port)
+        return
     if node is None:
         source = source or _configured_source(config_file)
     elif source is not None:
@@ -67,7 +85,7 @@ def up(
         )
     folder = data_folder(data, config_file)
     with Store(folder) as store:
-        shown = scene_to_show(store, _recording(source), scene)
+        shown = scene_to_show(store, recording_of(source), scene)
     with session_file(shown) as session:
         plan = HostPlan(
             source,
@@ -89,6 +107,18 @@ def up(
             supervisor.run()
 
 
+def _run_rooms(path: Path, commands: "HostCommands", data: Path, port: int, rooms_port: int) -> None:
+    from deltalight.services.rooms.host import RoomsHost
+    from deltalight.services.rooms.rooms_file import load_rooms
+
+    rooms = load_rooms(path)
+    with TemporaryDirectory(prefix="deltalight-") as folder:
+        host = RoomsHost(rooms, commands, data, Path(folder), port, rooms_port)
+        host.require_free_ports()
+        typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
+        host.run(lambda line: typer.echo(line, err=True))
+
+
 def _configured_source(config_file: Path | None) -> str:
     """Return the node's source of the configuration.
 
@@ -104,12 +134,3 @@ def _configured_source(config_file: Path | None) -> str:
             "up needs a source; name it with --source, or a node on the network with --node."
         )
     return config.source
-
-
-def _recording(source: str | None) -> "Source | None":
-    """Return the recording that a source names, None if it is a camera, or another host's."""
-    from deltalight.protocol.source import open_source
-    from deltalight.sensor_node.cameras.drivers import SYNTHETIC
-    from deltalight.sensor_node.cameras.open import is_live
-
-    return None if source is None or source == SYNTHETIC or is_live(source) else open_source(Path(source))

@@ -2,7 +2,8 @@
 
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,10 +57,27 @@ class Revision:
 
 
 class SceneStore:
-    """The scenes of a store."""
+    """The scenes of a store; which of them is active is a matter of the `room`, None = of a single one.
 
-    def __init__(self, database: Database) -> None:
+    `rooms` are all rooms that scenes may be active in.
+    """
+
+    def __init__(self, database: Database, room: str | None = None, rooms: Sequence[str] = ()) -> None:
         self._database = database
+        self._key = _active_key(room)
+        self._keys = {self._key, *map(_active_key, rooms)}
+
+    @contextmanager
+    def _reading(self) -> Iterator[Session]:
+        with self._database.reading() as session:
+            session.info[ACTIVE] = self._key
+            yield session
+
+    @contextmanager
+    def _writing(self) -> Iterator[Session]:
+        with self._database.writing() as session:
+            session.info[ACTIVE] = self._key
+            yield session
 
     def create(self, document: object, what: str = "created") -> StoredScene:
         """Store a new scene; its revisions begin at 1.
@@ -67,7 +85,7 @@ class SceneStore:
         Raises:
             DeltalightError: the document is wrong or names an asset that was not uploaded.
         """
-        with self._database.writing() as session:
+        with self._writing() as session:
             return self._add(session, document, what)
 
     def get(self, scene_id: str) -> StoredScene:
@@ -76,7 +94,7 @@ class SceneStore:
         Raises:
             NotFoundError: there is no such scene.
         """
-        with self._database.reading() as session:
+        with self._reading() as session:
             return _stored(session, _scene(session, scene_id), _newest(session, scene_id))
 
     def revision(self, scene_id: str, number: int) -> StoredScene:
@@ -85,7 +103,7 @@ class SceneStore:
         Raises:
             NotFoundError: there is no such scene or revision.
         """
-        with self._database.reading() as session:
+        with self._reading() as session:
             scene = _scene(session, scene_id)
             row = session.get(RevisionRow, (scene_id, number))
             if row is None:
@@ -106,7 +124,7 @@ class SceneStore:
             .where(SceneRow.deleted_ns.is_(None))
             .order_by(SceneRow.created_ns, SceneRow.id)
         )
-        with self._database.reading() as session:
+        with self._reading() as session:
             active = _active_id(session)
             return [_head(scene, row, active) for scene, row in session.execute(query)]
 
@@ -119,7 +137,7 @@ class SceneStore:
         query = select(RevisionRow).where(RevisionRow.scene_id == scene_id)
         if before is not None:
             query = query.where(RevisionRow.number < before)
-        with self._database.reading() as session:
+        with self._reading() as session:
             _scene(session, scene_id)
             rows = session.scalars(query.order_by(RevisionRow.number.desc()).limit(limit))
             return [Revision(row.number, row.at_ns, row.what, row.name, row.gesture) for row in rows]
@@ -136,7 +154,7 @@ class SceneStore:
             StaleRevisionError: `expected` is not the newest revision.
             DeltalightError: the changed document is wrong.
         """
-        with self._database.writing() as session:
+        with self._writing() as session:
             scene, newest = _scene(session, scene_id), _newest(session, scene_id)
             require_revision(expected, newest.number)
             current = _document(session, newest)
@@ -187,7 +205,7 @@ class SceneStore:
         Raises:
             NotFoundError: there is no such scene.
         """
-        with self._database.writing() as session:
+        with self._writing() as session:
             _scene(session, scene_id)
             document = _document(session, _newest(session, scene_id)).model_dump(mode="json")
             document["name"] = f"{document['name']} (copy)"[-200:] if name is None else name
@@ -200,10 +218,11 @@ class SceneStore:
             NotFoundError: there is no such scene.
             ConflictError: it is active, or `expected` is not its newest revision.
         """
-        with self._database.writing() as session:
+        with self._writing() as session:
             scene = _scene(session, scene_id)
             require_revision(expected, _newest(session, scene_id).number)
-            if _active_id(session) == scene_id:
+            choices = (session.get(ChoiceRow, key) for key in self._keys)
+            if any(choice is not None and choice.value == scene_id for choice in choices):
                 raise ConflictError("the scene is the active one; activate another, then delete it.")
             scene.deleted_ns = time.time_ns()
 
@@ -213,19 +232,24 @@ class SceneStore:
         Raises:
             NotFoundError: there is no such scene.
         """
-        with self._database.writing() as session:
+        with self._writing() as session:
             scene = _scene(session, scene_id)
-            session.merge(ChoiceRow(key=ACTIVE, value=scene_id))
+            session.merge(ChoiceRow(key=self._key, value=scene_id))
             session.flush()
             return _stored(session, scene, _newest(session, scene_id))
 
     def active(self) -> StoredScene | None:
         """Return the scene that is rendered, if one was chosen."""
-        with self._database.reading() as session:
+        with self._reading() as session:
             scene_id = _active_id(session)
             if scene_id is None:
                 return None
             return _stored(session, _scene(session, scene_id), _newest(session, scene_id))
+
+    def active_id(self) -> str | None:
+        """Return the id of the scene that is rendered, if one was chosen."""
+        with self._reading() as session:
+            return _active_id(session)
 
     def _add(self, session: Session, document: Any, what: str) -> StoredScene:  # noqa: ANN401 - JSON
         checked = checked_document(document, FIRST_REVISION)
@@ -238,7 +262,7 @@ class SceneStore:
     def _step(
         self, scene_id: str, expected: int | None, step: Callable[[Session, RevisionRow], RevisionRow]
     ) -> StoredScene:
-        with self._database.writing() as session:
+        with self._writing() as session:
             scene, newest = _scene(session, scene_id), _newest(session, scene_id)
             require_revision(expected, newest.number)
             row = step(session, newest)
@@ -327,9 +351,15 @@ def _document(session: Session, row: RevisionRow) -> SceneDocument:
     return checked_document(parse_mapping(text, "the stored scene", is_json=True), row.number)
 
 
+def _active_key(room: str | None) -> str:
+    return ACTIVE if room is None else f"{ACTIVE}.{room}"
+
+
 def _active_id(session: Session) -> str | None:
-    choice = session.get(ChoiceRow, ACTIVE)
-    return None if choice is None else choice.value
+    """Return the scene that is active in the session's room; one that was deleted while no such room ran is none."""
+    choice = session.get(ChoiceRow, session.info[ACTIVE])
+    scene = None if choice is None else session.get(SceneRow, choice.value)
+    return None if scene is None or scene.deleted_ns is not None else scene.id
 
 
 def _head(scene: SceneRow, row: RevisionRow, active: str | None) -> SceneHead:

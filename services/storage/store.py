@@ -1,6 +1,8 @@
 """Entry to the storage: one folder with a database and a folder of assets."""
 
+import copy
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
@@ -43,6 +45,12 @@ class Store:
 
     def __exit__(self, *_fault: object) -> None:
         self.close()
+
+    def of_room(self, room: str, rooms: Sequence[str]) -> Self:
+        """Return this store with the active scene of one of the `rooms`; it is closed with this one."""
+        own = copy.copy(self)
+        own.scenes = SceneStore(self._database, room, rooms)
+        return own
 
     @property
     def poster(self) -> Path:

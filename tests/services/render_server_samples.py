@@ -31,7 +31,8 @@ class Recorder:
     does.
     """
 
-    def __init__(self, control_port: int) -> None:
+    def __init__(self, control_port: int, epoch: int | None = None) -> None:
+        self.epoch = epoch
         self.asked: list[tuple[str, dict[str, object]]] = []
         self.fault: str | None = None
         self.scene_id: str | None = None
@@ -57,7 +58,12 @@ class Recorder:
         self.asked.append((request.op, dict(request.payload)))
         match request.op:
             case "ping":
-                return {"scene_id": self.scene_id, "revision": self.revision, "instance": self.instance}
+                return {
+                    "scene_id": self.scene_id,
+                    "revision": self.revision,
+                    "instance": self.instance,
+                    "epoch": self.epoch,
+                }
             case "set_scene":
                 self._wait_at_gate()
                 self.scene_id, self.revision = request.scene_id, request.revision or self.revision + 1

@@ -13,8 +13,9 @@ from deltalight.render_server.gpu.lost_context import GpuResetError, check_reset
 from deltalight.render_server.server.session import RenderSession
 from deltalight.services import ports
 from deltalight.services.api.streams import ProcessWatch
+from deltalight.services.child import ChildSpec
 from deltalight.services.cli import run
-from deltalight.services.supervisor import ChildSpec, Supervisor
+from deltalight.services.supervisor import Supervisor
 from tests.services.conftest import color, depth, pose
 from tests.services.render_server_samples import InvertingRenderer
 from tests.services.test_render_server_sockets import Node

@@ -13,8 +13,9 @@ import psutil
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.child import ChildSpec
 from deltalight.services.host import PREPARED
-from deltalight.services.supervisor import ChildSpec, Supervisor
+from deltalight.services.supervisor import Supervisor
 from deltalight.services.warm_spare import SPARE_VARIABLE
 
 SLEEP_FOREVER = "import time\nwhile True: time.sleep(60)"
@@ -93,7 +94,8 @@ def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
         f"pathlib.Path({str(pid_file)!r}).write_text(str(os.getpid())); time.sleep(600)"
     )
     parent = (
-        "from deltalight.services.supervisor import ChildSpec, Supervisor\n"
+        "from deltalight.services.child import ChildSpec\n"
+        "from deltalight.services.supervisor import Supervisor\n"
         f"with Supervisor([ChildSpec('child', ('-c', {child!r}))]) as supervisor: supervisor.run()"
     )
     process = subprocess.Popen([sys.executable, "-c", parent])
@@ -116,7 +118,7 @@ while True: time.sleep(60)
 
 
 def test_a_spare_takes_the_place_of_a_process_that_dies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deltalight.services.supervisor.SPARE_AFTER_S", 0.0)
+    monkeypatch.setattr("deltalight.services.child.SPARE_AFTER_S", 0.0)
     lines: list[str] = []
     spec = ChildSpec("a", ("-c", WARM_CHILD), warm=("colorsys",))
     with Supervisor([spec], forward=lines.append) as supervisor:
@@ -132,7 +134,7 @@ def test_a_spare_takes_the_place_of_a_process_that_dies(monkeypatch: pytest.Monk
 
 
 def test_a_dead_spare_is_nobodys_replacement(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deltalight.services.supervisor.SPARE_AFTER_S", 0.0)
+    monkeypatch.setattr("deltalight.services.child.SPARE_AFTER_S", 0.0)
     spec = ChildSpec("a", ("-c", WARM_CHILD), warm=("no_such_module",))
     with Supervisor([spec], forward=lambda _line: None) as supervisor:
         poll_until(supervisor, lambda: bool(supervisor.spare_ids()))

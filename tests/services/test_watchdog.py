@@ -14,8 +14,9 @@ from deltalight.protocol.messages import StatsMessage
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.services import ports
+from deltalight.services.child import ChildSpec
 from deltalight.services.host import HostPlan
-from deltalight.services.supervisor import ChildSpec, Supervisor
+from deltalight.services.supervisor import Supervisor
 from deltalight.services.watchdog import Heartbeat, Patience, Watchdog, processor_time_s
 
 PATIENCE = Patience(times=10, floor_s=20, start_s=120, deaf_s=300, longest_frame_s=1800)

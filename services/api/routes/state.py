@@ -19,8 +19,6 @@ state_router = APIRouter(tags=["state"])
 nodes_router = APIRouter(tags=["nodes"])
 ROUTERS = (state_router, nodes_router)
 
-RENDER_SERVER = "render-server"  # its name unless its settings give another
-
 
 class StreamState(BaseModel):
     """Whether pictures come."""
@@ -120,7 +118,8 @@ def settings(shared: Shared) -> Settings:
 def list_nodes(shared: Shared) -> list[NodeAnswer]:
     """List the nodes and render servers that are heard: state, rates, losses, clock, delays."""
     frame = shared.live.newest
-    return [_node(report, frame) for report in shared.watch.reports()]
+    server = shared.server_name if frame is None else frame.message.node
+    return [_node(report, frame, server) for report in shared.watch.reports()]
 
 
 @nodes_router.get("/cameras", responses=responses(503))
@@ -145,9 +144,9 @@ def _server(shared: Shared) -> Literal["answers", "silent"]:
     return "answers" if shared.link.is_reachable else "silent"
 
 
-def _node(report: Report, frame: LiveFrame | None) -> NodeAnswer:
+def _node(report: Report, frame: LiveFrame | None, server: str) -> NodeAnswer:
     message = report.message
-    renders = message.node == (RENDER_SERVER if frame is None else frame.message.node)
+    renders = message.node == server
     delays_ms = {"report": report.delay_ms, **(_picture_delays_ms(frame) if frame and renders else {})}
     return NodeAnswer(
         **ProcessAnswer.of(report).model_dump(),

@@ -1,10 +1,19 @@
 // Requests to the REST API; a refusal becomes one sentence.
+import { room } from "./room";
 import { token, tokenRefused } from "./session";
 import type { Problem } from "./types";
 
-export const API = "api/v1";
+/** Every route, for the first room. */
+export const ROOT = "api/v1";
+/** Every route, for the room that this page shows. */
+export const API = room === null ? ROOT : apiOf(room);
 const PROBLEM_PREFIX = "urn:deltalight:problem:";
 const JSON_TYPE = "application/json";
+
+/** Every route, for a room. */
+export function apiOf(name: string): string {
+  return `${ROOT}/rooms/${encodeURIComponent(name)}`;
+}
 
 /** A refusal: `message` is the sentence for people, `kind` the end of the problem's type. */
 export class ProblemError extends Error {

@@ -552,6 +552,106 @@ export interface paths {
         readonly patch: operations["change_replay"];
         readonly trace?: never;
     };
+    readonly "/api/v1/rooms": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * List Rooms
+         * @description List all rooms and slots.
+         */
+        readonly get: operations["list_rooms"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/rooms/{room}": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * Get Room
+         * @description Return one room.
+         */
+        readonly get: operations["get_room"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/rooms/{room}/drain": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly get?: never;
+        readonly put?: never;
+        /**
+         * Drain Room
+         * @description End the room's render server until it is started again; its slot is free for rooms that wait.
+         */
+        readonly post: operations["drain_room"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/rooms/{room}/move": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly get?: never;
+        readonly put?: never;
+        /**
+         * Move Room
+         * @description Move the room to another slot; it is shown from where it was until its pictures come from there.
+         */
+        readonly post: operations["move_room"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/rooms/{room}/start": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly get?: never;
+        readonly put?: never;
+        /**
+         * Start Room
+         * @description Start a room that was drained or has failed.
+         */
+        readonly post: operations["start_room"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/scenes": {
         readonly parameters: {
             readonly query?: never;
@@ -2398,6 +2498,17 @@ export interface components {
             readonly pose?: components["schemas"]["Pose"];
         };
         /**
+         * MoveOrder
+         * @description Where to move a room.
+         */
+        readonly MoveOrder: {
+            /**
+             * Slot
+             * @description A free slot; null = any.
+             */
+            readonly slot?: string | null;
+        };
+        /**
          * NewRecording
          * @description What to record; every key has a default.
          */
@@ -3137,6 +3248,104 @@ export interface components {
             readonly what: string;
         };
         /**
+         * RoomAnswer
+         * @description A room: whose frames it shows, with which scene, and how it is doing.
+         */
+        readonly RoomAnswer: {
+            /**
+             * Epoch
+             * @description Grows with each start of its render server.
+             */
+            readonly epoch: number | null;
+            /**
+             * Frames Per S
+             * @description Of its pictures.
+             */
+            readonly frames_per_s: number | null;
+            /**
+             * Last Frame S
+             * @description Seconds since its newest picture came.
+             */
+            readonly last_frame_s: number | null;
+            /**
+             * Moving To
+             * @description The slot in which its next render server starts.
+             */
+            readonly moving_to: string | null;
+            /**
+             * Name
+             * @description In addresses: `/rooms/NAME/...` is every route, for this room.
+             */
+            readonly name: string;
+            /**
+             * Nodes
+             * @description Its sensor nodes.
+             */
+            readonly nodes: readonly string[];
+            /**
+             * Restarts
+             * @description How often its render server was lost and placed again.
+             */
+            readonly restarts: number;
+            readonly scene: components["schemas"]["RoomScene"] | null;
+            /**
+             * Slot
+             * @description Where its render server runs; null = nowhere, or a single room.
+             */
+            readonly slot: string | null;
+            /**
+             * State
+             * @description `waiting` for a slot, or drained; `starting`; `running`; `failed` until it is started again.
+             * @enum {string}
+             */
+            readonly state: "waiting" | "starting" | "running" | "failed";
+            /**
+             * Title
+             * @description For people.
+             */
+            readonly title: string;
+            /**
+             * Why
+             * @description Why it waits, failed, or shows nothing; else empty.
+             */
+            readonly why: string;
+        };
+        /**
+         * RoomScene
+         * @description The scene that a room shows.
+         */
+        readonly RoomScene: {
+            /** Id */
+            readonly id: string;
+            /**
+             * Method
+             * @description How the real scene is relit.
+             */
+            readonly method: string;
+            /** Name */
+            readonly name: string;
+            /** Revision */
+            readonly revision: number;
+        };
+        /**
+         * RoomsAnswer
+         * @description All rooms and slots.
+         */
+        readonly RoomsAnswer: {
+            /**
+             * Can Move
+             * @description Whether rooms can be drained, started and moved here.
+             */
+            readonly can_move: boolean;
+            /** Rooms */
+            readonly rooms: readonly components["schemas"]["RoomAnswer"][];
+            /**
+             * Slots
+             * @description Empty for a single room.
+             */
+            readonly slots: readonly components["schemas"]["SlotStatus"][];
+        };
+        /**
          * SceneAnswer
          * @description A scene at one revision.
          */
@@ -3383,6 +3592,24 @@ export interface components {
             readonly id: string;
             /** Revision */
             readonly revision: number;
+        };
+        /**
+         * SlotStatus
+         * @description Room for one render server.
+         */
+        readonly SlotStatus: {
+            /**
+             * Device
+             * @description On which it renders.
+             */
+            readonly device: string;
+            /** Name */
+            readonly name: string;
+            /**
+             * Room
+             * @description Which room is in it; null = free.
+             */
+            readonly room: string | null;
         };
         /**
          * SnapshotFacts
@@ -3820,6 +4047,7 @@ export type LiveHeader = components['schemas']['LiveHeader'];
 export type Material = components['schemas']['Material'];
 export type MissingCameras = components['schemas']['MissingCameras'];
 export type ModelGeometry = components['schemas']['ModelGeometry'];
+export type MoveOrder = components['schemas']['MoveOrder'];
 export type NewRecording = components['schemas']['NewRecording'];
 export type NewReplay = components['schemas']['NewReplay'];
 export type NewSnapshot = components['schemas']['NewSnapshot'];
@@ -3841,6 +4069,9 @@ export type Region = components['schemas']['Region'];
 export type ReplayAnswer = components['schemas']['ReplayAnswer'];
 export type ReplayChange = components['schemas']['ReplayChange'];
 export type RevisionEntry = components['schemas']['RevisionEntry'];
+export type RoomAnswer = components['schemas']['RoomAnswer'];
+export type RoomScene = components['schemas']['RoomScene'];
+export type RoomsAnswer = components['schemas']['RoomsAnswer'];
 export type SceneAnswer = components['schemas']['SceneAnswer'];
 export type SceneDocument = components['schemas']['SceneDocument'];
 export type SceneObject = components['schemas']['SceneObject'];
@@ -3849,6 +4080,7 @@ export type Settings = components['schemas']['Settings'];
 export type Shading = components['schemas']['Shading'];
 export type ShelfAnswer = components['schemas']['ShelfAnswer'];
 export type ShownScene = components['schemas']['ShownScene'];
+export type SlotStatus = components['schemas']['SlotStatus'];
 export type SnapshotFacts = components['schemas']['SnapshotFacts'];
 export type SnapshotPicture = components['schemas']['SnapshotPicture'];
 export type SphereLight = components['schemas']['SphereLight'];
@@ -7093,6 +7325,500 @@ export interface operations {
                 };
             };
             /** @description Service Unavailable */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly list_rooms: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["RoomsAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Service Unavailable */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly get_room: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                /** @description The room's `name`. */
+                readonly room: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["RoomAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Service Unavailable */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly drain_room: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                /** @description The room's `name`. */
+                readonly room: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["RoomAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Conflict */
+            readonly 409: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly move_room: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                /** @description The room's `name`. */
+                readonly room: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/json": components["schemas"]["MoveOrder"];
+            };
+        };
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["RoomAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Conflict */
+            readonly 409: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly start_room: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                /** @description The room's `name`. */
+                readonly room: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["RoomAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Conflict */
+            readonly 409: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;

@@ -15,6 +15,8 @@ export type {
   Problem,
   ProcessAnswer,
   RevisionEntry,
+  RoomAnswer,
+  RoomsAnswer,
   State,
   SceneSummary,
   Settings,

@@ -7,6 +7,7 @@ import { ReconnectingSocket } from "../live/socket";
 import { readAssets, readShelf } from "./assets";
 import { readRevisions } from "./history";
 import { readState, takeReport } from "./processes";
+import { readRooms } from "./rooms";
 import { readScene, readScenes, scene, takePicture } from "./scene";
 import { readRecordings, readReplay, readSnapshots, replay } from "./takes";
 import { toast } from "./toasts";
@@ -42,6 +43,7 @@ export async function readAll(): Promise<void> {
     readRecordings(),
     readReplay(),
     readSnapshots(),
+    readRooms(),
   ]);
   await readRevisions();
   isRead.value = true;
@@ -72,6 +74,8 @@ async function take(event: Event): Promise<void> {
       takePictureEvent(event as unknown as PictureEvent);
       return;
     }
+    case "rooms":
+      return readRooms();
     case "notice": {
       toast(String(event.text));
       return;

@@ -1,7 +1,7 @@
 // How the live picture is doing: what is late is blamed on what the service says of it.
 import { computed, effect, signal } from "@preact/signals";
 import { connection, frame, lateMs } from "../live/picture";
-import { isSilent, processes, readState, RENDER_SERVER, renderServer } from "./processes";
+import { isSilent, processes, readState, renderServer, renderServerName } from "./processes";
 import { scene } from "./scene";
 import { replay } from "./takes";
 
@@ -35,7 +35,7 @@ function isAtWork(): boolean {
 export function isSending(): boolean {
   if (replay.value?.recording != null) return true;
   return [...processes.value.values()].some(
-    (seen) => seen.report.name !== RENDER_SERVER && (seen.report.rates.fps ?? 0) > 0 && !isSilent(seen),
+    (seen) => seen.report.name !== renderServerName.value && (seen.report.rates.fps ?? 0) > 0 && !isSilent(seen),
   );
 }
 

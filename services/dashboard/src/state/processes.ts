@@ -8,8 +8,8 @@ export interface Seen {
   readonly arrivedMs: number;
 }
 
-/** Its name among the processes. */
-export const RENDER_SERVER = "render-server";
+/** The render server's name among the processes; that of a room bears the room's. */
+export const renderServerName = signal("render-server");
 /** That of the node that replays a recording. */
 export const REPLAY = "replay";
 // Processes report once a second; so many misses are no accident.
@@ -23,7 +23,7 @@ export const hasFisheye = signal<boolean | null>(null);
 
 /** Whether a process has stopped reporting; the renderer reports between frames only, and answers meanwhile. */
 export function isSilent({ report, arrivedMs }: Seen): boolean {
-  if (report.name === RENDER_SERVER && renderServer.value === "answers") return false;
+  if (report.name === renderServerName.value && renderServer.value === "answers") return false;
   return performance.now() - arrivedMs > SILENT_MS;
 }
 

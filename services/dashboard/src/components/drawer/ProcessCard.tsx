@@ -1,6 +1,6 @@
 import { rate } from "../../live/picture";
 import { rateText, trimmed } from "../../math/units";
-import { isSilent, RENDER_SERVER, type Seen } from "../../state/processes";
+import { isSilent, renderServerName, type Seen } from "../../state/processes";
 
 const RATE_NAMES: Readonly<Record<string, string>> = { fps: "frames", without_board: "frames without the board" };
 
@@ -17,7 +17,7 @@ export function ProcessCard({ seen }: { readonly seen: Seen }) {
       </header>
       {report.detail && <p class="quiet small">{report.detail}</p>}
       <dl>
-        {report.name === RENDER_SERVER && <Row name="frames" value={rateText(rate.value)} />}
+        {report.name === renderServerName.value && <Row name="frames" value={rateText(rate.value)} />}
         {rates.map(([name, each]) => (
           <Row
             key={name}

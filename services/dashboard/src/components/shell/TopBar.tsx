@@ -2,8 +2,10 @@ import { role } from "../../api/session";
 import { needsToken, signOut } from "../../state/begin";
 import { redo, undo } from "../../state/history";
 import { isInspectorOpen, isTreeOpen } from "../../state/preferences";
+import { areRoomsShown, hasRooms, shownRoom } from "../../state/rooms";
 import { scene } from "../../state/scene";
 import { theme, toggleTheme } from "../../state/theme";
+import { Button } from "../ui/Button";
 import { IconButton } from "../ui/IconButton";
 import { Mark } from "../ui/Mark";
 import { areKeysShown } from "./KeysDialog";
@@ -28,6 +30,11 @@ export function TopBar() {
         <Mark />
         <span>Deltalight</span>
       </h1>
+      {hasRooms.value && (
+        <Button kind="plain" icon="room" title="All rooms" onClick={() => (areRoomsShown.value = true)}>
+          {shownRoom.value?.title}
+        </Button>
+      )}
       <SceneMenu />
       <span class="rule" />
       <IconButton

@@ -8,6 +8,7 @@ import { Boundary } from "../ui/Boundary";
 import { KeysDialog } from "./KeysDialog";
 import { listenToKeys } from "./shortcuts";
 import { NameDialog } from "./NameDialog";
+import { RoomsDialog } from "./RoomsDialog";
 import { TopBar } from "./TopBar";
 
 export function Workspace() {
@@ -32,6 +33,7 @@ export function Workspace() {
       <Drawer />
       <KeysDialog />
       <NameDialog />
+      <RoomsDialog />
     </div>
   );
 }

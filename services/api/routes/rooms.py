@@ -1,0 +1,198 @@
+"""Routes of the rooms: which there are, how they are doing, and where they run."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Depends, Path
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.requests import HTTPConnection
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.message_fields import NAME_PATTERN
+from deltalight.services.api.context import Context, Shared, in_pool
+from deltalight.services.api.problems import ProblemError, responses, unavailable
+from deltalight.services.api.rooms import Rooms
+from deltalight.services.rooms.directory import DRAIN, MOVE, START, SilentDirectoryError
+from deltalight.services.rooms.status import RoomList, RoomState, RoomStatus, SlotStatus
+from deltalight.services.storage.faults import ConflictError, NotFoundError
+
+router = APIRouter(tags=["rooms"])
+ROUTERS = (router,)
+
+NO_DIRECTORY = "The directory of rooms does not answer, or (with Retry-After) too many requests wait for it."
+SILENT = "The render server does not answer yet."
+
+
+class RoomScene(BaseModel):
+    """The scene that a room shows."""
+
+    id: str
+    name: str
+    revision: int
+    method: str = Field(description="How the real scene is relit.")
+
+
+class RoomAnswer(BaseModel):
+    """A room: whose frames it shows, with which scene, and how it is doing."""
+
+    name: str = Field(description="In addresses: `/rooms/NAME/...` is every route, for this room.")
+    title: str = Field(description="For people.")
+    state: RoomState = Field(
+        description="`waiting` for a slot, or drained; `starting`; `running`; `failed` until it is started again."
+    )
+    why: str = Field(description="Why it waits, failed, or shows nothing; else empty.")
+    nodes: list[str] = Field(description="Its sensor nodes.")
+    scene: RoomScene | None
+    slot: str | None = Field(description="Where its render server runs; null = nowhere, or a single room.")
+    moving_to: str | None = Field(description="The slot in which its next render server starts.")
+    epoch: int | None = Field(description="Grows with each start of its render server.")
+    restarts: int = Field(description="How often its render server was lost and placed again.")
+    frames_per_s: float | None = Field(description="Of its pictures.")
+    last_frame_s: float | None = Field(description="Seconds since its newest picture came.")
+
+
+class RoomsAnswer(BaseModel):
+    """All rooms and slots."""
+
+    rooms: list[RoomAnswer]
+    slots: list[SlotStatus] = Field(description="Empty for a single room.")
+    can_move: bool = Field(description="Whether rooms can be drained, started and moved here.")
+
+
+class MoveOrder(BaseModel):
+    """Where to move a room."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    slot: str | None = Field(None, max_length=64, description="A free slot; null = any.")
+
+
+async def _rooms(connection: HTTPConnection) -> Rooms:
+    rooms = connection.app.state.rooms
+    assert isinstance(rooms, Rooms)
+    return rooms
+
+
+AllRooms = Annotated[Rooms, Depends(_rooms)]
+RoomName = Annotated[str, Path(description="The room's `name`.", pattern=NAME_PATTERN, examples=["room"])]
+
+
+@router.get("/rooms")
+def list_rooms(rooms: AllRooms) -> RoomsAnswer:
+    """List all rooms and slots."""
+    return _answer(rooms)
+
+
+@router.get("/rooms/{room}", responses=responses(404))
+def get_room(rooms: AllRooms, room: RoomName) -> RoomAnswer:
+    """Return one room."""
+    return _one(_answer(rooms), room)
+
+
+@router.post("/rooms/{room}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
+@in_pool("render server")
+def drain_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
+    """End the room's render server until it is started again; its slot is free for rooms that wait."""
+    del shared
+    return _commanded(rooms, DRAIN, room)
+
+
+@router.post("/rooms/{room}/start", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
+@in_pool("render server")
+def start_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
+    """Start a room that was drained or has failed."""
+    del shared
+    return _commanded(rooms, START, room)
+
+
+@router.post("/rooms/{room}/move", responses={**responses(400, 404, 409), **unavailable(NO_DIRECTORY)})
+@in_pool("render server")
+def move_room(
+    shared: Shared,
+    rooms: AllRooms,
+    room: RoomName,
+    order: Annotated[MoveOrder, Body(examples=[{"slot": "slot-2"}])],
+) -> RoomAnswer:
+    """Move the room to another slot; it is shown from where it was until its pictures come from there."""
+    del shared
+    return _commanded(rooms, MOVE, room, order.slot)
+
+
+def _commanded(rooms: Rooms, op: str, room: str, slot: str | None = None) -> RoomAnswer:
+    _one(_answer(rooms), room)
+    if rooms.directory is None or rooms.follower is None:
+        raise ConflictError(
+            "this installation has a single room, which stays where it is; for several, use `deltalight up --rooms`."
+        )
+    try:
+        found = rooms.directory.command(op, room, slot)
+    except SilentDirectoryError as fault:
+        raise ProblemError(503, "directory", str(fault)) from fault
+    except DeltalightError as refusal:
+        raise ConflictError(str(refusal)) from refusal
+    return _one(_described(rooms.contexts, found), room)
+
+
+def _answer(rooms: Rooms) -> RoomsAnswer:
+    if rooms.follower is None:
+        (context,) = rooms.contexts.values()
+        return RoomsAnswer(rooms=[_single(context)], slots=[], can_move=False)
+    return _described(rooms.contexts, rooms.follower.newest)
+
+
+def _described(contexts: dict[str, Context], found: RoomList) -> RoomsAnswer:
+    answers = [_room(contexts[each.name], each) for each in found.rooms if each.name in contexts]
+    return RoomsAnswer(rooms=answers, slots=list(found.slots), can_move=True)
+
+
+def _one(answer: RoomsAnswer, room: str) -> RoomAnswer:
+    found = next((each for each in answer.rooms if each.name == room), None)
+    if found is None:
+        raise NotFoundError(f"there is no room {room!r:.80}; list the rooms for their names.")
+    return found
+
+
+def _room(context: Context, status: RoomStatus) -> RoomAnswer:
+    _, since_s = context.live.state()
+    return RoomAnswer(
+        name=status.name,
+        title=status.title,
+        state=status.state,
+        why=status.why,
+        nodes=[node.name for node in status.nodes],
+        scene=_scene(context),
+        slot=status.slot,
+        moving_to=status.moving_to,
+        epoch=None if status.endpoints is None else status.endpoints.epoch,
+        restarts=status.restarts,
+        frames_per_s=context.live.frames_per_s(),
+        last_frame_s=None if since_s is None else round(since_s, 3),
+    )
+
+
+def _single(context: Context) -> RoomAnswer:
+    _, since_s = context.live.state()
+    reports = [report.message.node for report in context.watch.reports()]
+    return RoomAnswer(
+        name=context.room,
+        title=context.room,
+        state="running" if context.link.is_reachable else "starting",
+        why="" if context.link.is_reachable else SILENT,
+        nodes=[name for name in reports if name != context.server_name],
+        scene=_scene(context),
+        slot=None,
+        moving_to=None,
+        epoch=None,
+        restarts=0,
+        frames_per_s=context.live.frames_per_s(),
+        last_frame_s=None if since_s is None else round(since_s, 3),
+    )
+
+
+def _scene(context: Context) -> RoomScene | None:
+    scene = context.store.scenes.active()
+    if scene is None:
+        return None
+    head = scene.head
+    return RoomScene(
+        id=head.id, name=head.name, revision=head.revision, method=scene.document.method.method_name()
+    )

@@ -1,0 +1,163 @@
+"""A child process of this host's: its command line, its start, its output, and whether it hangs.
+
+Each is a command line of its own (`python -P -m deltalight.services.cli ...`): one process, one OpenGL
+context. `-P` keeps Python from importing what lies in the folder where the command was called.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
+from deltalight.services.warm_spare import spare_environment, use_spare
+
+SPARE_AFTER_S = 4.0  # of a process's life: most have started by then
+STOP_TIMEOUT_S = 1.5  # then SIGKILL; all are gone within 2 s
+KEPT_LINES = 20
+
+
+class Watch(Protocol):
+    """Tells whether a process hangs (`watchdog.Watchdog`)."""
+
+    def fault(self) -> str | None:
+        """Return what shows that it hangs, None while nothing does."""
+
+    def close(self) -> None:
+        """Stop watching."""
+
+
+@dataclass(frozen=True)
+class ChildSpec:
+    """One supervised process: a name for display and the arguments after the interpreter.
+
+    `watch` is called with the id of each started process; what it returns tells whether that hangs. With `warm`, a
+    spare process that has prepared these (`warm_spare`) waits to take the place of one that dies.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    watch: Callable[[int], Watch] | None = None
+    warm: tuple[str, ...] = ()
+
+    @classmethod
+    def deltalight(cls, name: str, *arguments: str) -> "ChildSpec":
+        """Return a child that runs a command of this command line."""
+        return cls(name, ("-P", "-m", "deltalight.services.cli", *arguments))
+
+
+@dataclass
+class Child:
+    """A process of a `spec`, which may be started again; `forward` gets its lines, with its name before them."""
+
+    spec: ChildSpec
+    forward: Callable[[str], None]
+    process: subprocess.Popen[str] | None = None
+    spare: subprocess.Popen[str] | None = None
+    watch: Watch | None = None
+    started: int = 0
+    started_s: float = 0.0
+    deaths_s: deque[float] = field(default_factory=deque)
+    last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT_LINES))
+    reader: threading.Thread | None = None
+
+    def start(self, spare: subprocess.Popen[str] | None = None) -> None:
+        """Start it, by a process that waits for these arguments if there is one."""
+        self.last_lines.clear()
+        self.process = spare or self._take_spare() or open_process(self.spec.arguments, subprocess.DEVNULL)
+        self.started += 1
+        self.started_s = time.monotonic()
+        if self.spec.watch is not None:
+            self.watch = self.spec.watch(self.process.pid)
+        self.reader = threading.Thread(target=self._read, args=(self.process,), daemon=True)
+        self.reader.start()
+
+    def start_spare_if_due(self) -> None:
+        """Start a spare once the process itself has had the time to start; none again for one that died."""
+        due = self.spec.warm and self.process is not None and self.spare is None
+        if due and time.monotonic() - self.started_s >= SPARE_AFTER_S:
+            self.spare = open_spare(self.spec.arguments, self.spec.warm)
+
+    def _take_spare(self) -> subprocess.Popen[str] | None:
+        """Return the spare, which starts now, None if there is none."""
+        spare, self.spare = self.spare, None
+        return spare if spare is not None and use_spare(spare) else None
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr is not None
+        with process.stderr as lines:
+            for line in lines:
+                self.last_lines.append(line.rstrip())
+                self.forward(f"{self.spec.name}: {line.rstrip()}")
+
+    def last_sentence(self) -> str:
+        """Return the last line that the child wrote, without the command's name before it."""
+        if self.reader is not None:
+            self.reader.join(timeout=1.0)
+        line = next((line for line in reversed(self.last_lines) if line.strip()), "it said nothing")
+        return line.removeprefix("deltalight: ")
+
+    def end_if_hanging(self) -> None:
+        """Kill it if it hangs, and say so."""
+        fault = None if self.watch is None else self.watch.fault()
+        if fault is not None and self.process is not None:
+            self.forward(f"{self.spec.name}: {fault}; it is killed.")
+            self.process.kill()
+            self.process.wait()
+
+    def end_watching(self) -> None:
+        """Stop looking whether it hangs."""
+        if self.watch is not None:
+            self.watch.close()
+            self.watch = None
+
+    def end_reading(self) -> None:
+        """Wait shortly for its last lines."""
+        if self.reader is not None:
+            self.reader.join(timeout=0.2)
+
+
+def open_process(
+    arguments: Sequence[str], stdin: int, more: Mapping[str, str] | None = None
+) -> subprocess.Popen[str]:
+    """Start Python with these arguments, and `more` in the environment; it ends with this process."""
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        stdin=stdin,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        start_new_session=True,  # Ctrl-C reaches the supervisor only, which ends them in order
+        env={**os.environ, SUPERVISOR_VARIABLE: str(os.getpid()), **(more or {})},
+    )
+
+
+def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subprocess.Popen[str]:
+    """Start a process that prepares these (`warm_spare`) and waits."""
+    return open_process(arguments, subprocess.PIPE, spare_environment(prepared))
+
+
+def end_all(processes: Sequence[subprocess.Popen[str]]) -> None:
+    """End processes: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
+    try:
+        for process in processes:
+            process.terminate()
+        deadline_s = time.monotonic() + STOP_TIMEOUT_S
+        for process in processes:
+            _wait(process, deadline_s - time.monotonic())
+    finally:  # a second Ctrl-C must not leave orphans
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _wait(process: subprocess.Popen[str], timeout_s: float) -> None:
+    try:
+        process.wait(max(timeout_s, 0.0))
+    except subprocess.TimeoutExpired:
+        return

@@ -1,0 +1,84 @@
+"""`deltalight rooms`: the rooms of an installation, and which of them run where."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from deltalight.services.commands.options import ConfigFile
+from deltalight.services.ports import ROOMS_PORT, endpoint
+
+if TYPE_CHECKING:
+    from deltalight.services.rooms.directory import DirectoryClient
+    from deltalight.services.rooms.status import RoomList
+
+rooms = typer.Typer(
+    no_args_is_help=True, help="List, move, drain and start the rooms of `deltalight up --rooms`."
+)
+
+Room = Annotated[str, typer.Argument(help="Name of the room, as in the rooms file.")]
+Directory = Annotated[str, typer.Option(help="Endpoint of the directory of rooms.")]
+HERE = endpoint(ROOMS_PORT)
+
+
+@rooms.command("list")
+def list_rooms(
+    *,
+    directory: Directory = HERE,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
+    config_file: ConfigFile = None,
+) -> None:
+    """List rooms and slots: which rooms run, which wait, and why."""
+    found = _directory(directory, config_file).rooms()
+    if as_json:
+        typer.echo(found.model_dump_json(indent=2))
+    else:
+        _print_rooms(found)
+
+
+@rooms.command()
+def drain(room: Room, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
+    """End the render server of a room until it is started again; its slot is free for rooms that wait."""
+    _print_rooms(_directory(directory, config_file).command("drain", room))
+
+
+@rooms.command()
+def start(room: Room, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
+    """Start a room that was drained or has failed."""
+    _print_rooms(_directory(directory, config_file).command("start", room))
+
+
+@rooms.command()
+def move(
+    room: Room,
+    slot: Annotated[str | None, typer.Argument(help="Name of a free slot; default: any.")] = None,
+    *,
+    directory: Directory = HERE,
+    config_file: ConfigFile = None,
+) -> None:
+    """Move a room to another slot; it is shown from where it was until its pictures come from there."""
+    _print_rooms(_directory(directory, config_file).command("move", room, slot))
+
+
+def _directory(address: str, config_file: ConfigFile) -> "DirectoryClient":
+    from deltalight.protocol.keys import KeySettings
+    from deltalight.services.rooms.directory import DirectoryClient
+    from deltalight.services.settings import load_configuration
+
+    settings = load_configuration(config_file).section("keys", KeySettings)
+    return DirectoryClient(address, settings.load([address]))
+
+
+def _print_rooms(found: "RoomList") -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("Room", "State", "Slot", "Nodes", "Restarts", "Why", box=None)
+    for room in found.rooms:
+        slot = (room.slot or "") + (f" -> {room.moving_to}" if room.moving_to else "")
+        nodes = " ".join(node.name for node in room.nodes)
+        table.add_row(*map(escape, (room.name, room.state, slot, nodes, str(room.restarts), room.why)))
+    console = Console(soft_wrap=True)
+    console.print(table)
+    for place in found.slots:
+        console.print(escape(f"{place.name} ({place.device}): {place.room or 'free'}"))

@@ -1,0 +1,96 @@
+"""Follows the directory of rooms: the newest endpoints of each room, and no older ones."""
+
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+import structlog
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.rooms.status import RoomEndpoints, RoomList
+
+POLL_INTERVAL_S = 0.2
+
+log = structlog.get_logger()
+
+
+class Directory(Protocol):
+    """Knows all rooms (`directory.DirectoryClient`)."""
+
+    def rooms(self) -> RoomList:
+        """Return all rooms and slots; raises DeltalightError where it does not answer."""
+
+
+class RoomFollower:
+    """Asks a directory five times a second, in a thread between `start` and `close`.
+
+    Calls `on_endpoints(room, endpoints)` for each room whose render server is another, newer one, or (None) is gone,
+    and `on_change` when anything changed. Endpoints of an epoch before the newest are `refused`, and counted: a
+    directory or a render server that was cut off and comes back must not take the room over.
+    """
+
+    def __init__(
+        self,
+        directory: Directory,
+        on_endpoints: Callable[[str, RoomEndpoints | None], None],
+        on_change: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._directory = directory
+        self._on_endpoints, self._on_change = on_endpoints, on_change
+        self._epochs: dict[str, int] = {}  # the newest of each room
+        self._followed: dict[str, RoomEndpoints | None] = {}
+        self.refused = 0
+        self.newest = RoomList(rooms=(), slots=())
+        self._is_answered = True
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="room-follower", daemon=True)
+
+    def start(self) -> None:
+        """Start to follow."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop following."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def look(self) -> None:
+        """Ask once.
+
+        Raises:
+            DeltalightError: the directory does not answer.
+        """
+        self.take(self._directory.rooms())
+
+    def take(self, found: RoomList) -> None:
+        """Follow what a directory says."""
+        for room in found.rooms:
+            self._follow(room.name, room.endpoints)
+        before, self.newest = self.newest, found
+        if found != before:
+            self._on_change()
+
+    def _follow(self, room: str, endpoints: RoomEndpoints | None) -> None:
+        if endpoints is not None and endpoints.epoch < self._epochs.get(room, 0):
+            self.refused += 1
+            log.warning(
+                "stale endpoints refused", room=room, epoch=endpoints.epoch, newest=self._epochs[room]
+            )
+            return
+        if endpoints == self._followed.get(room):
+            return
+        if endpoints is not None:
+            self._epochs[room] = endpoints.epoch
+        self._followed[room] = endpoints
+        self._on_endpoints(room, endpoints)
+
+    def _run(self) -> None:
+        while not self._stop.wait(POLL_INTERVAL_S):
+            try:
+                self.look()
+                self._is_answered = True
+            except DeltalightError as fault:
+                if self._is_answered:
+                    log.warning("the directory of rooms does not answer", fault=str(fault))
+                self._is_answered = False

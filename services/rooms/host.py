@@ -1,0 +1,180 @@
+"""What `deltalight up --rooms` runs on one host: nodes, a render server per room with a slot, the web process."""
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import KeySettings
+from deltalight.protocol.scene import SceneDocument, load_scene
+from deltalight.protocol.source import Source
+from deltalight.services import ports
+from deltalight.services.child import ChildSpec
+from deltalight.services.discovery import node_endpoint
+from deltalight.services.host import PREPARED, HostCommands, recording_of
+from deltalight.services.host_store import activate_document, write_scene
+from deltalight.services.rooms.directory import DirectoryServer
+from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
+from deltalight.services.rooms.local_placer import LocalPlacer
+from deltalight.services.rooms.placer import Placement, RoomOrder
+from deltalight.services.rooms.rooms_file import RoomEntry, RoomsFile
+from deltalight.services.rooms.status import RoomNode
+from deltalight.services.settings import load_configuration
+from deltalight.services.storage.store import Store
+from deltalight.services.supervisor import POLL_INTERVAL_S, Supervisor
+
+NODE_RETRY_S = 10.0
+
+
+@dataclass(frozen=True)
+class RoomsHost:
+    """The rooms of a file on this host; `data` is the folder of scenes, `sessions` holds the session files."""
+
+    rooms: RoomsFile
+    commands: HostCommands
+    data: Path
+    sessions: Path
+    page_port: int = ports.PAGE_PORT
+    rooms_port: int = ports.ROOMS_PORT
+
+    def require_free_ports(self) -> None:
+        """Check the ports that have been chosen, before a child is started.
+
+        Raises:
+            DeltalightError: another program listens on one of them.
+        """
+        ports.require_free(self.page_port, "dashboard", "--port")
+        ports.require_free(self.rooms_port, "directory of rooms", "--rooms-port")
+
+    @cached_property
+    def node_ports(self) -> dict[str, int]:
+        """The port of each node of this host."""
+        here = [name for name, node in self.rooms.nodes.items() if node.source is not None]
+        return dict(zip(here, ports.private_ports(len(here)), strict=True))
+
+    def run(self, forward: Callable[[str], None], until: Callable[[], bool] = lambda: False) -> None:
+        """Keep everything running until `until` returns true.
+
+        Raises:
+            DeltalightError: a source, a scene, a key or a port cannot be used, or the web process keeps dying.
+        """
+        endpoints = self._node_endpoints()
+        plans = self._plans(endpoints)
+        with ExitStack() as stack:
+            placer = self.placer(forward)
+            stack.callback(placer.close)
+            keeper = RoomKeeper(plans, placer, forward)
+            directory = DirectoryServer(self.directory, keeper, self.commands.keys([self.directory]))
+            stack.callback(directory.close)
+            nodes = [NodeSupervisor(spec, forward) for spec in self._nodes()]
+            for node in nodes:
+                stack.callback(node.stop)
+            supervisor = stack.enter_context(Supervisor([self._web()], forward=forward))
+            while not until():
+                supervisor.poll()
+                keeper.note_nodes({node.name: node.fault for node in nodes if node.poll()})
+                keeper.poll()
+                time.sleep(POLL_INTERVAL_S)
+
+    @property
+    def directory(self) -> str:
+        """The endpoint of the directory of rooms."""
+        return ports.endpoint(self.rooms_port)
+
+    def placer(self, forward: Callable[[str], None]) -> LocalPlacer:
+        """Return the placer of this host."""
+        spare = replace(self.commands.child("spare", "server"), warm=PREPARED["server"])
+        return LocalPlacer(
+            self.rooms.devices,
+            self._server,
+            spare=spare if self.commands.spares else None,
+            keys=self.commands.keys([self.directory]),
+            forward=forward,
+        )
+
+    def _server(self, order: RoomOrder, placement: Placement, device: int | None) -> ChildSpec:
+        sources = [word for source in order.sources for word in ("--subscribe", source)]
+        identity = ("--name", order.room, "--epoch", str(order.epoch))
+        endpoints = placement.publish, placement.control
+        label = f"room {order.room}"
+        spec = self.commands.server(label, order.session_file, *endpoints, device, *identity, *sources)
+        return replace(spec, warm=())  # the placer has one spare for all rooms
+
+    def _nodes(self) -> list[ChildSpec]:
+        specs = []
+        for name, node in self.rooms.nodes.items():
+            if node.source is not None:
+                publish = ports.endpoint(self.node_ports[name])
+                more = ("--name", name, "--loop")
+                specs.append(self.commands.node(f"node {name}", node.source, publish, self.directory, *more))
+        return specs
+
+    def _web(self) -> ChildSpec:
+        return self.commands.web(self.data, self.page_port, "--rooms", self.directory)
+
+    def _node_endpoints(self) -> dict[str, str]:
+        settings = load_configuration(self.commands.config).section("keys", KeySettings)
+        found = {}
+        for name, node in self.rooms.nodes.items():
+            if node.found is not None:
+                found[name] = node_endpoint(node.found, settings)
+            else:
+                found[name] = ports.endpoint(self.node_ports[name])
+        return found
+
+    def _plans(self, endpoints: Mapping[str, str]) -> list[RoomPlan]:
+        plans = []
+        with Store(self.data) as store:
+            for name, room in self.rooms.rooms.items():
+                source = recording_of(self.rooms.nodes[room.nodes[0]].source)
+                document = room_scene(store.of_room(name, tuple(self.rooms.rooms)), name, room, source)
+                path = self.sessions / f"{name}.json"
+                write_scene(path, document)
+                nodes = tuple(RoomNode(name=node, endpoint=endpoints[node]) for node in room.nodes)
+                plans.append(RoomPlan(name, room.title, nodes, path))
+        return plans
+
+
+class NodeSupervisor:
+    """Keeps a node running; one that is given up is tried again every ten seconds, and stops no other process."""
+
+    def __init__(self, spec: ChildSpec, forward: Callable[[str], None]) -> None:
+        self.name = spec.name.removeprefix("node ")
+        self.fault = ""
+        self._spec, self._forward = spec, forward
+        self._supervisor = Supervisor([spec], forward=forward).__enter__()
+        self._again_s = 0.0
+
+    def poll(self) -> bool:
+        """Look after it; return whether it does not run, for the reason `fault`."""
+        try:
+            if not self.fault:
+                self._supervisor.poll()
+            elif time.monotonic() >= self._again_s:
+                self._supervisor, self.fault = Supervisor([self._spec], forward=self._forward).__enter__(), ""
+        except DeltalightError as fault:
+            self._supervisor.stop()
+            self.fault, self._again_s = str(fault), time.monotonic() + NODE_RETRY_S
+            self._forward(f"{self._spec.name}: {fault} It is tried again in {NODE_RETRY_S:.0f} s.")
+        return bool(self.fault)
+
+    def stop(self) -> None:
+        """End it."""
+        self._supervisor.stop()
+
+
+def room_scene(store: Store, name: str, room: RoomEntry, source: Source | None) -> SceneDocument:
+    """Return the document that a room shows first: its active one, else a copy of its file's or its recording's.
+
+    Raises:
+        DeltalightError: the document or one of its files is wrong.
+    """
+    active = store.scenes.active()
+    if active is not None:
+        return store.assets.localised(active.document)
+    brought = None if source is None else source.scene
+    document = brought or SceneDocument() if room.scene is None else load_scene(room.scene)
+    return activate_document(store, document.replaced(name=room.title or name))

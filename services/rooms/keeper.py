@@ -1,0 +1,217 @@
+"""Keeps rooms running: gives each a slot, places it again when its render server is lost, moves and drains it.
+
+A room that waits is placed as soon as a slot is free: those that lost their render server first, then by the time
+that they have waited.
+"""
+
+import itertools
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from deltalight.protocol.documents import nearest
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, Placer, RoomOrder
+from deltalight.services.rooms.status import (
+    RoomEndpoints,
+    RoomList,
+    RoomNode,
+    RoomState,
+    RoomStatus,
+    SlotStatus,
+)
+
+MAXIMUM_FAILED_STARTS = 3  # in a row
+
+
+@dataclass(frozen=True)
+class RoomPlan:
+    """A room to keep; `session_file` holds its scene document, which survives a change of its render server."""
+
+    name: str
+    title: str
+    nodes: tuple[RoomNode, ...]
+    session_file: Path
+
+
+@dataclass(eq=False)
+class _Room:
+    plan: RoomPlan
+    queued: int  # place in the order of those that wait; lost rooms come first
+    state: RoomState = "waiting"
+    why: str = "It has not been started yet."
+    placement: Placement | None = None
+    successor: Placement | None = None  # in the slot that it moves to
+    shows: bool = False
+    drained: bool = False
+    failed_starts: int = 0
+    restarts: int = 0
+
+    def wait(self, why: str) -> None:
+        self.state, self.why, self.placement, self.shows = "waiting", why, None, False
+
+    def run_as(self, placement: Placement) -> None:
+        self.state, self.why, self.placement, self.shows = "starting", "", placement, False
+
+
+class RoomKeeper:
+    """Decides where rooms run; `notice` gets a line for each change. Any thread may call it."""
+
+    def __init__(
+        self, plans: Sequence[RoomPlan], placer: Placer, notice: Callable[[str], None] = lambda _line: None
+    ) -> None:
+        self._placer, self._notice = placer, notice
+        self._queue = itertools.count()
+        self._epochs = itertools.count(1)
+        self._rooms = {plan.name: _Room(plan, next(self._queue)) for plan in plans}
+        self._faults: Mapping[str, str] = {}  # of nodes
+        self._lock = threading.Lock()
+
+    def poll(self) -> None:
+        """Learn what happened, then place the rooms that wait."""
+        with self._lock:
+            for event in self._placer.watch():
+                self._note(event)
+            self._place_waiting()
+
+    def note_nodes(self, faults: Mapping[str, str]) -> None:
+        """Note which nodes do not run, and why."""
+        self._faults = faults
+
+    def status(self) -> RoomList:
+        """Return all rooms, in their order, and slots."""
+        with self._lock:
+            rooms = tuple(self._described(room) for room in self._rooms.values())
+            slots = tuple(SlotStatus(**vars(slot)) for slot in self._placer.slots())
+        return RoomList(rooms=rooms, slots=slots)
+
+    def drain(self, name: str) -> None:
+        """End a room's render server until `start`.
+
+        Raises:
+            DeltalightError: there is no such room.
+        """
+        with self._lock:
+            room = self._room(name)
+            for placement in (room.placement, room.successor):
+                if placement is not None:
+                    self._placer.release(placement)
+            room.successor, room.drained = None, True
+            room.wait(f"It was drained; `deltalight rooms start {name}` starts it again.")
+            self._notice(f"room {name}: drained.")
+
+    def start(self, name: str) -> None:
+        """Start a room that was drained or has failed.
+
+        Raises:
+            DeltalightError: there is no such room.
+        """
+        with self._lock:
+            room = self._room(name)
+            if room.placement is not None:
+                return
+            room.drained, room.failed_starts, room.queued = False, 0, next(self._queue)
+            room.wait("It is about to start.")
+
+    def move(self, name: str, slot: str | None = None) -> None:
+        """Start a room's next render server in this slot, or a free one; once that shows frames, the old one ends.
+
+        Raises:
+            DeltalightError: there is no such room, it does not run or moves already, or the slot is not free.
+        """
+        with self._lock:
+            room = self._room(name)
+            if room.state != "running" or room.placement is None:
+                raise DeltalightError(f"the room {name} is {room.state}; move it when it runs.")
+            if room.successor is not None:
+                raise DeltalightError(f"the room {name} moves to {room.successor.slot} already; wait for it.")
+            room.successor = self._placer.place(self._order(room), slot)
+            self._notice(f"room {name}: moves from {room.placement.slot} to {room.successor.slot}.")
+
+    def _room(self, name: str) -> _Room:
+        if name not in self._rooms:
+            hint = nearest(name, self._rooms) or ", ".join(self._rooms)
+            raise DeltalightError(f"there is no room {name[:80]}; did you mean {hint}?")
+        return self._rooms[name]
+
+    def _order(self, room: _Room) -> RoomOrder:
+        sources = tuple(node.endpoint for node in room.plan.nodes)
+        return RoomOrder(room.plan.name, next(self._epochs), sources, room.plan.session_file)
+
+    def _note(self, event: PlacementEvent) -> None:
+        for room in self._rooms.values():
+            if room.placement is not None and room.placement.epoch == event.epoch:
+                if event.kind == "lost":
+                    self._lose(room, event)
+                else:
+                    self._hear(room, event)
+            elif room.successor is not None and room.successor.epoch == event.epoch:
+                self._note_successor(room, event)
+
+    def _hear(self, room: _Room, event: PlacementEvent) -> None:
+        if room.state == "starting":
+            self._notice(f"room {room.plan.name}: runs.")
+        room.state, room.shows, room.failed_starts = "running", event.shows, 0
+        names = ", ".join(node.name for node in room.plan.nodes)
+        room.why = "" if event.shows else f"No frames come from {names}."
+
+    def _lose(self, room: _Room, event: PlacementEvent) -> None:
+        room.failed_starts = room.failed_starts + 1 if room.state == "starting" else 0
+        room.restarts += 1
+        self._notice(f"room {room.plan.name}: {event.detail}")
+        if room.successor is not None:
+            successor, room.successor = room.successor, None
+            room.run_as(successor)
+        elif event.refused or room.failed_starts >= MAXIMUM_FAILED_STARTS:
+            room.wait(event.detail)
+            room.state = "failed"
+        else:
+            room.wait(event.detail)
+            room.queued = min(each.queued for each in self._rooms.values()) - 1
+
+    def _note_successor(self, room: _Room, event: PlacementEvent) -> None:
+        successor, before = room.successor, room.placement
+        assert successor is not None
+        assert before is not None
+        if event.kind == "lost":
+            room.successor = None
+            self._notice(f"room {room.plan.name}: it stays in {before.slot}: {event.detail}")
+        elif event.shows or not room.shows:
+            room.successor = None
+            room.run_as(successor)
+            self._hear(room, event)
+            self._placer.release(before)
+
+    def _place_waiting(self) -> None:
+        waiting = [room for room in self._rooms.values() if room.state == "waiting" and not room.drained]
+        for room in sorted(waiting, key=lambda each: each.queued):
+            try:
+                placement = self._placer.place(self._order(room))
+            except NoSlotError as fault:
+                room.why = f"It starts when a slot is free: {fault}"
+            else:
+                room.run_as(placement)
+                self._notice(f"room {room.plan.name}: starts in {placement.slot}.")
+
+    def _described(self, room: _Room) -> RoomStatus:
+        placement = room.placement
+        endpoints = None
+        if placement is not None:
+            endpoints = RoomEndpoints(
+                epoch=placement.epoch, publish=placement.publish, control=placement.control
+            )
+        faults = [
+            f"{node.name}: {self._faults[node.name]}" for node in room.plan.nodes if node.name in self._faults
+        ]
+        return RoomStatus(
+            name=room.plan.name,
+            title=room.plan.title or room.plan.name,
+            nodes=room.plan.nodes,
+            state=room.state,
+            why=" ".join(filter(None, (room.why, *faults))),
+            slot=None if placement is None else placement.slot,
+            endpoints=endpoints,
+            moving_to=None if room.successor is None else room.successor.slot,
+            restarts=room.restarts,
+        )

@@ -1,0 +1,113 @@
+"""The rooms file of `deltalight up --rooms`: the nodes, the rooms that show them, and the slots that rooms run in."""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from deltalight.protocol.documents import StrictModel, nearest, read_mapping, validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.message_fields import Name
+from deltalight.sensor_node.cameras.drivers import SYNTHETIC
+from deltalight.sensor_node.cameras.open import is_live
+
+MAX_ROOMS = 64
+MAX_NODES = 16  # that one render server reads
+
+Device = Annotated[int, Field(ge=0)] | None
+
+
+class NodeEntry(StrictModel):
+    """A sensor node: one of this host with its `source`, or one `found` on the network by its name."""
+
+    source: str | None = Field(
+        default=None,
+        min_length=1,
+        description="Camera, dataset folder, .mcap recording or `synthetic`; relative to the rooms file.",
+    )
+    found: Name | None = Field(
+        default=None, description="Name under which a node of another host announces itself."
+    )
+
+    @model_validator(mode="after")
+    def _is_one_of_both(self) -> Self:
+        if (self.source is None) == (self.found is None):
+            raise ValueError("give either the source of a node here, or the name of one that is found")
+        return self
+
+
+class RoomEntry(StrictModel):
+    """A room: whose frames it shows, and the scene that it begins with."""
+
+    nodes: tuple[Name, ...] = Field(
+        min_length=1,
+        max_length=MAX_NODES,
+        description="Nodes of this file that it shows; rooms may share one.",
+    )
+    scene: Path | None = Field(
+        default=None,
+        description="Scene document to import and show; null = the last one shown, else the recording's.",
+    )
+    title: str = Field(default="", max_length=200, description="For people; empty = its name.")
+
+
+class RoomsFile(StrictModel):
+    """Nodes and rooms by name, and `slots`: how many rooms run at once, or the EGL device of each slot."""
+
+    slots: Annotated[int, Field(ge=1, le=MAX_ROOMS)] | Annotated[tuple[Device, ...], Field(min_length=1)] = (
+        Field(
+            default=1,
+            description="How many rooms run at once on this host, or a list with the EGL device of each slot.",
+        )
+    )
+    nodes: dict[Name, NodeEntry] = Field(min_length=1, max_length=MAX_ROOMS)
+    rooms: dict[Name, RoomEntry] = Field(min_length=1, max_length=MAX_ROOMS)
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Self:
+        for name, room in self.rooms.items():
+            if name in self.nodes:
+                raise ValueError(f"{name} is both a node and a room; give the room another name")
+            if len(set(room.nodes)) < len(room.nodes):
+                raise ValueError(f"the room {name} names a node twice; name each once")
+            for node in room.nodes:
+                if node not in self.nodes:
+                    hint = nearest(node, self.nodes) or ", ".join(self.nodes)
+                    raise ValueError(f"the room {name} shows the unknown node {node}; did you mean {hint}?")
+        return self
+
+    @property
+    def devices(self) -> tuple[int | None, ...]:
+        """The EGL device of each slot; None = the driver's first."""
+        return (None,) * self.slots if isinstance(self.slots, int) else self.slots
+
+
+def load_rooms(path: Path) -> RoomsFile:
+    """Read a rooms file (YAML or JSON); paths in it become absolute.
+
+    Raises:
+        DeltalightError: it is missing, malformed, or names what it does not define.
+    """
+    rooms = validate(RoomsFile, read_mapping(path, unique_keys=True), str(path))
+    folder = path.absolute().parent
+    nodes = {name: _placed(node, folder) for name, node in rooms.nodes.items()}
+    entries = {name: _with_scene(name, room, folder) for name, room in rooms.rooms.items()}
+    return rooms.replaced(nodes=nodes, rooms=entries)
+
+
+def _placed(node: NodeEntry, folder: Path) -> NodeEntry:
+    source = node.source
+    if source is None or source == SYNTHETIC or is_live(source):
+        return node
+    return node.replaced(source=str(folder / source))
+
+
+def _with_scene(name: str, room: RoomEntry, folder: Path) -> RoomEntry:
+    if room.scene is None:
+        return room
+    scene = folder / room.scene
+    if not scene.is_file():
+        raise DeltalightError(
+            f"the scene {scene} of the room {name} is not there; name a scene document that is."
+        )
+    return room.replaced(scene=scene)

@@ -1,0 +1,56 @@
+"""What is said of rooms: by the keeper to the directory, from there to the web process and the command line."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.message_fields import Name
+
+RoomState = Literal["waiting", "starting", "running", "failed"]
+
+
+class RoomNode(StrictModel):
+    """A sensor node of a room."""
+
+    name: Name
+    endpoint: str = Field(description="Of its streams.")
+
+
+class RoomEndpoints(StrictModel):
+    """Endpoints of a room's render server; those with a newer epoch replace them."""
+
+    epoch: int = Field(ge=1, description="Counts the starts of render servers, of all rooms together.")
+    publish: str = Field(description="Pictures and reports.")
+    control: str = Field(description="Commands.")
+
+
+class RoomStatus(StrictModel):
+    """A room: whose frames it shows, how it is doing and where."""
+
+    name: Name
+    title: str = ""
+    nodes: tuple[RoomNode, ...] = Field(min_length=1)
+    state: RoomState = Field(
+        description="`waiting` for a slot, or drained; `starting`; `running`; `failed` until it is started again."
+    )
+    why: str = Field("", description="Why it waits, failed, or shows nothing; else empty.")
+    slot: str | None = Field(None, description="Where its render server runs.")
+    endpoints: RoomEndpoints | None = None
+    moving_to: str | None = Field(None, description="The slot in which its next render server starts.")
+    restarts: int = Field(0, ge=0, description="How often its render server was lost and placed again.")
+
+
+class SlotStatus(StrictModel):
+    """Room for one render server."""
+
+    name: str
+    device: str = Field(description="On which it renders.")
+    room: str | None = Field(description="Which room is in it; null = free.")
+
+
+class RoomList(StrictModel):
+    """All rooms and slots of an installation."""
+
+    rooms: tuple[RoomStatus, ...]
+    slots: tuple[SlotStatus, ...]

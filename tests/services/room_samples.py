@@ -1,0 +1,89 @@
+"""Rooms for tests: a placer of stand-ins in this process, plans, and a directory that a web process follows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from deltalight.services import ports
+from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
+from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, RoomOrder, Slot
+from deltalight.services.rooms.status import RoomNode
+from tests.services.render_server_samples import Recorder
+
+
+def plans(folder: Path, *names: str) -> list[RoomPlan]:
+    """Rooms that all show one node, at which nobody listens."""
+    node = RoomNode(name="desk", endpoint=ports.endpoint(ports.private_ports(1)[0]))
+    return [RoomPlan(name, f"The {name}", (node,), folder / f"{name}.json") for name in names]
+
+
+@dataclass
+class StandInPlacer:
+    """Places nothing, or (with `answers`) control sockets that answer as a render server of the epoch does."""
+
+    slot_names: Sequence[str] = ("slot-1", "slot-2")
+    answers: bool = False
+    placed: dict[str, Placement] = field(default_factory=dict)
+    released: list[Placement] = field(default_factory=list)
+    events: list[PlacementEvent] = field(default_factory=list)
+    servers: dict[int, Recorder] = field(default_factory=dict)
+
+    def slots(self) -> list[Slot]:
+        rooms = {name: placement.room for name, placement in self.placed.items()}
+        return [Slot(name, "default", rooms.get(name)) for name in self.slot_names]
+
+    def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
+        free = [name for name in self.slot_names if name not in self.placed]
+        if not free or slot not in (None, *free):
+            raise NoSlotError("no slot is free.")
+        publish, control = ports.private_ports(2)
+        chosen = slot or free[0]
+        if self.answers:
+            self.servers[order.epoch] = Recorder(control, epoch=order.epoch)
+        placement = Placement(
+            order.room, order.epoch, chosen, ports.endpoint(publish), ports.endpoint(control)
+        )
+        self.placed[chosen] = placement
+        return placement
+
+    def release(self, placement: Placement) -> None:
+        if self.placed.get(placement.slot) == placement:
+            del self.placed[placement.slot]
+            self.released.append(placement)
+            self._end(placement.epoch)
+
+    def watch(self) -> list[PlacementEvent]:
+        found, self.events = self.events, []
+        return found
+
+    def close(self) -> None:
+        for epoch in list(self.servers):
+            self._end(epoch)
+
+    def report(self, room: str, *, shows: bool = True, slot: str | None = None) -> None:
+        """Have the render server of a room report."""
+        self.events.append(PlacementEvent(self.of(room, slot).epoch, "reported", shows=shows))
+
+    def lose(self, room: str, *, refused: bool = False, slot: str | None = None) -> None:
+        """Have the render server of a room die."""
+        placement = self.of(room, slot)
+        del self.placed[placement.slot]
+        self._end(placement.epoch)
+        self.events.append(PlacementEvent(placement.epoch, "lost", "It broke.", refused=refused))
+
+    def of(self, room: str, slot: str | None = None) -> Placement:
+        """The placement of a room, in this slot if it is in two."""
+        found = (each for each in self.placed.values() if each.room == room and slot in (None, each.slot))
+        return next(found)
+
+    def _end(self, epoch: int) -> None:
+        if epoch in self.servers:
+            self.servers.pop(epoch).close()
+
+
+def running(keeper: RoomKeeper, placer: StandInPlacer, *names: str) -> None:
+    """Place rooms and have them report."""
+    keeper.poll()
+    for name in names:
+        placer.report(name)
+    keeper.poll()

@@ -1,0 +1,156 @@
+"""Which room runs where: slots, losses, moves and drains, with a placer that places nothing."""
+
+from pathlib import Path
+
+import pytest
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.rooms.keeper import MAXIMUM_FAILED_STARTS, RoomKeeper
+from deltalight.services.rooms.status import RoomStatus
+from tests.services.room_samples import StandInPlacer, plans, running
+
+
+@pytest.fixture
+def placer() -> StandInPlacer:
+    return StandInPlacer()
+
+
+@pytest.fixture
+def keeper(placer: StandInPlacer, tmp_path: Path) -> RoomKeeper:
+    return RoomKeeper(plans(tmp_path, "hall", "door", "attic"), placer)
+
+
+def rooms(keeper: RoomKeeper) -> dict[str, RoomStatus]:
+    return {room.name: room for room in keeper.status().rooms}
+
+
+def states(keeper: RoomKeeper) -> list[str]:
+    return [room.state for room in keeper.status().rooms]
+
+
+def epoch(keeper: RoomKeeper, name: str) -> int:
+    endpoints = rooms(keeper)[name].endpoints
+    assert endpoints is not None
+    return endpoints.epoch
+
+
+def test_a_room_without_a_slot_waits_and_says_so_until_one_is_free(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    assert states(keeper) == ["waiting"] * 3
+    keeper.poll()
+    assert states(keeper) == ["starting", "starting", "waiting"]
+    running(keeper, placer, "hall", "door")
+    assert states(keeper) == ["running", "running", "waiting"]
+    assert "no slot is free" in rooms(keeper)["attic"].why
+    assert [slot.room for slot in keeper.status().slots] == ["hall", "door"]
+    keeper.drain("hall")
+    keeper.poll()
+    running(keeper, placer, "attic")
+    assert states(keeper) == ["waiting", "running", "running"]
+    assert "was drained" in rooms(keeper)["hall"].why
+    assert rooms(keeper)["attic"].slot == "slot-1"
+
+
+def test_a_lost_room_is_placed_again_before_those_that_wait_with_a_newer_epoch(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    running(keeper, placer, "hall", "door")
+    before, other = epoch(keeper, "hall"), epoch(keeper, "door")
+    placer.lose("hall")
+    keeper.poll()
+    assert states(keeper) == ["starting", "running", "waiting"]
+    assert epoch(keeper, "hall") > before
+    assert epoch(keeper, "door") == other
+    assert rooms(keeper)["hall"].restarts == 1
+
+
+def test_a_room_that_ran_is_never_given_up(keeper: RoomKeeper, placer: StandInPlacer) -> None:
+    for _ in range(20):
+        running(keeper, placer, "hall")
+        placer.lose("hall")
+        keeper.poll()
+    assert states(keeper)[0] == "starting"
+    assert rooms(keeper)["hall"].restarts == 20
+
+
+def test_a_room_that_never_starts_fails_and_frees_its_slot(keeper: RoomKeeper, placer: StandInPlacer) -> None:
+    keeper.poll()
+    for _ in range(MAXIMUM_FAILED_STARTS):
+        placer.lose("hall")
+        keeper.poll()
+    assert states(keeper) == ["failed", "starting", "starting"]
+    assert rooms(keeper)["hall"].why == "It broke."
+    keeper.drain("door")
+    keeper.start("hall")
+    running(keeper, placer, "hall")
+    assert states(keeper) == ["running", "waiting", "starting"]
+
+
+def test_a_room_whose_input_is_refused_fails_at_once(keeper: RoomKeeper, placer: StandInPlacer) -> None:
+    keeper.poll()
+    placer.lose("door", refused=True)
+    keeper.poll()
+    assert states(keeper) == ["starting", "failed", "starting"]
+
+
+def test_a_room_moves_once_its_pictures_come_from_the_new_slot(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    keeper.drain("attic")
+    keeper.drain("door")
+    running(keeper, placer, "hall")
+    before = epoch(keeper, "hall")
+    keeper.move("hall", "slot-2")
+    placer.report("hall", shows=False, slot="slot-2")
+    keeper.poll()
+    assert (epoch(keeper, "hall"), rooms(keeper)["hall"].moving_to) == (before, "slot-2")
+    placer.report("hall", slot="slot-2")
+    keeper.poll()
+    moved = rooms(keeper)["hall"]
+    assert (moved.slot, moved.moving_to, moved.state, moved.restarts) == ("slot-2", None, "running", 0)
+    assert epoch(keeper, "hall") > before
+    assert [each.slot for each in placer.released] == ["slot-1"]
+
+
+def test_a_move_that_fails_leaves_the_room_where_it_is(keeper: RoomKeeper, placer: StandInPlacer) -> None:
+    keeper.drain("attic")
+    keeper.drain("door")
+    running(keeper, placer, "hall")
+    keeper.move("hall")
+    placer.lose("hall", slot="slot-2")
+    keeper.poll()
+    stays = rooms(keeper)["hall"]
+    assert (stays.slot, stays.moving_to, stays.state) == ("slot-1", None, "running")
+
+
+def test_a_room_that_dies_while_it_moves_goes_on_in_the_new_slot(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    keeper.drain("attic")
+    keeper.drain("door")
+    running(keeper, placer, "hall")
+    keeper.move("hall")
+    placer.lose("hall", slot="slot-1")
+    keeper.poll()
+    assert (rooms(keeper)["hall"].slot, states(keeper)[0]) == ("slot-2", "starting")
+
+
+def test_what_cannot_be_done_is_one_sentence(keeper: RoomKeeper, placer: StandInPlacer) -> None:
+    keeper.poll()
+    with pytest.raises(DeltalightError, match="no room halll; did you mean hall"):
+        keeper.drain("halll")
+    with pytest.raises(DeltalightError, match="the room attic is waiting; move it when it runs"):
+        keeper.move("attic")
+    running(keeper, placer, "hall", "door")
+    with pytest.raises(DeltalightError, match="no slot is free"):
+        keeper.move("hall")
+    assert states(keeper) == ["running", "running", "waiting"]
+
+
+def test_a_room_says_which_node_is_away(keeper: RoomKeeper, placer: StandInPlacer) -> None:
+    keeper.poll()
+    placer.report("hall", shows=False)
+    keeper.note_nodes({"desk": "The camera is gone; plug it in."})
+    keeper.poll()
+    assert rooms(keeper)["hall"].why == "No frames come from desk. desk: The camera is gone; plug it in."

@@ -1,0 +1,80 @@
+"""The rooms file: what it says, and what is refused by one sentence."""
+
+from pathlib import Path
+
+import pytest
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.rooms.rooms_file import RoomsFile, load_rooms
+
+GOOD = """
+slots: [0, null]
+nodes:
+  desk: {source: take.mcap}
+  shop: {source: synthetic}
+  far: {found: garden}
+rooms:
+  hall: {nodes: [desk], scene: hall.json, title: The hall}
+  door: {nodes: [desk, far]}
+"""
+
+
+def loaded(folder: Path, text: str) -> RoomsFile:
+    path = folder / "rooms.yaml"
+    path.write_text(text)
+    return load_rooms(path)
+
+
+def test_paths_are_relative_to_the_file_and_rooms_may_share_a_node(tmp_path: Path) -> None:
+    (tmp_path / "hall.json").write_text("{}")
+    rooms = loaded(tmp_path, GOOD)
+    assert rooms.nodes["desk"].source == str(tmp_path / "take.mcap")
+    assert rooms.nodes["shop"].source == "synthetic"
+    assert rooms.rooms["hall"].scene == tmp_path / "hall.json"
+    assert [room.nodes for room in rooms.rooms.values()] == [("desk",), ("desk", "far")]
+    assert rooms.devices == (0, None)
+
+
+def test_a_number_of_slots_is_so_many_on_the_first_device(tmp_path: Path) -> None:
+    text = "slots: 3\nnodes: {desk: {source: synthetic}}\nrooms: {hall: {nodes: [desk]}}"
+    assert loaded(tmp_path, text).devices == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [b]}}", "shows the unknown node b; did you mean a"),
+        ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a]}, hall: {nodes: [a]}}", "`hall` comes twice"),
+        ("nodes: {a: {source: s}, a: {source: t}}\nrooms: {hall: {nodes: [a]}}", "`a` comes twice"),
+        ("nodes: {a: {source: s}}\nrooms: {a: {nodes: [a]}}", "a is both a node and a room"),
+        ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a, a]}}", "the room hall names a node twice"),
+        ("nodes: {a: {}}\nrooms: {hall: {nodes: [a]}}", "give either the source of a node here"),
+        ("nodes: {a: {source: s, found: t}}\nrooms: {hall: {nodes: [a]}}", "give either the source"),
+        ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: []}}", "`rooms.hall.nodes` is wrong"),
+        ("nodes: {a: {source: s}}\nrooms: {}", "`rooms` is wrong"),
+        ("nodes: {a: {source: s}}\nrooms: {ha/ll: {nodes: [a]}}", "is wrong"),
+        ("slots: 0\nnodes: {a: {source: s}}\nrooms: {hall: {nodes: [a]}}", "`slots` is wrong"),
+        ("slots: []\nnodes: {a: {source: s}}\nrooms: {hall: {nodes: [a]}}", "`slots` is wrong"),
+        (
+            "nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a], scene: no.json}}",
+            "of the room hall is not there",
+        ),
+        ("nodes: {a: {source: s}}\nroom: {}", "the nearest known key is `rooms`"),
+        ("- hall", "must hold keys and values"),
+        ("nodes: {a: [", "is not valid YAML"),
+    ],
+)
+def test_what_cannot_be_right_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(DeltalightError) as refused:
+        loaded(tmp_path, text)
+    assert sentence in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_doubled_keys_of_json_are_refused_too(tmp_path: Path) -> None:
+    path = tmp_path / "rooms.json"
+    path.write_text(
+        '{"nodes": {"a": {"source": "s"}}, "rooms": {"h": {"nodes": ["a"]}, "h": {"nodes": ["a"]}}}'
+    )
+    with pytest.raises(DeltalightError, match="`h` comes twice"):
+        load_rooms(path)
