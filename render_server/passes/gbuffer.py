@@ -14,7 +14,8 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
-from deltalight.render_server.scene.materials import TextureMap, map_edge, map_table, resampled
+from deltalight.render_server.scene.materials import map_table
+from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
 from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from deltalight.render_server.view import CameraView, Rectangle
 

@@ -19,7 +19,8 @@ from deltalight.render_server.scene.gltf_document import (
     faults_named,
     read_nodes,
 )
-from deltalight.render_server.scene.materials import Material, TextureReader
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.texture_maps import TextureReader
 from deltalight.render_server.scene.triangle_mesh import (
     MAX_COORDINATE_M,
     ConvertedMesh,

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.render_server.scene import materials
-from deltalight.render_server.scene.materials import TextureMap, map_edge
+from deltalight.render_server.scene import texture_maps
 from deltalight.render_server.scene.mesh_loading import load_asset
+from deltalight.render_server.scene.texture_maps import TextureMap, map_edge
 from deltalight.services.storage.asset_facts import mesh_facts
 from tests.render_server.gltf_samples import Plate, edited, even
 
@@ -99,7 +99,7 @@ def test_textures_that_are_described_wrongly_are_refused_in_a_sentence(
 
 
 def test_the_pixels_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(materials, "MAX_FILE_PIXELS", 31)
+    monkeypatch.setattr(texture_maps, "MAX_FILE_PIXELS", 31)
     plate = textured()
     load_asset(plate.write(tmp_path / "one.glb"))
     plate = textured()
@@ -110,8 +110,8 @@ def test_the_pixels_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_large_pictures_are_reduced_in_linear_light(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whole pixels first, then areas; a few rows at a time, and all of them."""
-    monkeypatch.setattr(materials, "MAX_TEXTURE_EDGE", 16)
-    monkeypatch.setattr(materials, "_DECODED_ROWS", 200)
+    monkeypatch.setattr(texture_maps, "MAX_TEXTURE_EDGE", 16)
+    monkeypatch.setattr(texture_maps, "_DECODED_ROWS", 200)
     plate = Plate(1, 1)
     codes = (np.indices((40, 72)).sum(axis=0) % 2 * 255)[..., None].repeat(3, axis=2)
     plate.material["emissiveTexture"] = plate.texture(codes)

@@ -74,64 +74,6 @@ def test_only_what_a_change_reaches_runs_again(graph: Graph, calls: Calls) -> No
     assert graph["e"] == 15
 
 
-def lagging(graph: Graph, calls: Calls, turns: int) -> tuple[Resource[int], Resource[int]]:
-    """`late` and `later`, which may lag behind the source `moves` but not behind `other`; `shown` reads all."""
-    moves, other = graph.source("moves", "objects"), graph.source("other", "world")
-    with graph.lagging(turns, moves):
-        late = graph.stage("late", calls("late"), moves, other)
-        later = graph.stage("later", calls("later"), late)
-    graph.stage("shown", calls("shown"), moves, later)
-    moves.write(0)
-    other.write(0)
-    graph.begin_frame()
-    graph.run()
-    calls.taken()
-    return moves, other
-
-
-def shown_frames(graph: Graph, moves: Resource[int], values: list[int]) -> list[int]:
-    """What each frame shows of sources that are written before it: 2 moves if nothing lags."""
-    found = []
-    for value in values:
-        graph.begin_frame()
-        moves.write(value, eq)
-        graph.run()
-        found.append(graph["shown"])
-    return found
-
-
-@pytest.mark.parametrize(
-    ("turns", "expected"),
-    [(1, [2, 4, 6, 8, 10]), (2, [2, 3, 6, 7, 10]), (3, [2, 3, 4, 8, 9])],
-)
-def test_stages_may_lag_behind_what_keeps_changing(
-    graph: Graph, calls: Calls, turns: int, expected: list[int]
-) -> None:
-    moves, _ = lagging(graph, calls, turns)
-    assert shown_frames(graph, moves, [1, 2, 3, 4, 5]) == expected
-
-
-def test_stages_that_lag_catch_up_in_the_next_frame_without_a_change(graph: Graph, calls: Calls) -> None:
-    moves, _ = lagging(graph, calls, 2)
-    assert shown_frames(graph, moves, [1, 2]) == [2, 3]
-    assert graph.is_lagging
-    calls.taken()
-    assert shown_frames(graph, moves, [2, 2]) == [4, 4]
-    assert not graph.is_lagging
-    assert calls.taken() == ["late", "later", "shown"]
-    assert shown_frames(graph, moves, [5]) == [10]  # the first change after rest shows at once
-
-
-def test_stages_lag_behind_nothing_else(graph: Graph, calls: Calls) -> None:
-    moves, other = lagging(graph, calls, 2)
-    assert shown_frames(graph, moves, [1]) == [2]
-    graph.begin_frame()
-    moves.write(2)
-    other.write(10)
-    graph.run()
-    assert graph["shown"] == 2 + 2 + 10
-
-
 def test_versions_count_changes(graph: Graph, calls: Calls) -> None:
     a, _ = diamond(graph, calls)
     assert (a.version, graph.resource("c").version) == (1, 0)
