@@ -178,7 +178,7 @@ def test_an_end_of_the_service_leaves_nothing_of_a_video(
     pytest.importorskip("av")
     folder, is_encoding = tmp_path / "recordings", threading.Event()
     (folder / ".cache").mkdir(parents=True)
-    write(folder / "take.mcap", frames(4))
+    write(folder / "take.mcap", frames(100))  # 20 s
     (folder / ".cache" / ".take.1.tmp.mp4").write_bytes(b"of a killed process")
     added = VideoWriter.add
 

@@ -5,7 +5,6 @@
 #include "common/volume.glsl"
 #include "common/lights.glsl"
 #include "common/low_res_grid.glsl"
-#include "common/continuation.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
 #ifdef REUSES
@@ -64,10 +63,8 @@ void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
     SurfacePoint s = surface_point(texel);
-    vec3 to_camera = camera_position - s.position;
-    float margin = grid_margin((camera_from_world * vec4(s.position, 1.0)).z, s.normal, normalize(to_camera));
     bool reached = s.present && (is_in_lit_area(real_pixel(texel)) || volume_fade(volume_coordinate(s.position)) > 0.0
-        || object_may_shadow(s.position, 0.0, margin));
+        || object_may_shadow(s.position, 0.0, true));
     if (!reached) leave(texel, s);
     else if (!remembered(texel, s)) append_texel(texel, low_resolution_size.x);
 }

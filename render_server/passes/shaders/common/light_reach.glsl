@@ -14,14 +14,15 @@ bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, 
 #elif defined(REAL_SHADOWS)
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return false; }
 #else
-bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_may_shadow(p, bias, 0.0); }
+bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_may_shadow(p, bias, false); }
 #endif
 
 float shadow_bias(float depth) { return 3.0 * noise_sigma * depth * depth; }
 
 // Whether cones change the light here: in the volume, or so close that a texel of the reduced grid beside it is inside.
 bool cones_may_reach(vec4 position, vec3 normal) {
-    float margin_m = grid_margin(position.w, normal, normalize(camera_position - position.xyz));
+    vec3 away = normalize(camera_position - position.xyz);
+    float margin_m = 2.0 * sample_distance * position.w / max(dot(normal, away), 0.1);
     vec3 place = position.xyz - volume_origin + margin_m;
     return inside_cube(place, float(volume_size) * voxel_edge + 2.0 * margin_m);
 }

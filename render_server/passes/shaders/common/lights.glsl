@@ -328,28 +328,27 @@ float texels_to_caster(LightView view, vec2 s) {
     return max(from_inside - outside, outside);
 }
 
-// Whether a virtual object can stand between any part of a light and a point at most `margin` (m) from p.
-bool object_may_block(Light light, vec3 p, float bias, float margin) {
+// Whether a virtual object can stand between p and any part of a light; `in_box`: or anything that fills their map.
+bool object_may_block(Light light, vec3 p, float bias, bool in_box) {
     bool found = false;
     for (int j = light.views.z; j < light.views.z + light.views.w && !found; ++j) {
         LightView view = light_views[j];
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
-        float depth = v.z + margin, texel = 2.0 * view.tile.w / view.tile.z;
-        if (depth - bias <= view.range.x) continue;
+        if (v.z - bias <= view.range.x) continue;
         vec2 s = lateral(view, v);
-        Spread k = spread_of(light, view, s, depth);
-        float reach = k.widest * drift(view, depth, view.range.x) * (k.square ? sqrt(2.0) : 1.0);
-        reach += view.range.z > 0.5 ? margin : margin * (1.0 + length(s)) / max(v.z - margin, 1e-3);
-        found = texels_to_caster(view, s) <= reach / texel + COMPARED_TEXELS;
+        Spread k = spread_of(light, view, s, v.z);
+        float texel = 2.0 * view.tile.w / view.tile.z, reach = k.widest * drift(view, v.z, view.range.x);
+        found = in_box ? all(lessThanEqual(abs(s), vec2(view.tile.w + reach)))
+                       : texels_to_caster(view, s) <= reach * (k.square ? sqrt(2.0) : 1.0) / texel + COMPARED_TEXELS;
     }
     return found;
 }
 
-// Whether a virtual object can stand between any part of any light and a point at most `margin` (m) from p.
-bool object_may_shadow(vec3 p, float bias, float margin) {
+// The same of all lights.
+bool object_may_shadow(vec3 p, float bias, bool in_box) {
     for (int i = 0; i < light_count; ++i) {
         vec2 shown = mirror_fraction(lights[i], p);
-        if (shown.x != shown.y || object_may_block(lights[i], p, bias, margin)) return true;
+        if (shown.x != shown.y || object_may_block(lights[i], p, bias, in_box)) return true;
     }
     return false;
 }
@@ -444,7 +443,7 @@ float real_visibility(Light light, vec3 p, vec3 n, float bias) {
 // 3). `bias_real`, `bias_virtual` (m) move the receiver towards the light.
 vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {
     Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
-    int views = object_may_block(light, p, bias_virtual, 0.0) ? light.views.w : 0;
+    int views = object_may_block(light, p, bias_virtual, false) ? light.views.w : 0;
     Occluder object = occluder(virtual_light_depth, light, light.views.z, views, p, n, bias_virtual);
     return mirror_fraction(light, p) * visible_fraction(light, real, object, p, n);
 }
