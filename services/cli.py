@@ -41,7 +41,7 @@ from deltalight.services.commands.up import up
 from deltalight.services.commands.virtual_camera import virtual_camera
 from deltalight.services.logs import configure_logging
 from deltalight.services.parent_death_signal import end_with_supervisor
-from deltalight.services.signals import Terminated, raise_on_sigterm
+from deltalight.services.signals import Terminated, raise_signals
 from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
@@ -124,7 +124,7 @@ def _global_options(
 
 def main() -> None:
     """Run the command line of this process and exit with its code."""
-    raise_on_sigterm()
+    raise_signals()
     end_with_supervisor()
     limit_blas_threads(sys.argv[1:])
     wait_if_spare()

@@ -1,4 +1,4 @@
-"""Termination of long-running commands: SIGTERM becomes an exception, so that every `finally` runs."""
+"""Termination of long-running commands: signals become exceptions, so that every `finally` runs."""
 
 import os
 import signal
@@ -13,15 +13,29 @@ class Terminated(BaseException):
     """SIGTERM was received; not an `Exception`, so that no handler of faults swallows it."""
 
 
-def raise_on_sigterm() -> None:
-    """Make SIGTERM raise `Terminated` in the main thread (as SIGINT raises `KeyboardInterrupt`), once.
+class Interrupted(KeyboardInterrupt):
+    """SIGINT was received.
+
+    Where a `KeyboardInterrupt` itself leaves code that was compiled from a string (dataclasses are), Python ends the
+    process by SIGINT at its exit, whoever caught it meanwhile.
+    """
+
+
+def raise_signals() -> None:
+    """Make SIGTERM raise `Terminated` in the main thread, once, and SIGINT `Interrupted` unless it is ignored.
 
     Linux signals the death of a supervisor once for each of its threads that dies: a second exception would interrupt
     the clean-up that the first one started.
     """
     signal.signal(signal.SIGTERM, _raise_terminated)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _raise_interrupted)
     sys.unraisablehook = _deliver_again
     sys.excepthook = _print_faults
+
+
+def _raise_interrupted(_number: int, _frame: FrameType | None) -> None:
+    raise Interrupted
 
 
 def _raise_terminated(_number: int, _frame: FrameType | None) -> None:

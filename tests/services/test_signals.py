@@ -11,14 +11,14 @@ from deltalight.services.cli import run
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import os, signal, time
-from deltalight.services.signals import raise_on_sigterm
+from deltalight.services.signals import raise_signals
 
 class Freed:
     def __del__(self):
         os.kill(os.getpid(), signal.{name})
         time.sleep(0.1)
 
-raise_on_sigterm()
+raise_signals()
 try:
     Freed()  # what is raised while an object is freed goes nowhere
     time.sleep(60)
@@ -27,7 +27,7 @@ except BaseException as ending:
 """
 
 
-@pytest.mark.parametrize(("name", "ending"), [("SIGTERM", "Terminated"), ("SIGINT", "KeyboardInterrupt")])
+@pytest.mark.parametrize(("name", "ending"), [("SIGTERM", "Terminated"), ("SIGINT", "Interrupted")])
 def test_a_signal_while_an_object_is_freed_ends_the_program_all_the_same(name: str, ending: str) -> None:
     program = [sys.executable, "-c", PROGRAM.format(name=name)]
     ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
@@ -36,9 +36,9 @@ def test_a_signal_while_an_object_is_freed_ends_the_program_all_the_same(name: s
 
 FINISHING = """
 import os, signal, time
-from deltalight.services.signals import Terminated, raise_on_sigterm
+from deltalight.services.signals import Terminated, raise_signals
 
-raise_on_sigterm()
+raise_signals()
 try:
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(60)
@@ -55,12 +55,32 @@ def test_further_signals_do_not_break_off_what_the_first_one_ends() -> None:
     assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("finished", "", 0)
 
 
+IN_A_STRING = """
+import os, signal, sys, time
+from deltalight.services.signals import raise_signals
+
+raise_signals()
+try:
+    exec("os.kill(os.getpid(), signal.SIGINT); time.sleep(60)")
+except KeyboardInterrupt:
+    print("finished")
+    sys.exit(130)
+"""
+
+
+def test_ctrl_c_in_code_from_a_string_ends_with_the_programs_own_exit_code(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(IN_A_STRING)
+    program = [sys.executable, "-m", "program"]
+    ended = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("finished", "", 130)
+
+
 FREEING = """
 import os, signal, threading, time
 import zmq
-from deltalight.services.signals import raise_on_sigterm
+from deltalight.services.signals import raise_signals
 
-raise_on_sigterm()
+raise_signals()
 frames = [zmq.Frame(b"") for _ in range(300_000)]
 freeing = threading.Event()
 
