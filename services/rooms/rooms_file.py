@@ -72,8 +72,8 @@ class RoomsFile(StrictModel):
                 raise ValueError(f"the room {name} names a node twice; name each once")
             for node in room.nodes:
                 if node not in self.nodes:
-                    hint = nearest(node, self.nodes) or ", ".join(self.nodes)
-                    raise ValueError(f"the room {name} shows the unknown node {node}; did you mean {hint}?")
+                    known = nearest(node, self.nodes) or ", ".join(self.nodes)
+                    raise ValueError(f"the room {name} shows the unknown node {node}; write {known} instead")
         return self
 
     @property
