@@ -43,7 +43,10 @@ def test_a_number_of_slots_is_so_many_on_the_first_device(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [b]}}", "shows the unknown node b; write a instead."),
+        (
+            "nodes: {a: {source: s}}\nrooms: {hall: {nodes: [b]}}",
+            "shows the unknown node b; write a instead.",
+        ),
         ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a]}, hall: {nodes: [a]}}", "`hall` comes twice"),
         ("nodes: {a: {source: s}, a: {source: t}}\nrooms: {hall: {nodes: [a]}}", "`a` comes twice"),
         ("nodes: {a: {source: s}}\nrooms: {a: {nodes: [a]}}", "a is both a node and a room"),
