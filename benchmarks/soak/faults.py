@@ -113,11 +113,11 @@ class Stop(Fault):
 
 @dataclass(frozen=True)
 class Viewers(Fault):
-    """Viewers that are slow, silent or never acknowledge; others' rate and age before and meanwhile."""
+    """Viewers that are slow, silent or never acknowledge; others' rate and age before, meanwhile and after."""
 
     def run(self, run: Run) -> Outcome:
         """Have one of each watch for a while."""
-        with _compared(run) as outcome:
+        with _compared(run, after=True) as outcome:
             leave = [run.crowd.join(behaviour) for behaviour in BEHAVIOURS]
             time.sleep(run.profile.load_s)
             for each in leave:
@@ -127,11 +127,11 @@ class Viewers(Fault):
 
 @dataclass(frozen=True)
 class Churn(Fault):
-    """Many viewers that join and leave; others' rate and age before and meanwhile."""
+    """Many viewers that join and leave; others' rate and age before, meanwhile and after."""
 
     def run(self, run: Run) -> Outcome:
         """Have them do so for a while."""
-        with _compared(run) as outcome:
+        with _compared(run, after=True) as outcome:
             leave = run.crowd.come_and_go(run.profile.viewers, run.dice.randrange(2**32))
             time.sleep(run.profile.load_s)
             leave()
@@ -140,11 +140,11 @@ class Churn(Fault):
 
 @dataclass(frozen=True)
 class Nonsense(Fault):
-    """A node that sends mutated messages; others' rate and age before and meanwhile."""
+    """A node that sends mutated messages; others' rate and age before, meanwhile and after."""
 
     def run(self, run: Run) -> Outcome:
         """Have it send for a while."""
-        with _compared(run) as outcome:
+        with _compared(run, after=True) as outcome:
             sent = send_nonsense(run.station.places.stranger, run.profile.load_s, run.dice)
         return {"sent": sent, **outcome}
 
@@ -233,17 +233,21 @@ def parse_faults(text: str) -> list[str]:
 
 
 @contextmanager
-def _compared(run: Run) -> Iterator[Outcome]:
-    """Yield an outcome that holds, after the block, the flow of pictures before it and during it."""
+def _compared(run: Run, *, after: bool = False) -> Iterator[Outcome]:
+    """Yield an outcome that holds, after the block, the flow of pictures before it and during it.
+
+    With `after`, also the flow after it, since the rate wanders without any fault.
+    """
     outcome: Outcome = {}
     began_s = time.monotonic()
-    before = Flow.of(
-        run.crowd.between(began_s - run.profile.calm_s, began_s), began_s - run.profile.calm_s, began_s
-    )
     yield outcome
     ended_s = time.monotonic()
-    during = Flow.of(run.crowd.between(began_s, ended_s), began_s, ended_s)
-    outcome |= {"before": vars(before), "during": vars(during)}
+    calm_s = run.profile.calm_s
+    spans = {"before": (began_s - calm_s, began_s), "during": (began_s, ended_s)}
+    if after:
+        time.sleep(calm_s)
+        spans["after"] = (ended_s, ended_s + calm_s)
+    outcome |= {name: vars(Flow.of(run.crowd.between(*span), *span)) for name, span in spans.items()}
 
 
 def _chosen(process: str, run: Run) -> str:

@@ -57,7 +57,7 @@ def all_figures(soaked: Soaked) -> list[Figure]:
         *_resources(soaked),
         _age(soaked),
         *_kills(outcomes),
-        *_loads(outcomes),
+        *_loads(outcomes, soaked.profile),
         *_links(outcomes),
         worst("lost of a recording", "SIGKILL of the recorder", lost_s, LOST, "s"),
     ]
@@ -125,7 +125,7 @@ def _kills(outcomes: _Outcomes) -> list[Figure | None]:
     ]
 
 
-def _loads(outcomes: _Outcomes) -> list[Figure | None]:
+def _loads(outcomes: _Outcomes, profile: Profile) -> list[Figure | None]:
     near = Bar("within 5 %", lambda value: value <= 5.0)
     figures = []
     for name, what in (
@@ -133,9 +133,16 @@ def _loads(outcomes: _Outcomes) -> list[Figure | None]:
         ("churn", "viewers that join and leave"),
         ("nonsense", "a node that sends nonsense"),
     ):
-        before, during = (outcomes.of(name, when, "frames_per_s") for when in ("before", "during"))
-        changes = [100 * abs(now / then - 1) for then, now in zip(before, during, strict=True) if then]
-        figures.append(worst("change of others' rate", what, changes, near, "%"))
+        before, during, after = (
+            np.array(outcomes.of(name, when, "frames_per_s")) for when in ("before", "during", "after")
+        )
+        calm = (before + after) / 2
+        changes = [float(each) for each in 100 * np.abs(during - calm)[calm > 0] / calm[calm > 0]]
+        ages_ms = outcomes.of(name, "during", "unwaited_p95_ms")
+        figures += [
+            worst("change of others' rate", f"{what}, against before and after", changes, near, "%"),
+            worst("others' age without waiting, 95 of 100", what, ages_ms, period_bar(profile), "ms"),
+        ]
     return figures
 
 

@@ -1,5 +1,6 @@
 """The REST API's process: its socket, its web server, and its initial scene."""
 
+import gc
 import socket
 from pathlib import Path
 
@@ -49,6 +50,9 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
         for fault in PLUGINS.faults.values():
             log.warning(fault)
         server = http_server(create_app(settings, store, keys))
+        # What lives as long as the process counts no more towards a full collection, which so comes after some
+        # viewers have left, not after hundreds (gc: a full one waits until a quarter of all objects are new).
+        gc.freeze()
         log.info("web process runs", address=f"http://{settings.host}:{settings.port}")
         server.run(sockets=[listener])
 

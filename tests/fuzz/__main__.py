@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of the decoders: `python -m tests.fuzz TARGET... --minutes 5`.
 
-It needs atheris (`python -m pip install atheris==3.0.0`), which has wheels for Linux on x86-64 only and so is in no
-lock. What fails is kept as a file in `kept/TARGET`, which the tests replay; the corpus grows in a folder of its own.
+It needs atheris, which has wheels for Linux on x86-64 only. What fails is kept as a file in `kept/TARGET`, which the
+tests replay; the corpus grows in a folder of its own.
 `--distil` then packs the shortest inputs that reached new code into `corpus/TARGET.bin`.
 """
 
@@ -24,17 +24,18 @@ MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 300
 LONGEST_INPUT = 32_768
 DISTILLED_BYTES = 6_000  # of a target
 MOST_CRASHES = 20
+NO_ATHERIS = "fuzzing needs atheris, which there is for Linux on x86-64 and Python up to 3.13"
 
 
 def main() -> None:
     """Fuzz the chosen targets one after the other and print their figures as JSON lines."""
     options = _options()
     if find_spec("atheris") is None:
-        sys.exit("fuzzing needs atheris: python -m pip install atheris==3.0.0 (Linux on x86-64)")
+        sys.exit(NO_ATHERIS)
     for target in options.targets or TARGETS:
         grown = options.work / target
         grown.mkdir(parents=True, exist_ok=True)
-        _write_seeds(target, _seed_folder(grown))
+        write_seeds(target, grown)
         print(json.dumps(_fuzz(target, grown, 60 * options.minutes)), flush=True)
         if options.distil:
             _distil(target, grown)
@@ -51,8 +52,9 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _write_seeds(target: str, folder: Path) -> None:
-    """Write the first inputs and the corpus as files, which libFuzzer wants."""
+def write_seeds(target: str, grown: Path) -> None:
+    """Write the first inputs and the corpus as files beside `grown`, which libFuzzer wants."""
+    folder = _seed_folder(grown)
     folder.mkdir(parents=True, exist_ok=True)
     for number, content in enumerate([*(data for name, data in seeds() if name == target), *corpus(target)]):
         (folder / f"{number:04d}").write_bytes(content)
@@ -64,10 +66,10 @@ def _fuzz(target: str, grown: Path, seconds: float) -> dict[str, object]:
     began_s, executions, crashes, peak_mb, slowest_s = time.monotonic(), 0, 0, 0, 0
     before = _contents(KEPT / target)
     while (left_s := round(seconds - (time.monotonic() - began_s))) > 0 and crashes < MOST_CRASHES:
-        code, told = _run(target, grown, f"-max_total_time={left_s}")
-        executions += _figure(told, "number_of_executed_units")
-        peak_mb = max(peak_mb, _figure(told, "peak_rss_mb"))
-        slowest_s = max(slowest_s, _figure(told, "slowest_unit_time_sec"))
+        code, told = run_fuzzer(target, grown, KEPT / target, f"-max_total_time={left_s}")
+        executions += told_figure(told, "number_of_executed_units")
+        peak_mb = max(peak_mb, told_figure(told, "peak_rss_mb"))
+        slowest_s = max(slowest_s, told_figure(told, "slowest_unit_time_sec"))
         if code == 0:
             break
         crashes += 1
@@ -84,7 +86,11 @@ def _fuzz(target: str, grown: Path, seconds: float) -> dict[str, object]:
     }
 
 
-def _run(target: str, grown: Path, *options: str) -> tuple[int, str]:
+def run_fuzzer(target: str, grown: Path, kept: Path, *options: str) -> tuple[int, str]:
+    """Fuzz with libFuzzer's options until its process ends; return the exit code and what it told.
+
+    The corpus grows in `grown`, beside which the first inputs lie (`write_seeds`); what fails goes to `kept`.
+    """
     folders = [str(each) for each in (grown, _seed_folder(grown), KEPT / target)]
     limits = [f"-rss_limit_mb={MEMORY_MB}", f"-malloc_limit_mb={ALLOCATION_MB}", f"-timeout={HANG_S}"]
     command = [
@@ -96,7 +102,7 @@ def _run(target: str, grown: Path, *options: str) -> tuple[int, str]:
         *limits,
         f"-max_len={LONGEST_INPUT}",
     ]
-    artifacts = f"-artifact_prefix={KEPT / target}/"
+    artifacts = f"-artifact_prefix={kept}/"
     done = subprocess.run(
         [*command, artifacts, "-print_final_stats=1", *folders],
         stdout=subprocess.DEVNULL,
@@ -107,7 +113,8 @@ def _run(target: str, grown: Path, *options: str) -> tuple[int, str]:
     return done.returncode, done.stderr.decode(errors="replace")
 
 
-def _figure(told: str, name: str) -> int:
+def told_figure(told: str, name: str) -> int:
+    """Return one of libFuzzer's closing figures, 0 if it is missing."""
     found = re.search(rf"stat::{name}:\s+(\d+)", told)
     return int(found.group(1)) if found else 0
 
