@@ -4,18 +4,31 @@ Only the command line imports files by their paths, never a REST client.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from deltalight.protocol.files import write_bytes
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument, load_scene
 from deltalight.protocol.source import Source
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.settings import load_configuration
+from deltalight.services.storage.faults import ConflictError
 from deltalight.services.storage.store import Store
 
 FIRST_SCENE = "First scene"
 CHUNK_BYTES = 1 << 20
 LIMIT_BYTES = 512 << 20
+
+
+def open_store(folder: Path, config_file: Path | None = None, database: str | None = None) -> Store:
+    """Open the store of a data folder, with the database and the store of assets of the configuration.
+
+    Raises:
+        DeltalightError: it cannot be used.
+    """
+    settings = load_configuration(config_file).section("api", ApiSettings)
+    return Store(folder, database=database or settings.database, assets=settings.assets)
 
 
 @contextmanager
@@ -40,6 +53,19 @@ def activate_document(store: Store, document: SceneDocument) -> SceneDocument:
     """
     stored = store.scenes.activate(import_document(store, document))
     return store.assets.localised(stored.document)
+
+
+def activate_first(store: Store, document: SceneDocument) -> None:
+    """Store a document and its files and activate it, unless another web process was faster.
+
+    Raises:
+        DeltalightError: one of its files is wrong.
+    """
+    before = {head.id for head in store.scenes.all()}
+    scene_id = import_document(store, document)
+    if not store.scenes.activate_first(scene_id) and scene_id not in before:
+        with suppress(ConflictError):  # the faster one shows this very scene
+            store.scenes.delete(scene_id)
 
 
 def scene_to_show(store: Store, source: Source | None, path: Path | None) -> SceneDocument:

@@ -40,6 +40,7 @@ RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
 MAXIMUM_FAULTS_IN_A_ROW = 30
 LOG_INTERVAL_NS = 10**9
+WATCHED_NS = 60 * 10**9
 
 log = structlog.get_logger()
 
@@ -127,7 +128,7 @@ class RenderSession:
         self.instance = uuid.uuid4().hex
         self.counts: Counter[str] = Counter()
         self.stopping = False
-        self.watched: tuple[ShownView, ...] = ()
+        self._watchers: dict[str, tuple[int, tuple[ShownView, ...]]] = {}  # when each said so, and what
         self._renderer = renderer
         self._assembler = assembler or FrameAssembler()
         self._assembler.needs_depth = _needs_depth(scene)
@@ -254,10 +255,17 @@ class RenderSession:
         return self._use_scene(_with_view(self.scene, request.payload.get("view")), scene_id=None)
 
     def _watch(self, request: ControlRequest) -> dict[str, object]:
-        """Renders frames in these views too from now on."""
+        """Renders frames in these views too from now on, and in those of other senders."""
         views = validate(WatchOrder, request.payload, "the command watch").views
-        self.watched = tuple(dict.fromkeys(views))
+        self._watchers[request.node] = (self._clock_ns(), views)
         return {"views": list(self.watched)}
+
+    @property
+    def watched(self) -> tuple[ShownView, ...]:
+        """The views that senders watch who said so within the last minute."""
+        since_ns = self._clock_ns() - WATCHED_NS
+        self._watchers = {name: each for name, each in self._watchers.items() if each[0] >= since_ns}
+        return tuple(dict.fromkeys(view for _, views in self._watchers.values() for view in views))
 
     def _shut_down(self, _request: ControlRequest) -> dict[str, object]:
         self.stopping = True

@@ -23,7 +23,7 @@ BODY_LIMIT_BYTES = 2 << 20  # three times a document with the maximum number of 
 UPLOAD_PATH = "/api/v1/assets"
 RECORDING_UPLOAD_PATH = "/api/v1/recordings/upload"
 PROTECTED = "/api/"  # the page's files and the API's description are public
-OPEN_PATHS = frozenset({"/api/v1/health"})  # it reveals nothing that requires a token
+OPEN_PATHS = frozenset({"/api/v1/health", "/api/v1/ready"})  # they reveal nothing that requires a token
 STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # endless responses that are no WebSockets
 # POST requests without side effects.
 READ_ONLY_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
@@ -144,7 +144,10 @@ class AuthMiddleware:
         wait_s = self._wrong_tokens.wait_s(client)
         if wait_s > 0:
             raise _too_many(wait_s, "wrong-tokens", "Too many wrong tokens came from this address; wait.")
-        principal = await self._verified(scheme, token) if scheme else self._tickets.redeem(ticket or "")
+        if scheme:
+            principal = await self._verified(scheme, token)
+        else:
+            principal = await run_in_threadpool(self._tickets.redeem, ticket or "")
         if principal is None:
             self._wrong_tokens.take(client)
             raise _unknown_token(True)

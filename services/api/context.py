@@ -150,6 +150,16 @@ async def _precondition(
 
 
 Shared = Annotated[Context, Depends(_context)]
+
+
+async def _require_jobs(connection: HTTPConnection, shared: Shared) -> None:
+    if connection.scope["method"] != "GET" and not shared.settings.jobs:
+        raise ProblemError(
+            409, "no-jobs", "This web process neither records nor replays; ask the one that does."
+        )
+
+
+JOBS = Depends(_require_jobs)  # of routers whose changes are for one of several web processes
 ExpectedRevision = Annotated[int | None, Depends(_if_match)]
 IfUnchanged = Annotated[Precondition, Depends(_precondition)]
 

@@ -7,12 +7,15 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from starlette.types import Scope
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.faults import StorageFaultError
+from deltalight.services.storage.tickets import Ticket, TicketStore
 from deltalight.services.storage.tokens import Role
 
 TICKET_LIFE_S = 30.0
@@ -78,17 +81,26 @@ def _hash(token: str) -> bytes:
 class Tickets:
     """Single-use tickets for addresses that cannot carry a token: WebSockets and pictures in a browser.
 
-    A ticket admits once, with the role of the principal that requested it.
+    A ticket admits once, with the role of the principal that requested it. With a `store`, every web process of its
+    database takes it; while that does not answer, this one alone.
     """
 
-    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, clock_s: Callable[[], float] = time.monotonic, store: TicketStore | None = None
+    ) -> None:
         self._clock_s = clock_s
+        self._store = store
         self._open: OrderedDict[str, _Ticket] = OrderedDict()
         self._lock = threading.Lock()
 
     def issue(self, principal: Principal) -> str:
         """Create a ticket for this principal."""
         ticket = secrets.token_urlsafe(_TICKET_BYTES)
+        if self._store is not None:
+            with suppress(StorageFaultError):
+                shown = Ticket(principal.role, principal.token_id, principal.name)
+                self._store.add(ticket, shown, TICKET_LIFE_S)
+                return ticket
         with self._lock:
             self._open[ticket] = _Ticket(principal, self._clock_s() + TICKET_LIFE_S)
             while len(self._open) > OPEN_TICKETS:
@@ -96,9 +108,16 @@ class Tickets:
         return ticket
 
     def redeem(self, ticket: str) -> Principal | None:
-        """Consume a ticket and return its principal, or None if it is unknown or has expired."""
+        """Consume a ticket and return its principal, or None if it is unknown or has expired.
+
+        Raises:
+            StorageFaultError: the store does not answer.
+        """
         with self._lock:
             found = self._open.pop(ticket, None)
+        if found is None and self._store is not None:
+            taken = self._store.take(ticket)
+            return None if taken is None else Principal(taken.role, taken.token_id, taken.name)
         return None if found is None or found.ends_s < self._clock_s() else found.principal
 
 

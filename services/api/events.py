@@ -3,7 +3,7 @@
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
@@ -26,6 +26,8 @@ EventType = Literal[
     "lost",
 ]
 IN_ALL_ROOMS: frozenset[EventType] = frozenset({"asset", "recording", "snapshot", "rooms"})
+# To the listeners of other web processes, which hear the rest themselves.
+PASSED_ON: frozenset[EventType] = frozenset({"scene", "asset", "recording", "replay", "snapshot", "notice"})
 
 
 @dataclass(eq=False)
@@ -64,16 +66,24 @@ class EventQueue:
 class EventHub:
     """Publishes events to all listeners; each is encoded once, and slow listeners delay nobody.
 
-    What all rooms share (assets, recordings) the `others`' listeners hear too.
+    What all rooms share (assets, recordings) the `others`' listeners hear too. `pass_on` gets what listeners of other
+    web processes should hear.
     """
 
     def __init__(self) -> None:
         self.others: Sequence[EventHub] = ()
+        self.pass_on: Callable[[str], None] = lambda _text: None
         self._queues: set[EventQueue] = set()
         self._lock = threading.Lock()
 
     def publish(self, type: EventType, body: Mapping[str, object]) -> None:
         """Publish an event (any thread); `body` is anything that pydantic serialises, models and times included."""
+        if type in PASSED_ON:
+            self.pass_on(packed(type, body))
+        self.deliver(type, body)
+
+    def deliver(self, type: EventType, body: Mapping[str, object]) -> None:
+        """Publish an event to the listeners of this process alone (any thread)."""
         hubs = (self, *self.others) if type in IN_ALL_ROOMS else (self,)
         queues = [queue for hub in hubs for queue in hub.queues()]
         if queues:

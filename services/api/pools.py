@@ -19,6 +19,7 @@ PoolName = Literal[
     "recordings",
     "recording uploads",
     "assets",
+    "asset files",
     "thumbnails",
     "cameras",
     "documents",
@@ -60,6 +61,7 @@ def make_pools() -> Mapping[PoolName, Pool]:
         Pool("recordings", 4, patience_s=10.0),
         Pool("recording uploads", 2, patience_s=60.0),  # the check of one may take minutes
         Pool("assets", 4, patience_s=60.0),  # the check of one may take a minute
+        Pool("asset files", 8, patience_s=10.0),  # which may have to be brought here
         Pool("thumbnails", 4, patience_s=10.0),
         Pool("cameras", 2, patience_s=10.0),
         Pool("documents", 1, patience_s=10.0),  # threads that parse would only take turns

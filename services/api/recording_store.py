@@ -18,9 +18,10 @@ from deltalight.protocol.cached_files import read_cached, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import ACTIVE_SUFFIX, write_bytes
 from deltalight.services.files import SUFFIX, make_output_folder
+from deltalight.services.storage.asset_files import disk_faults
 from deltalight.services.storage.asset_kinds import clean_name
 from deltalight.services.storage.asset_sandbox import MEMORY_LIMIT_BYTES, run_limited
-from deltalight.services.storage.assets import Incoming, disk_faults
+from deltalight.services.storage.assets import Incoming
 from deltalight.services.storage.faults import ConflictError, NotFoundError, TooLargeError
 
 if TYPE_CHECKING:  # readers of recordings take 0.1 s

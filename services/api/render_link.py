@@ -5,6 +5,7 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import structlog
 
@@ -20,6 +21,7 @@ from deltalight.services.storage.scenes import StoredScene
 from deltalight.services.storage.store import Store
 
 LOOK_INTERVAL_S = 1.0
+WATCH_INTERVAL_S = 20.0  # the server forgets views after a minute
 ALIVE_TIMEOUT_S = 1.0  # a separate thread of the server answers this, whatever the renderer does
 COMMAND_TIMEOUT_S = 25.0  # the server itself times out after 20 s
 
@@ -62,7 +64,7 @@ class RenderLink:
 
     One thread always sends the newest revision: it skips changes that come faster than the server takes them.
     Commands run in between, each after the changes that preceded it. `control` is the server's endpoint, None while
-    there is no server.
+    there is no server. Several web processes may keep one server up to date; of these, one `chooses_source`.
     """
 
     def __init__(
@@ -72,8 +74,11 @@ class RenderLink:
         keys: Keys | None = None,
         *,
         on_delivery: Callable[[DeliveryStatus], None] = lambda _status: None,
+        chooses_source: bool = True,
     ) -> None:
         self._store = store
+        self._name = f"api-{uuid.uuid4().hex[:8]}"  # by which the server keeps web processes apart
+        self._chooses_source = chooses_source
         self._on_delivery = on_delivery
         self._keys = keys
         self._client = None if control is None else RequestClient(control, keys=keys)
@@ -88,6 +93,7 @@ class RenderLink:
         self._source: list[str] | None = None
         self._watched: tuple[ShownView, ...] = ()
         self._sent_watched: tuple[ShownView, ...] | None = None  # by the server that answers; None: not yet
+        self._watch_due_s = 0.0
         self.on_source: Callable[[Sequence[str] | None], None] = lambda _endpoints: None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="render-link", daemon=True)
@@ -231,7 +237,8 @@ class RenderLink:
     def _send_watched(self) -> None:
         """Tell the server which views are looked at, unless it knows (while holding the lock)."""
         watched = self._watched
-        if not self._answers or watched == self._sent_watched:
+        is_due = bool(watched) and time.monotonic() >= self._watch_due_s
+        if not self._answers or (watched == self._sent_watched and not is_due):
             return
         try:
             self._request("watch", COMMAND_TIMEOUT_S, {"views": list(watched)})
@@ -241,6 +248,7 @@ class RenderLink:
         except DeltalightError as fault:  # viewers see the scene's own view
             log.warning("the render server shows no other views", fault=str(fault))
         self._sent_watched = watched
+        self._watch_due_s = time.monotonic() + WATCH_INTERVAL_S
 
     def _send(self, active: StoredScene) -> DeliveryStatus:
         revision = active.document.revision
@@ -251,9 +259,19 @@ class RenderLink:
             self._note_reachable(False)
             return pending(_change(active), SILENT)
         except DeltalightError as refusal:
-            detail = self._store.assets.without_paths(str(refusal))
-            return DeliveryStatus("refused", active.head.id, revision, detail)
+            return self._refused(active, refusal)
         return DeliveryStatus("shown", active.head.id, revision)
+
+    def _refused(self, active: StoredScene, refusal: DeltalightError) -> DeliveryStatus:
+        """Return the status of a refused scene; another web process may have sent a newer revision meanwhile."""
+        revision = active.document.revision
+        with suppress(DeltalightError):
+            server = self._request("ping", ALIVE_TIMEOUT_S)
+            newest = server.get("revision")
+            if server.get("scene_id") == active.head.id and isinstance(newest, int) and newest > revision:
+                return pending(_change(active), BUSY)  # until the next look
+        detail = self._store.assets.without_paths(str(refusal))
+        return DeliveryStatus("refused", active.head.id, revision, detail)
 
     def _set_scene(self, active: StoredScene) -> None:
         """Send the scene.
@@ -317,6 +335,8 @@ class RenderLink:
 
     def _restore_source(self) -> None:
         """Tell a (re)started server where to read from; its source may be left from a killed service."""
+        if not self._chooses_source:
+            return
         try:
             self._request("set_source", COMMAND_TIMEOUT_S, {"endpoints": self._source})
         except UnansweredError:
@@ -339,7 +359,7 @@ class RenderLink:
         revision: int | None = None,
     ) -> dict[str, object]:
         request = ControlRequest(
-            node="api",
+            node=self._name,
             capture_ns=time.time_ns(),
             id=uuid.uuid4().hex,
             op=op,

@@ -10,6 +10,7 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.services.api.camera_finder import CameraFinder
 from deltalight.services.api.context import Context
 from deltalight.services.api.credentials import Tickets
+from deltalight.services.api.event_relay import EventRelay
 from deltalight.services.api.events import EventHub
 from deltalight.services.api.fisheye import FisheyeView
 from deltalight.services.api.live_hub import LiveHub
@@ -26,7 +27,7 @@ from deltalight.services.api.routes import recordings
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.streams import ProcessWatch, Sink, Streams
-from deltalight.services.host_store import activate_document
+from deltalight.services.host_store import activate_first
 from deltalight.services.rooms.directory import DirectoryClient
 from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.status import RoomEndpoints, RoomList, RoomStatus
@@ -83,6 +84,7 @@ class Rooms:
         for context in contexts:
             context.others.extend(other for other in contexts if other is not context)
             context.events.others = [other.events for other in context.others]
+        self._relay = EventRelay(store.feed(), self.contexts)
 
     @property
     def contexts(self) -> dict[str, Context]:
@@ -90,7 +92,8 @@ class Rooms:
         return {name: room.context for name, room in self._rooms.items()}
 
     def start(self) -> None:
-        """Start to talk to nodes and render servers."""
+        """Start to talk to nodes, render servers and other web processes."""
+        self._relay.start()
         for room in self._rooms.values():
             room.context.link.start()
             room.streams.start()
@@ -101,6 +104,7 @@ class Rooms:
         """End all children and connections."""
         if self.follower is not None:
             self.follower.close()
+        self._relay.close()
         for room in self._rooms.values():
             room.close()
         self._builder.close()
@@ -128,7 +132,8 @@ class _Builder:
 
     def __init__(self, settings: ApiSettings, store: Store, keys: Keys | None) -> None:
         self._settings, self._store, self._keys = settings, store, keys
-        self._problems, self._tickets, self._cameras = Problems(), Tickets(), CameraFinder()
+        self._problems, self._cameras = Problems(), CameraFinder()
+        self._tickets = Tickets(store=store.tickets)
         self._recordings = RecordingStore(store.folder / "recordings")
         self._videos = RecordingVideos(self._recordings)
         self._snapshots = SnapshotStore(store.folder / "snapshots")
@@ -151,7 +156,7 @@ class _Builder:
         assert self._settings.rooms is not None
         store = self._store.of_room(status.name, rooms)
         if store.scenes.active_id() is None:
-            activate_document(store, SceneDocument(name=status.title))
+            activate_first(store, SceneDocument(name=status.title))
         nodes = tuple(node.endpoint for node in status.nodes)
         context = self._context(status.name, store, None, nodes, self._settings.rooms)
         return self._room(context, nodes, nodes)
@@ -171,6 +176,7 @@ class _Builder:
             control,
             self._keys,
             on_delivery=lambda status: events.publish("picture", asdict(status)),
+            chooses_source=self._settings.jobs,
         )
         live_hub = LiveHub(link.watch)
 

@@ -2,6 +2,7 @@
 
 import gc
 import socket
+import time
 from pathlib import Path
 
 import structlog
@@ -17,12 +18,14 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.services.api.app import create_app
 from deltalight.services.api.connections import HEAD_TIMEOUT_S, LimitedProtocol
 from deltalight.services.api.settings import ApiSettings
-from deltalight.services.host_store import FIRST_SCENE, activate_document, import_scene
+from deltalight.services.host_store import FIRST_SCENE, activate_first, import_scene
+from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultError
 from deltalight.services.storage.store import Store, default_folder
 
 FIRST_TOKEN = "first"
 MAX_CONNECTIONS = 256
 ANSWER_TIMEOUT_S = 1.0
+DATABASE_PATIENCE_S, DATABASE_INTERVAL_S = 60.0, 2.0
 LARGEST_SOCKET_MESSAGE = 1024  # bytes: clients send acknowledgements only
 
 log = structlog.get_logger()
@@ -39,7 +42,7 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
     """
     with (
         listening(settings.host, settings.port) as listener,
-        Store(settings.data or default_folder()) as store,
+        open_patiently(settings) as store,
     ):
         if scene is not None:
             store.scenes.activate(import_scene(store, scene))
@@ -55,6 +58,25 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
         gc.freeze()
         log.info("web process runs", address=f"http://{settings.host}:{settings.port}")
         server.run(sockets=[listener])
+
+
+def open_patiently(settings: ApiSettings) -> Store:
+    """Open the service's store; wait for a database that does not answer yet, as when a host starts.
+
+    Raises:
+        DeltalightError: it cannot be used.
+    """
+    ends_s = time.monotonic() + DATABASE_PATIENCE_S
+    while True:
+        try:
+            return Store(
+                settings.data or default_folder(), database=settings.database, assets=settings.assets
+            )
+        except DatabaseGoneError as fault:
+            if time.monotonic() >= ends_s:
+                raise
+            log.warning("waiting for the database", fault=str(fault))
+            time.sleep(DATABASE_INTERVAL_S)
 
 
 class _Server(uvicorn.Server):
@@ -124,10 +146,12 @@ def make_first_scene(store: Store, settings: ApiSettings, keys: Keys | None) -> 
         return
     try:
         shown = _shown_scene(settings.control, keys)
-        activate_document(store, shown.replaced(name=shown.name or FIRST_SCENE))
+        activate_first(store, shown.replaced(name=shown.name or FIRST_SCENE))
+    except StorageFaultError:
+        raise
     except (DeltalightError, OSError) as fault:  # it does not run yet, or its files are another host's
         log.debug("nothing to take over from the render server", fault=str(fault))
-        activate_document(store, SceneDocument(name=FIRST_SCENE))
+        activate_first(store, SceneDocument(name=FIRST_SCENE))
 
 
 def _shown_scene(control: str, keys: Keys | None) -> SceneDocument:

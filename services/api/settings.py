@@ -22,6 +22,21 @@ class ApiSettings(StrictModel):
         default=None,
         description="Folder of scenes and assets; null = `deltalight` in the user's data folder.",
     )
+    database: str | None = Field(
+        default=None,
+        description="Address of a PostgreSQL database for scenes, tokens and what is known of assets, such as "
+        "postgresql://USER@HOST/NAME; null = the SQLite file in the data folder.",
+    )
+    assets: str | None = Field(
+        default=None,
+        description="Address of a store for the files of assets, such as s3://BUCKET/FOLDER; the data folder then "
+        "holds copies. null = the data folder.",
+    )
+    jobs: bool = Field(
+        default=True,
+        description="Whether this process records and replays. Of several web processes for one render server, all "
+        "but one do not.",
+    )
     token_file: Path | None = Field(
         default=None,
         description="File with one more token, of role control, which is never stored: a secret of the container "

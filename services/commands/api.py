@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from deltalight.services.commands.options import ConfigFile, Data, NodeName, data_folder
+from deltalight.services.commands.options import ConfigFile, Data, DatabaseAddress, NodeName, data_folder
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def serve(
     ] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port. Default: 8000.")] = None,
     data: Data = None,
+    database: DatabaseAddress = None,
     scene: Annotated[
         Path | None, typer.Option(help="Scene document to import, with its files, and show.")
     ] = None,
@@ -77,6 +78,7 @@ def serve(
         "host": host,
         "port": port,
         "data": data,
+        "database": database,
         "token_file": token_file,
         "view_token_file": view_token_file,
         "control": control,
@@ -97,19 +99,21 @@ def token(
         TokenRole, typer.Option(help="view: look only; control: change everything.")
     ] = TokenRole.VIEW,
     data: Data = None,
+    database: DatabaseAddress = None,
 ) -> None:
     """Create a token and print it; it cannot be shown again."""
-    with _store(data) as store:
+    with _store(data, database) as store:
         typer.echo(store.tokens.create(name, role.value))
 
 
 @api.command()
 def tokens(
     data: Data = None,
+    database: DatabaseAddress = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
     """List the tokens with their roles and dates."""
-    with _store(data) as store:
+    with _store(data, database) as store:
         found = store.tokens.all()
     days = [datetime.fromtimestamp(each.created_ns / 1e9, UTC).date().isoformat() for each in found]
     if as_json:
@@ -127,10 +131,12 @@ def tokens(
 
 @api.command()
 def revoke(
-    name: Annotated[str, typer.Argument(help="Name of the token to revoke.")], data: Data = None
+    name: Annotated[str, typer.Argument(help="Name of the token to revoke.")],
+    data: Data = None,
+    database: DatabaseAddress = None,
 ) -> None:
     """Revoke a token; it is refused from the next request on, without a restart."""
-    with _store(data) as store:
+    with _store(data, database) as store:
         store.tokens.revoke(name)
     typer.echo(f"The token `{name}` is no longer taken.")
 
@@ -144,7 +150,7 @@ def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySett
     return [*(subscribe or [endpoint(COMPOSITE_PORT)]), node_endpoint(node, keys)]
 
 
-def _store(data: Path | None) -> "Store":
-    from deltalight.services.storage.store import Store
+def _store(data: Path | None, database: str | None) -> "Store":
+    from deltalight.services.host_store import open_store
 
-    return Store(data_folder(data))
+    return open_store(data_folder(data), database=database)

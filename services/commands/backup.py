@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deltalight.protocol.errors import DeltalightError
 from deltalight.services.commands.options import ConfigFile, Data, data_folder
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def backup(
     """
     from deltalight.services.storage.backup import write_backup
 
-    contents = write_backup(data_folder(data, config_file), path)
+    contents = write_backup(_whole_folder(data, config_file), path)
     _print(contents, f"are in {path}", as_json=as_json)
 
 
@@ -44,9 +45,27 @@ def restore(
     """
     from deltalight.services.storage.backup import restore_backup
 
-    folder = data_folder(data, config_file)
+    folder = _whole_folder(data, config_file)
     contents = restore_backup(path, folder)
     _print(contents, f"are in {folder}", as_json=as_json)
+
+
+def _whole_folder(data: Path | None, config_file: Path | None) -> Path:
+    """Return the data folder.
+
+    Raises:
+        DeltalightError: a part of what it usually holds is elsewhere.
+    """
+    from deltalight.services.api.settings import ApiSettings
+    from deltalight.services.settings import load_configuration
+
+    settings = load_configuration(config_file).section("api", ApiSettings)
+    if settings.database is not None or settings.assets is not None:
+        raise DeltalightError(
+            "the configuration names a `database` or a store of `assets` outside of the data folder; use pg_dump and "
+            "pg_restore for the database, and copy the files of assets by the tools of their store."
+        )
+    return data_folder(data, config_file)
 
 
 def _print(contents: "Contents", place: str, *, as_json: bool) -> None:

@@ -54,6 +54,13 @@ ConfigFile = Annotated[
 Data = Annotated[
     Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
 ]
+DatabaseAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--database",
+        help="PostgreSQL database, such as postgresql://USER@HOST/NAME; default: the SQLite file in the data folder.",
+    ),
+]
 NodeStreams = Annotated[
     list[str] | None,
     typer.Option(

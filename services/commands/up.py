@@ -64,8 +64,7 @@ def up(
     says which nodes and render servers there are.
     """
     from deltalight.services.host import HostCommands, HostPlan, recording_of
-    from deltalight.services.host_store import scene_to_show, session_file
-    from deltalight.services.storage.store import Store
+    from deltalight.services.host_store import open_store, scene_to_show, session_file
     from deltalight.services.supervisor import Supervisor
 
     if rooms is not None:
@@ -84,7 +83,7 @@ def up(
             "--source starts a node here and --node uses one elsewhere; give only one of them."
         )
     folder = data_folder(data, config_file)
-    with Store(folder) as store:
+    with open_store(folder, config_file) as store:
         shown = scene_to_show(store, recording_of(source), scene)
     with session_file(shown) as session:
         plan = HostPlan(

@@ -15,7 +15,7 @@ from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.discovery import node_endpoint
 from deltalight.services.host import PREPARED, HostCommands, recording_of
-from deltalight.services.host_store import activate_document, write_scene
+from deltalight.services.host_store import activate_document, open_store, write_scene
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
 from deltalight.services.rooms.local_placer import LocalPlacer
@@ -127,7 +127,7 @@ class RoomsHost:
 
     def _plans(self, endpoints: Mapping[str, str]) -> list[RoomPlan]:
         plans = []
-        with Store(self.data) as store:
+        with open_store(self.data, self.commands.config) as store:
             for name, room in self.rooms.rooms.items():
                 source = recording_of(self.rooms.nodes[room.nodes[0]].source)
                 document = room_scene(store.of_room(name, tuple(self.rooms.rooms)), name, room, source)

@@ -1,12 +1,8 @@
-"""Uploaded files, stored by the hash of their content: ASSETS/<sha256>/asset.<format>.
-
-Each has a folder of its own, so that a file that refers to others finds none.
-"""
+"""Uploaded files, stored by the hash of their content."""
 
 import hashlib
 import json
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +18,7 @@ from sqlalchemy.orm import Session
 from deltalight.protocol.cached_files import read_cached, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
+from deltalight.services.storage.asset_files import FolderFiles, disk_faults
 from deltalight.services.storage.asset_kinds import (
     BY_NAME,
     HEAD_BYTES,
@@ -33,8 +30,7 @@ from deltalight.services.storage.asset_kinds import (
     recognise,
 )
 from deltalight.services.storage.asset_sandbox import Task, probe, run_limited
-from deltalight.services.storage.data_folder import sync_folder
-from deltalight.services.storage.database import Database
+from deltalight.services.storage.database import Database, remembered
 from deltalight.services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
 from deltalight.services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
 
@@ -108,14 +104,13 @@ class Incoming:
 class AssetStore:
     """The assets of a store; tests about something else replace `probe`."""
 
-    def __init__(self, database: Database, folder: Path, probe: Probe = probe) -> None:
+    def __init__(self, database: Database, files: FolderFiles, probe: Probe = probe) -> None:
         self._database = database
-        self._folder = folder
-        self._incoming = folder / ".incoming"
+        self._files = files
+        self._incoming = files.incoming
         self._probe = probe
         self._children = BoundedSemaphore(CONCURRENT_CHILDREN)
         with disk_faults():
-            self._incoming.mkdir(parents=True, exist_ok=True)
             self._remove_left_over()
 
     @contextmanager
@@ -169,6 +164,7 @@ class AssetStore:
         finally:
             checked.unlink(missing_ok=True)
 
+    @remembered
     def get(self, digest: str) -> Asset:
         """Return an asset.
 
@@ -178,6 +174,7 @@ class AssetStore:
         with self._database.reading() as session:
             return _asset(session, _row(session, digest))
 
+    @remembered
     def all(self) -> list[Asset]:
         """Return all assets, the newest first."""
         with self._database.reading() as session:
@@ -185,8 +182,12 @@ class AssetStore:
             return [_asset(session, row) for row in rows]
 
     def path(self, asset: Asset) -> Path:
-        """Return the path of an asset's file."""
-        return self._path(asset.digest, asset.format.name)
+        """Return the path of an asset's file, brought to this host if it is elsewhere.
+
+        Raises:
+            StorageFaultError: it cannot be brought here.
+        """
+        return self._files.fetched(asset.digest, _file_name(asset.format.name))
 
     def thumbnail(self, digest: str) -> Path:
         """Return the file of an asset's thumbnail, drawn on first request.
@@ -224,6 +225,7 @@ class AssetStore:
         """
         with self._database.writing() as session:
             row = _row(session, digest)
+            format_name = row.format
             _require_unused(session, digest)
             for each in session.scalars(select(AssetNameRow).where(AssetNameRow.digest == digest)):
                 session.delete(each)
@@ -231,7 +233,7 @@ class AssetStore:
             session.delete(row)
         with self._database.writing() as session:  # the lock excludes simultaneous uploads of the same file
             if session.get(AssetRow, digest) is None:
-                shutil.rmtree(self._folder / digest, ignore_errors=True)
+                self._files.remove(digest, _file_name(format_name))
 
     def localised(self, document: SceneDocument) -> SceneDocument:
         """Return a stored document with the paths of its assets' files, for the render server.
@@ -243,7 +245,7 @@ class AssetStore:
 
     def without_paths(self, sentence: str) -> str:
         """Return a sentence of the render server for clients: digests in place of files."""
-        return sentence.replace(f"{self._folder.absolute()}{os.sep}", DIGEST_PREFIX)
+        return sentence.replace(f"{self._files.folder.absolute()}{os.sep}", DIGEST_PREFIX)
 
     def _existing(self, reference: str) -> Path:
         asset = self.get(reference.removeprefix(DIGEST_PREFIX))
@@ -255,9 +257,6 @@ class AssetStore:
             )
         return path
 
-    def _path(self, digest: str, format_name: str) -> Path:
-        return (self._folder / digest / f"asset{BY_NAME[format_name].suffix}").absolute()
-
     def _facts(self, digest: str, path: Path, found: AssetFormat, name: str) -> Facts:
         with self._database.reading() as session:
             known = session.get(AssetRow, digest)
@@ -268,14 +267,10 @@ class AssetStore:
 
     def _placed(self, checked: Path, row: AssetRow, name: str) -> tuple[Asset, bool]:
         """Move the file into place, then add its row: a row without a file never exists."""
+        self._files.upload(row.digest, _file_name(row.format), checked)
         with self._database.writing() as session:
             known = session.get(AssetRow, row.digest)
-            place = self._path(row.digest, row.format)
-            with disk_faults():
-                place.parent.mkdir(exist_ok=True)
-                checked.replace(place)
-                sync_folder(place.parent)
-                sync_folder(self._folder)
+            self._files.place(row.digest, _file_name(row.format), checked)
             if known is None:
                 session.add(row)
                 session.flush()
@@ -376,10 +371,5 @@ def _columns(digest: str, found: AssetFormat, size_bytes: int, facts: Facts) -> 
     }
 
 
-@contextmanager
-def disk_faults() -> Iterator[None]:
-    """Turn what the disk refuses into a fault of the storage."""
-    try:
-        yield
-    except OSError as fault:
-        raise StorageFaultError(f"The file cannot be kept ({fault.strerror}); free some space.") from fault
+def _file_name(format_name: str) -> str:
+    return f"asset{BY_NAME[format_name].suffix}"

@@ -1,103 +1,132 @@
-"""The SQLite file: in WAL mode, written in transactions that are durable when they end."""
+"""A database for scenes, assets and tokens: what SQLite and PostgreSQL have in common."""
 
-import sqlite3
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial, wraps
+from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
-from sqlalchemy import URL, Connection, create_engine, event
-from sqlalchemy.exc import DatabaseError, IntegrityError
+from sqlalchemy import Connection, Engine, event
 from sqlalchemy.orm import Session
-from sqlalchemy.pool import ConnectionPoolEntry
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.storage.faults import StorageFaultError
-from deltalight.services.storage.tables import MIGRATIONS, SCHEMA_VERSION, Base
+from deltalight.services.storage.feed import Feed
+from deltalight.services.storage.schema import make_tables, migrate
+from deltalight.services.storage.tables import SCHEMA_VERSION
 
 BUSY_TIMEOUT_S = 10.0
-_IMMEDIATE = "deltalight_immediate"
-_DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+WRITES, IS_DURABLE = "deltalight_writes", "deltalight_is_durable"  # execution options
+Answer = TypeVar("Answer")
+Given = ParamSpec("Given")
 
 
-class Database:
-    """A database file, shared by any number of threads and processes.
+class Database(ABC):
+    """A database, shared by any number of threads and processes; `shown` names it in sentences.
 
-    A file of an older version is migrated in one transaction.
+    One of an older version is migrated in one transaction.
 
     Raises:
-        DeltalightError: the file is of a newer version, no database, or cannot be written.
+        DeltalightError: it is of a newer version, no database, or cannot be used.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        url = URL.create("sqlite", database=str(path))
-        self._engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_S})
-        event.listen(self._engine, "connect", _prepare)
-        event.listen(self._engine, "begin", _begin)
-        self._writing = self._engine.execution_options(**{_IMMEDIATE: True})
-        with self._explained(), self._engine.connect() as connection:
-            driver = connection.connection.driver_connection
-            assert driver is not None
-            driver.execute("PRAGMA journal_mode=WAL")
-        self._create_tables()
+    def __init__(self, engine: Engine, shown: str) -> None:
+        self.shown = shown
+        self._engine = engine
+        self._reading = self._writing = engine
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
         """Yield a session with a consistent view of the data."""
-        with self._explained(), Session(self._engine) as session:
+        with self._explained(), Session(self._reading) as session:
             yield session
 
     @contextmanager
-    def writing(self) -> Iterator[Session]:
-        """Yield the session of the only writer, of all threads and processes; an exception rolls everything back."""
-        with self._explained(), Session(self._writing) as session, session.begin():
+    def writing(self, *, durable: bool = True) -> Iterator[Session]:
+        """Yield the session of the only writer, of all threads and processes; an exception rolls everything back.
+
+        What is not `durable` may be lost in a power cut.
+        """
+        engine = self._writing if durable else self._writing.execution_options(**{IS_DURABLE: False})
+        with self._explained(), Session(engine) as session, session.begin():
             yield session
+
+    def answer(self, key: Hashable, read: Callable[[], Answer]) -> Answer:
+        """Return what `read` returns; where the database may be away, what it returned last time under this `key`."""
+        del key
+        return read()
+
+    def note(self, key: Hashable, answer: Answer, read: Callable[[], Answer]) -> None:
+        """Note what `read` would answer now, after a change."""
+        del key, answer, read
+
+    def keep_known(self, *reads: Callable[[], object]) -> None:
+        """Have the answers of these reads at hand if the database goes."""
+        del reads
+
+    @abstractmethod
+    def feed(self) -> Feed:
+        """Return a feed to and from the other processes that use this database; the caller closes it."""
 
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
 
-    def _create_tables(self) -> None:
+    def _open(self) -> None:
+        """Lock writers' transactions from now on, and bring the layout up to date."""
+        event.listen(self._engine, "begin", self._begin)
+        self._writing = self._engine.execution_options(**{WRITES: True})
         with self._explained(), self._writing.begin() as connection:
-            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-            if version == 0:
-                Base.metadata.create_all(connection)
-            elif not 0 < version <= SCHEMA_VERSION:
+            version = self._version(connection)
+            if version > SCHEMA_VERSION or version < 0:
                 raise DeltalightError(
-                    f"{self._path} was written by another version of Deltalight (its layout is {version}, this one "
+                    f"{self.shown} was written by another version of Deltalight (its layout is {version}, this one "
                     f"reads {SCHEMA_VERSION}); start the version that wrote it, or name another --data folder."
                 )
-            for older in range(version or SCHEMA_VERSION, SCHEMA_VERSION):
-                for statement in MIGRATIONS[older]:
-                    connection.exec_driver_sql(statement)
-            connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
+            if version == 0:
+                make_tables(connection)
+            elif version < SCHEMA_VERSION:
+                self._migrate(connection, version)
+            self._note_version(connection)
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except IntegrityError:  # a fault of this program, not of the disk
-            raise
-        except (DatabaseError, sqlite3.DatabaseError) as fault:
-            cause = fault.orig if isinstance(fault, DatabaseError) else fault
-            if getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
-                raise StorageFaultError(
-                    f"{self._path} is damaged ({cause}); end the service and run `deltalight restore BACKUP`."
-                ) from fault
-            raise StorageFaultError(
-                f"The database cannot be used now ({cause}); free some space, end other users of it, or name "
-                "another --data folder."
-            ) from fault
+    @abstractmethod
+    def _version(self, connection: Connection) -> int:
+        """Return the version of the layout; 0 = there are no tables."""
 
+    def _migrate(self, connection: Connection, version: int) -> None:
+        """Bring an older layout up to date."""
+        del version
+        migrate(connection)
 
-def _prepare(connection: sqlite3.Connection, _entry: ConnectionPoolEntry) -> None:
-    """Leave transactions to this class, and make each durable (WAL alone survives a kill, but no power cut)."""
-    connection.isolation_level = None
-    connection.execute("PRAGMA synchronous=FULL")
-    connection.execute("PRAGMA foreign_keys=ON")
+    def _note_version(self, connection: Connection) -> None:
+        """Note where else than in Alembic's table that the layout is the newest."""
+        del connection
+
+    @abstractmethod
+    def _begin(self, connection: Connection) -> None:
+        """Lock at the start of a writer, so that what it reads stays true until it has written."""
+
+    @abstractmethod
+    def _explained(self) -> AbstractContextManager[None]:
+        """Turn faults of the database into sentences."""
 
 
-def _begin(connection: Connection) -> None:
-    """Lock at the start of a writer, so that what it reads stays true until it has written."""
-    immediate = connection.get_execution_options().get(_IMMEDIATE, False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+class Stored(Protocol):
+    """What reads a database."""
+
+    _database: Database
+
+
+Reader = TypeVar("Reader", bound=Stored)
+
+
+def remembered(
+    read: Callable[Concatenate[Reader, Given], Answer],
+) -> Callable[Concatenate[Reader, Given], Answer]:
+    """Let a method that reads answer as last time while the database is away (`Database.answer`)."""
+
+    @wraps(read)
+    def answer(self: Reader, /, *args: Given.args, **kwargs: Given.kwargs) -> Answer:
+        key = (read.__qualname__, self, args, tuple(sorted(kwargs.items())))
+        return self._database.answer(key, partial(read, self, *args, **kwargs))
+
+    return answer

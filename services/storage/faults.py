@@ -31,5 +31,9 @@ class StorageFaultError(DeltalightError):
     """The disk or the database refuses."""
 
 
+class DatabaseGoneError(StorageFaultError):
+    """The database does not answer; it may come back."""
+
+
 class OutdatedTokenError(DeltalightError):
     """A token is stored in the way of an earlier version, and has to be made again."""

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from sqlalchemy import func, select
@@ -13,7 +14,7 @@ from sqlalchemy.orm import Session
 from deltalight.protocol.documents import parse_mapping
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
 from deltalight.services.storage.assets import AssetNames
-from deltalight.services.storage.database import Database
+from deltalight.services.storage.database import Database, remembered
 from deltalight.services.storage.documents import Edit, checked_document, require_revision
 from deltalight.services.storage.faults import ConflictError, NotFoundError
 from deltalight.services.storage.tables import AssetUseRow, ChoiceRow, RevisionRow, SceneRow
@@ -86,7 +87,8 @@ class SceneStore:
             DeltalightError: the document is wrong or names an asset that was not uploaded.
         """
         with self._writing() as session:
-            return self._add(session, document, what)
+            added = self._add(session, document, what)
+        return self._noted(added)
 
     def get(self, scene_id: str) -> StoredScene:
         """Return the newest revision of a scene.
@@ -94,9 +96,22 @@ class SceneStore:
         Raises:
             NotFoundError: there is no such scene.
         """
+        return self._database.answer((self, scene_id), partial(self._get, scene_id))
+
+    def _get(self, scene_id: str) -> StoredScene:
         with self._reading() as session:
             return _stored(session, _scene(session, scene_id), _newest(session, scene_id))
 
+    def _noted(self, newest: StoredScene) -> StoredScene:
+        """Note what reads would answer after a change."""
+        scene_id = newest.head.id
+        self._database.note((self, scene_id), newest, partial(self._get, scene_id))
+        if newest.head.is_active:
+            active: StoredScene | None = newest
+            self._database.note((self, None), active, self._active)
+        return newest
+
+    @remembered
     def revision(self, scene_id: str, number: int) -> StoredScene:
         """Return a scene as it was at a revision.
 
@@ -110,6 +125,7 @@ class SceneStore:
                 raise NotFoundError(f"the scene has no revision {number}; list its revisions.")
             return _stored(session, scene, row)
 
+    @remembered
     def all(self) -> list[SceneHead]:
         """Return all scenes, in the order of their creation."""
         newest = select(RevisionRow.scene_id, func.max(RevisionRow.number).label("number"))
@@ -128,6 +144,7 @@ class SceneStore:
             active = _active_id(session)
             return [_head(scene, row, active) for scene, row in session.execute(query)]
 
+    @remembered
     def history(self, scene_id: str, before: int | None, limit: int) -> list[Revision]:
         """Return up to `limit` revisions below `before`, the newest first.
 
@@ -165,7 +182,8 @@ class SceneStore:
             changed = document.replaced(revision=newest.number + 1)
             is_continued = gesture is not None and gesture == newest.gesture
             before = newest.before if is_continued else newest.origin
-            return _added(session, scene, _row(scene_id, changed, what, before, gesture), changed)
+            added = _added(session, scene, _row(scene_id, changed, what, before, gesture), changed)
+        return self._noted(added)
 
     def undo(self, scene_id: str, expected: int | None = None) -> StoredScene:
         """Add a revision that restores the state before the last change.
@@ -209,7 +227,8 @@ class SceneStore:
             _scene(session, scene_id)
             document = _document(session, _newest(session, scene_id)).model_dump(mode="json")
             document["name"] = f"{document['name']} (copy)"[-200:] if name is None else name
-            return self._add(session, document, f"copied from {scene_id}")
+            added = self._add(session, document, f"copied from {scene_id}")
+        return self._noted(added)
 
     def delete(self, scene_id: str, expected: int | None = None) -> None:
         """Delete a scene that is not active; its revisions stay in the database.
@@ -236,16 +255,33 @@ class SceneStore:
             scene = _scene(session, scene_id)
             session.merge(ChoiceRow(key=self._key, value=scene_id))
             session.flush()
-            return _stored(session, scene, _newest(session, scene_id))
+            activated = _stored(session, scene, _newest(session, scene_id))
+        return self._noted(activated)
+
+    def activate_first(self, scene_id: str) -> bool:
+        """Make a scene the one that is rendered, unless one is; return whether it was made so.
+
+        Raises:
+            NotFoundError: there is no such scene.
+        """
+        with self._writing() as session:
+            if _active_id(session) is not None:
+                return False
+            session.merge(ChoiceRow(key=self._key, value=_scene(session, scene_id).id))
+            return True
 
     def active(self) -> StoredScene | None:
         """Return the scene that is rendered, if one was chosen."""
+        return self._database.answer((self, None), self._active)
+
+    def _active(self) -> StoredScene | None:
         with self._reading() as session:
             scene_id = _active_id(session)
             if scene_id is None:
                 return None
             return _stored(session, _scene(session, scene_id), _newest(session, scene_id))
 
+    @remembered
     def active_id(self) -> str | None:
         """Return the id of the scene that is rendered, if one was chosen."""
         with self._reading() as session:
@@ -268,7 +304,8 @@ class SceneStore:
             row = step(session, newest)
             session.add(row)
             session.flush()
-            return _stored(session, scene, row)
+            shown = _stored(session, scene, row)
+        return self._noted(shown)
 
 
 def _added(session: Session, scene: SceneRow, row: RevisionRow, document: SceneDocument) -> StoredScene:

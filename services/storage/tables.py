@@ -1,15 +1,18 @@
 """The tables of the store; times are nanoseconds since 1970, UTC."""
 
-from sqlalchemy import ForeignKey, ForeignKeyConstraint
+from typing import ClassVar
+
+from sqlalchemy import BigInteger, ForeignKey, ForeignKeyConstraint, Integer
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 2
-# Statements that migrate a store from a version to the next.
-MIGRATIONS = {1: ("ALTER TABLE revisions ADD COLUMN gesture VARCHAR",)}
+SCHEMA_VERSION = 3  # of the newest file in migrations/versions
+INTEGER = BigInteger().with_variant(Integer(), "sqlite")  # 64 bits in each database
 
 
 class Base(DeclarativeBase):
     """All tables."""
+
+    type_annotation_map: ClassVar = {int: INTEGER}
 
 
 class SceneRow(Base):
@@ -99,3 +102,15 @@ class TokenRow(Base):
     salt: Mapped[bytes]
     hash: Mapped[bytes]
     created_ns: Mapped[int]
+
+
+class TicketRow(Base):
+    """A single-use ticket that has not been used; `hash` is the SHA-256 of it."""
+
+    __tablename__ = "tickets"
+
+    hash: Mapped[bytes] = mapped_column(primary_key=True)
+    role: Mapped[str]
+    token_id: Mapped[str | None]
+    name: Mapped[str]
+    ends_ns: Mapped[int]

@@ -14,7 +14,7 @@ from typing import Literal
 from sqlalchemy import func, select
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.storage.database import Database
+from deltalight.services.storage.database import Database, remembered
 from deltalight.services.storage.faults import ConflictError, NotFoundError, OutdatedTokenError
 from deltalight.services.storage.tables import TokenRow
 
@@ -71,12 +71,14 @@ class TokenStore:
             )
         return f"{PREFIX}-{token_id}-{secret}"
 
+    @remembered
     def all(self) -> list[Token]:
         """Return all tokens, in the order of their creation."""
         with self._database.reading() as session:
             return [_token(row) for row in session.scalars(select(TokenRow).order_by(TokenRow.created_ns))]
 
     @property
+    @remembered
     def is_empty(self) -> bool:
         """Whether there is no token at all."""
         with self._database.reading() as session:
@@ -94,6 +96,7 @@ class TokenStore:
                 raise NotFoundError(f"there is no token called `{name}`; list the tokens for their names.")
             session.delete(row)
 
+    @remembered
     def knows(self, token_id: str) -> bool:
         """Whether a token of this id still exists."""
         with self._database.reading() as session:
@@ -109,8 +112,7 @@ class TokenStore:
         if match is None:
             return None
         token_id, secret = match.groups()
-        with self._database.reading() as session:
-            row = session.get(TokenRow, token_id)
+        row = self._row(token_id)
         if row is None:
             return None
         given = _hash(secret, row.salt)
@@ -121,11 +123,20 @@ class TokenStore:
             )
         return _token(row) if hmac.compare_digest(row.hash, given) else None
 
+    @remembered
+    def _row(self, token_id: str) -> TokenRow | None:
+        with self._database.reading() as session:
+            return session.get(TokenRow, token_id)
+
 
 def _hash(secret: str, salt: bytes) -> bytes:
     return hashlib.sha256(salt + secret.encode()).digest()
 
 
+def role_named(stored: str) -> Role:
+    """Return the role that the database names."""
+    return "control" if stored == "control" else "view"
+
+
 def _token(row: TokenRow) -> Token:
-    role: Role = "control" if row.role == "control" else "view"
-    return Token(row.id, row.name, role, row.created_ns)
+    return Token(row.id, row.name, role_named(row.role), row.created_ns)

@@ -62,7 +62,7 @@ def running_api(
         "requests_per_s": requests_per_s,
     }
     chosen = ApiSettings.model_validate({**defaults, **settings})
-    with Store(folder, probe=probe) as store:
+    with Store(folder, database=chosen.database, assets=chosen.assets, probe=probe) as store:
         app = create_app(chosen, store)
         server = http_server(app)
         listener = listening(ports.LOOPBACK, port)

@@ -16,12 +16,14 @@ from deltalight.protocol.envelope import encode
 from deltalight.protocol.messages import ColorMessage, DepthMessage, PoseMessage
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.cli import run
+from tests.services.postgres_samples import PostgresServer
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 64, 48
+DATABASES = ("sqlite", "postgres")
 IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
 
 RunCli = Callable[..., subprocess.CompletedProcess[str]]
@@ -34,6 +36,32 @@ def browser() -> Iterator["Browser"]:
 
     with chromium() as running:
         yield running
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[PostgresServer]:
+    server = PostgresServer()
+    try:
+        server.start()
+        yield server
+    finally:
+        server.close()
+
+
+def _database(request: pytest.FixtureRequest) -> str | None:
+    return None if request.param == "sqlite" else request.getfixturevalue("postgres").fresh_database()
+
+
+@pytest.fixture(params=DATABASES)
+def database(request: pytest.FixtureRequest) -> str | None:
+    """An empty database, as settings name it: the file in the data folder, or PostgreSQL's."""
+    return _database(request)
+
+
+@pytest.fixture(scope="module", params=DATABASES)
+def module_database(request: pytest.FixtureRequest) -> str | None:
+    """The same for a whole module."""
+    return _database(request)
 
 
 @pytest.fixture

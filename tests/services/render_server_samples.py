@@ -35,6 +35,7 @@ class Recorder:
         self.epoch = epoch
         self.asked: list[tuple[str, dict[str, object]]] = []
         self.fault: str | None = None
+        self.refusal: str | None = None  # of scenes
         self.scene_id: str | None = None
         self.revision, self.instance = 1, "stand-in"
         self.gate = threading.Event()
@@ -66,6 +67,8 @@ class Recorder:
                 }
             case "set_scene":
                 self._wait_at_gate()
+                if self.refusal is not None:
+                    raise DeltalightError(self.refusal)
                 self.scene_id, self.revision = request.scene_id, request.revision or self.revision + 1
             case "pick":
                 self._wait_at_gate()

@@ -17,8 +17,8 @@ from tests.services.storage_samples import TETRAHEDRON
 
 
 @pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
-    with live_api(tmp_path_factory.mktemp("data")) as running:
+def live(tmp_path_factory: pytest.TempPathFactory, module_database: str | None) -> Iterator[LiveApi]:
+    with live_api(tmp_path_factory.mktemp("data"), database=module_database) as running:
         yield running
 
 

@@ -23,7 +23,7 @@ from deltalight.services.api.limits import STREAMS_PER_CLIENT
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.routes.live import WINDOW
 from deltalight.services.live_message import unpack
-from tests.services.api_samples import sentence
+from tests.services.api_samples import running_api, sentence
 from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import (
     LiveApi,
@@ -264,6 +264,15 @@ def test_a_pick_is_the_render_servers_answer(live: LiveApi, monkeypatch: pytest.
     assert asked == [{"x": 3.0, "y": 4.5}, {"x": 3.0, "y": 4.0, "ignore": "knot"}]
     assert "No frame" in sentence(live.client.post("/live/pick", json={"x": 1, "y": 1}), 422)
     assert "`body.x`" in sentence(live.client.post("/live/pick", json={"x": -1, "y": 1}), 422)
+
+
+def test_ready_is_more_than_alive(live: LiveApi, tmp_path: Path) -> None:
+    assert live.client.get("/ready").json()["stream"]["status"] == "ok"
+    with running_api(tmp_path, host="0.0.0.0") as alone:  # no token, no render server, no picture
+        assert alone.client.get("/health").status_code == 200
+        text = sentence(alone.client.get("/ready"), 503)
+        assert "the render server does not answer; no picture came" in text
+        assert "storage" not in text
 
 
 def test_health_tells_of_the_stream(live: LiveApi) -> None:

@@ -16,8 +16,8 @@ from tests.services.storage_samples import TETRAHEDRON
 
 
 @pytest.fixture(scope="module")
-def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
-    with running_api(tmp_path_factory.mktemp("data")) as running:
+def api(tmp_path_factory: pytest.TempPathFactory, module_database: str | None) -> Iterator[RunningApi]:
+    with running_api(tmp_path_factory.mktemp("data"), database=module_database) as running:
         running.client.post("/assets?name=t.obj", content=TETRAHEDRON, headers=UPLOAD).raise_for_status()
         yield running
 

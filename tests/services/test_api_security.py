@@ -1,12 +1,12 @@
 """Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
 
 import socket
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
+from sqlalchemy import update
 from websockets.sync.client import connect
 
 from deltalight.protocol.errors import DeltalightError
@@ -15,6 +15,7 @@ from deltalight.services.api.auth import WRONG_TOKENS_AT_ONCE
 from deltalight.services.api.credentials import SecretToken
 from deltalight.services.api.limits import REMEMBERED_CLIENTS, RateLimit
 from deltalight.services.api.settings import ApiSettings
+from deltalight.services.storage.tables import TokenRow
 from tests.services.api_samples import RunningApi, running_api, sentence
 
 
@@ -33,9 +34,9 @@ def open_api(default_api: RunningApi) -> Iterator[RunningApi]:
 
 
 @pytest.fixture
-def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
+def guarded(tmp_path_factory: pytest.TempPathFactory, database: str | None) -> Iterator[RunningApi]:
     """With the rules of an address that leaves the host (the test itself listens on loopback)."""
-    with running_api(tmp_path_factory.mktemp("data"), host="0.0.0.0") as running:
+    with running_api(tmp_path_factory.mktemp("data"), host="0.0.0.0", database=database) as running:
         yield running
 
 
@@ -75,9 +76,8 @@ def test_elsewhere_every_request_needs_a_token(guarded: RunningApi) -> None:
 
 def test_a_token_that_an_earlier_version_stored_is_told_to_be_made_again(guarded: RunningApi) -> None:
     token = guarded.store.tokens.create("old", "control")
-    with sqlite3.connect(guarded.store.folder / "store.sqlite3") as database:
-        database.execute("UPDATE tokens SET hash = ?", (b"\0" * 64,))  # the length of a scrypt hash
-    database.close()
+    with guarded.store.tokens._database.writing() as session:
+        session.execute(update(TokenRow).values(hash=b"\0" * 64))  # the length of a scrypt hash
     answer = guarded.client.get("/scenes", headers=bearer(token))
     assert "earlier version; revoke it" in sentence(answer, 401)
 

@@ -26,9 +26,11 @@ def scene_file(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_scene_shown_last_is_shown_again_unless_one_is_named(tmp_path: Path, scene_file: Path) -> None:
+def test_the_scene_shown_last_is_shown_again_unless_one_is_named(
+    tmp_path: Path, scene_file: Path, database: str | None
+) -> None:
     recording = SimpleNamespace(scene=SceneDocument(name="recorded"))
-    with Store(tmp_path / "data", probe=trusting_probe) as store:
+    with Store(tmp_path / "data", database=database, probe=trusting_probe) as store:
         assert scene_to_show(store, recording, None).name == "recorded"
         active = store.scenes.active()
         assert active is not None

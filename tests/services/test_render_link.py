@@ -112,6 +112,18 @@ def test_the_newest_of_many_changes_is_sent_and_all_are_answered(shown: Shown) -
     assert shown.client.get("/state").json()["picture"] == last["picture"]
 
 
+def test_a_scene_that_another_web_process_was_ahead_of_is_not_refused(shown: Shown) -> None:
+    shown.rename("second")
+    shown.server.refusal, shown.server.revision = "The scene is already at revision 4.", 4
+    picture = shown.rename("third")["picture"]
+    assert (picture["state"], picture["revision"]) == ("pending", 3)
+    shown.server.refusal = None
+    wait_for(lambda: shown.client.get("/state").json()["picture"]["state"] == "shown")
+    shown.server.refusal = "It cannot be shown."
+    refused = shown.rename("fourth")["picture"]
+    assert (refused["state"], refused["detail"]) == ("refused", "It cannot be shown.")
+
+
 def test_the_views_that_viewers_look_at_are_ordered_and_no_change_of_the_scene(shown: Shown) -> None:
     def watched() -> list[object]:
         return [order["views"] for order in shown.server.payloads("watch")]

@@ -14,7 +14,12 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.server import frames
 from deltalight.render_server.server.frames import FrameAssembler
-from deltalight.render_server.server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
+from deltalight.render_server.server.session import (
+    MAXIMUM_FAULTS_IN_A_ROW,
+    WATCHED_NS,
+    RenderSession,
+    SourceInUse,
+)
 from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
 from tests.services.render_server_samples import InvertingRenderer
 
@@ -268,6 +273,20 @@ def test_watched_views_come_with_each_composite_as_long_as_they_are_watched(
     assert shown(4) == ["delta"]
     with pytest.raises(DeltalightError, match="the command watch"):
         session.execute(request("watch", views=["sideways"]))
+
+
+def test_views_of_several_senders_are_watched_until_each_is_silent_for_a_minute() -> None:
+    now_ns = START
+    session = RenderSession(InvertingRenderer(), SceneDocument(), clock_ns=lambda: now_ns)
+    first, second = (request("watch", views=[view, "rsm"]) for view in ("delta", "volume"))
+    session.execute(first)
+    now_ns += WATCHED_NS
+    session.execute(second.model_copy(update={"node": "another"}))
+    assert session.watched == ("delta", "rsm", "volume")
+    now_ns += 1
+    assert session.watched == ("volume", "rsm")
+    session.execute(second.model_copy(update={"node": "another", "payload": {"views": []}}))
+    assert session.watched == ()
 
 
 def test_set_view_and_get_scene(session: RenderSession) -> None:

@@ -6,8 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sqlalchemy import create_engine
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.storage.documents import (
@@ -27,13 +30,18 @@ from deltalight.services.storage.faults import (
     StaleRevisionError,
     TooLargeError,
 )
+from deltalight.services.storage.schema import migrate
 from deltalight.services.storage.store import Store
+from deltalight.services.storage.tables import SCHEMA_VERSION, Base
+from deltalight.services.storage.tickets import Ticket
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
+
+TOKEN_OF_VERSION_2 = "deltalight-fa9ac659b290--Bud0XIv_HpLkQqYnqwjfVqalCQgKxd21A1OS9YWbcU"
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    with Store(tmp_path / "data", probe=trusting_probe) as store:
+def store(tmp_path: Path, database: str | None) -> Iterator[Store]:
+    with Store(tmp_path / "data", database=database, probe=trusting_probe) as store:
         yield store
 
 
@@ -156,12 +164,12 @@ def test_scenes_are_copied_listed_and_deleted(store: Store) -> None:
         store.scenes.get(copy.head.id)
 
 
-def test_everything_is_there_after_reopening(tmp_path: Path) -> None:
-    with Store(tmp_path, probe=trusting_probe) as store:
+def test_everything_is_there_after_reopening(tmp_path: Path, database: str | None) -> None:
+    with Store(tmp_path, database=database, probe=trusting_probe) as store:
         scene_id = store.scenes.create({"name": "kept"}).head.id
         store.scenes.activate(scene_id)
         digest = upload(store, TETRAHEDRON, "t.obj").digest
-    with Store(tmp_path, probe=trusting_probe) as store:
+    with Store(tmp_path, database=database, probe=trusting_probe) as store:
         active = store.scenes.active()
         assert active is not None
         assert active.document.name == "kept"
@@ -306,7 +314,7 @@ def test_what_is_no_document_is_a_sentence(store: Store, document: object) -> No
         store.scenes.change(scene_id, replace_document(document), "x")
 
 
-def test_tokens_are_shown_once_and_kept_as_hashes(store: Store, tmp_path: Path) -> None:
+def test_tokens_are_shown_once_and_kept_as_hashes(store: Store, tmp_path: Path, database: str | None) -> None:
     token = store.tokens.create("wall", "view")
     found = store.tokens.verify(token)
     assert found is not None
@@ -317,7 +325,7 @@ def test_tokens_are_shown_once_and_kept_as_hashes(store: Store, tmp_path: Path) 
     assert all(secret not in path.read_bytes() for path in (tmp_path / "data").iterdir() if path.is_file())
     with pytest.raises(ConflictError):
         store.tokens.create("wall", "control")
-    with Store(tmp_path / "data", probe=trusting_probe) as elsewhere:
+    with Store(tmp_path / "data", database=database, probe=trusting_probe) as elsewhere:
         elsewhere.tokens.revoke("wall")
     assert store.tokens.verify(token) is None
     assert store.tokens.is_empty
@@ -341,6 +349,37 @@ def test_a_store_of_the_version_before_is_opened_and_goes_on(tmp_path: Path) -> 
             assert store.scenes.undo(active.head.id).document.name == "new"
     with Store(tmp_path) as store:
         assert store.scenes.undo(active.head.id).document.name == "old"
+
+
+def test_a_store_that_knew_no_tickets_keeps_all_it_has(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "store.sqlite3") as connection:
+        connection.executescript(Path(__file__).with_name("store_version_2.sql").read_text())
+    connection.close()
+    for _ in range(2):
+        with Store(tmp_path) as store:
+            active = store.scenes.active()
+            assert active is not None
+            assert (active.document.name, active.document.revision, active.can_redo) == ("first", 4, True)
+            (asset,) = store.assets.all()
+            assert (asset.names, active.document.objects[0].asset) == (("shape.obj",), asset.reference)
+            token = store.tokens.verify(TOKEN_OF_VERSION_2)
+            assert token is not None
+            assert token.name == "wall"
+    with Store(tmp_path) as store:
+        assert store.scenes.redo(active.head.id).document.name == "third"
+        store.tickets.add("secret", Ticket("view", None, ""), 30.0)
+        assert store.tickets.take("secret") == Ticket("view", None, "")
+        assert store.tickets.take("secret") is None
+
+
+def test_migrations_from_nothing_make_the_tables_that_a_new_store_has(database: str | None) -> None:
+    engine = create_engine((database or "sqlite://").replace("postgresql:", "postgresql+psycopg:"))
+    with engine.begin() as connection:
+        migrate(connection)
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, Base.metadata) == []
+        assert context.get_current_revision() == str(SCHEMA_VERSION)
+    engine.dispose()
 
 
 def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ pytestmark = pytest.mark.slow
 LAMPS = [{"type": "sphere", "position_m": [0, 0, 1 + index / 100]} for index in range(64)]
 
 
-def write_until_killed(acknowledge: Connection, folder: Path, seed: int) -> None:
+def write_until_killed(acknowledge: Connection, folder: Path, seed: int, database: str | None) -> None:
     """Makes revisions, undoes some, uploads assets; tells of each when the store has said that it is done."""
-    with Store(folder, probe=trusting_probe) as store:
+    with Store(folder, database=database, probe=trusting_probe) as store:
         scene_id = store.scenes.create({"name": f"process {seed}", "lights": {"manual": LAMPS}}).head.id
         acknowledge.send((scene_id, 1, f"process {seed}"))
         number = 0
@@ -35,21 +35,22 @@ def write_until_killed(acknowledge: Connection, folder: Path, seed: int) -> None
                 acknowledge.send((asset.digest,))
 
 
-def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
+def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path, database: str | None) -> None:
     writer = KilledWriter(write_until_killed, most_awaited=8, longest_delay_s=0.02)
     revisions: list[tuple[str, int, str]] = []
     digests: list[str] = []
     for seed in range(CYCLES):
-        for entry in writer.run(seed, tmp_path, seed):
+        for entry in writer.run(seed, tmp_path, seed, database):
             if len(entry) == 1:
                 digests += entry
             else:
                 revisions.append(entry)
-    connection = sqlite3.connect(tmp_path / "store.sqlite3")
-    assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
-    assert connection.execute("PRAGMA foreign_key_check").fetchall() == []
-    connection.close()
-    with Store(tmp_path, probe=trusting_probe) as store:
+    if database is None:
+        connection = sqlite3.connect(tmp_path / "store.sqlite3")
+        assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        assert connection.execute("PRAGMA foreign_key_check").fetchall() == []
+        connection.close()
+    with Store(tmp_path, database=database, probe=trusting_probe) as store:
         assert len({scene_id for scene_id, _, _ in revisions}) == CYCLES
         for scene_id, number, name in revisions:
             assert store.scenes.revision(scene_id, number).document.name == name

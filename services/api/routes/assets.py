@@ -83,6 +83,7 @@ def get_asset(shared: Shared, digest: Digest) -> AssetAnswer:
 
 
 @router.get("/{digest}/content", response_class=StoredFileResponse, responses=responses(404, 416))
+@in_pool("asset files")
 def download_asset(shared: Shared, digest: Digest) -> StoredFileResponse:
     """Download the file."""
     asset = shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX))

@@ -11,7 +11,7 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import Name
 from deltalight.sensor_node.cameras.playback import MAX_RATE, MIN_RATE
-from deltalight.services.api.context import Context, Shared, in_pool
+from deltalight.services.api.context import JOBS, Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.problems import responses
 from deltalight.services.api.recording_session import RecordingSession
@@ -20,8 +20,8 @@ from deltalight.services.api.replay_control import Position, ReplayOrder
 from deltalight.services.api.request_bodies import AS_SENT, UPLOAD_TYPE, checked, require_upload_type
 from deltalight.services.storage.faults import ConflictError
 
-router = APIRouter(tags=["recordings"], prefix="/recordings")
-replay_router = APIRouter(tags=["recordings"], prefix="/replay")
+router = APIRouter(tags=["recordings"], prefix="/recordings", dependencies=[JOBS])
+replay_router = APIRouter(tags=["recordings"], prefix="/replay", dependencies=[JOBS])
 ROUTERS = (router, replay_router)
 
 RecordingId = Annotated[
@@ -236,7 +236,9 @@ def start_recording(
     return RecordingAnswer.growing(session)
 
 
-@router.post("/upload", status_code=201, responses=responses(400, 413, 415, 422), openapi_extra=_UPLOAD_BODY)
+@router.post(
+    "/upload", status_code=201, responses=responses(400, 409, 413, 415, 422), openapi_extra=_UPLOAD_BODY
+)
 async def upload_recording(
     shared: Shared,
     request: Request,
@@ -363,7 +365,7 @@ def change_replay(
     return replay_answer(shared.replay.change(**dict(wanted)))
 
 
-@replay_router.delete("", status_code=204)
+@replay_router.delete("", status_code=204, responses=responses(409))
 @in_pool("replay")
 def end_replay(shared: Shared) -> None:
     """Show the live nodes again."""

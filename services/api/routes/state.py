@@ -12,8 +12,10 @@ from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.live_hub import LiveFrame
 from deltalight.services.api.metrics import MEDIA_TYPE
 from deltalight.services.api.models import PictureState, ProcessAnswer
-from deltalight.services.api.problems import responses
+from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.streams import Report
+
+READY_PICTURE_S = 10.0  # five pictures of a slow renderer
 
 state_router = APIRouter(tags=["state"])
 nodes_router = APIRouter(tags=["nodes"])
@@ -81,6 +83,24 @@ def health(shared: Shared) -> Health:
         stream=_stream(shared),
         version=__version__,
     )
+
+
+@state_router.get("/ready", responses=unavailable("The storage, the render server or a picture is missing."))
+def ready(shared: Shared) -> Health:
+    """Whether storage, render server and newest picture are there: for what chooses among web processes."""
+    _, since_s = shared.live.state()
+    missing = [
+        each
+        for each, is_missing in (
+            ("the storage does not answer", not shared.store.answers()),
+            ("the render server does not answer", not shared.link.is_reachable),
+            (f"no picture came within {READY_PICTURE_S:.0f} s", since_s is None or since_s > READY_PICTURE_S),
+        )
+        if is_missing
+    ]
+    if missing:
+        raise ProblemError(503, "not-ready", f"Not ready: {'; '.join(missing)}.")
+    return health(shared)
 
 
 @state_router.get("/state")
