@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor, srgb_bytes
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame
+from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
 from deltalight.render_server.post_effects.camera_compression import (
     SAMPLING,
     CameraCompression,
@@ -13,6 +15,7 @@ from deltalight.render_server.post_effects.camera_compression import (
     compressed,
     find_compression,
 )
+from deltalight.render_server.post_effects.camera_noise import add_noise, estimate_noise
 
 SIZE = (280, 328)  # neither a whole number of blocks, nor of what is examined
 
@@ -75,3 +78,41 @@ def test_all_frames_must_agree_on_the_quality() -> None:
     assert learned.model == Compression(75, (True, False))
     learned.observe(ViewFrame(2, 2, scene(), camera))
     assert learned.model is None
+
+
+@pytest.mark.parametrize("quality", [50, 75, 90])
+def test_objects_are_as_far_from_clean_as_the_camera_is(quality: int) -> None:
+    """Within 15 % with compression and noise, and nearer than with noise alone. Noise stays as measured."""
+    rows, columns = np.mgrid[:240, :320]
+    linear = np.linspace(0.03, 0.8, 320)[:, None] * np.array([1, 0.9, 0.7]) * np.ones((240, 1, 1))
+    linear *= (1 + 0.25 * np.sin(columns / 3 + rows / 5) * (rows > 120))[..., None]
+    linear[..., 2] *= 1 + 0.3 * np.sin(rows / 2.3 + columns / 5) * (rows < 60)
+    linear[40:100, 60:200:8] *= 0.5
+    linear, rng = linear.astype(np.float32), np.random.default_rng(3)
+    sensor, clean = ColorSensor(2e-4, 0.003), srgb_bytes(linear)
+    seen = [from_camera(sensor.expose(linear, rng), quality, (True, False)) for _ in range(2)]
+    noise, compression = estimate_noise(seen[0], seen[1], None), find_compression(seen[0])
+    assert noise is not None
+    assert compression is not None
+    assert compression.quality == quality
+    camera = CameraModel(320, 240, np.array([[300, 0, 160], [0, 300, 120], [0, 0, 1.0]]))
+    cover = np.ones((240, 320), np.float32)
+    put_on = [
+        FrameArtifacts(ViewFrame(number, number, each, camera), noise, None, None, compression).applied(
+            clean, cover
+        )
+        for number, each in enumerate(seen)
+    ]
+    assert distance(put_on[0], clean) == pytest.approx(distance(seen[0], clean), rel=0.15)
+    again = estimate_noise(put_on[0], put_on[1], None)
+    assert again is not None
+    grey = np.full((1, 3), 0.2)
+    np.testing.assert_allclose(again.variance(grey), noise.variance(grey), rtol=0.15)
+    alone = distance(add_noise(clean, cover, noise, 0, None), clean)
+    truth = distance(seen[0], clean)
+    assert abs(distance(put_on[0], clean) - truth) < abs(alone - truth)
+
+
+def distance(picture: np.ndarray, clean: np.ndarray) -> float:
+    """Codes, rms."""
+    return float(np.sqrt(np.mean((picture.astype(float) - clean) ** 2)))
