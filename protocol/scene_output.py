@@ -53,8 +53,8 @@ class Output(StrictModel):
     antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
     camera_artifacts: bool = Field(
         default=False,
-        description="Put the camera's noise, sharpness, vignetting and motion blur on the virtual part, as its "
-        "frames show them.",
+        description="Put the camera's noise, sharpness, vignetting, JPEG compression and motion blur on the virtual "
+        "part, as its frames show them.",
     )
     bloom: float = Field(
         default=0.0,

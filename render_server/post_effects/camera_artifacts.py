@@ -1,4 +1,7 @@
-"""What a camera does to a picture, learned from its frames and put on the virtual part: vignetting, blur, noise."""
+"""What a camera does to a picture, learned from its frames and put on the virtual part.
+
+In this order: vignetting, blur, compression, noise. Noise is last because it is measured behind the compression.
+"""
 
 from dataclasses import dataclass
 
@@ -15,6 +18,11 @@ from deltalight.render_server.post_effects.camera_blur import (
     blur_kernels,
     blurred,
     measure_blur,
+)
+from deltalight.render_server.post_effects.camera_compression import (
+    CameraCompression,
+    Compression,
+    compressed,
 )
 from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
 from deltalight.render_server.post_effects.camera_vignetting import PaperVignetting, Vignetting, vignetted
@@ -33,6 +41,7 @@ class FrameArtifacts:
     noise: NoiseModel | None
     kernels: Float64[np.ndarray, "3 k k"] | None
     vignetting: Vignetting | None = None
+    compression: Compression | None = None
 
     def applied(self, color: Color, coverage: Coverage) -> Color:
         """Return a picture of the frame with all of it on its virtual part; as it is while none is known."""
@@ -41,17 +50,20 @@ class FrameArtifacts:
             color = vignetted(color, coverage, self.vignetting.factors(frame.camera), frame)
         if self.kernels is not None:
             color, coverage = blurred(color, coverage, self.kernels, frame.response)
+        if self.compression is not None:
+            color = compressed(color, coverage, self.compression)
         if self.noise is None:
             return color
         return add_noise(color, coverage, self.noise, frame.frame_id, frame.response)
 
 
 class CameraArtifacts:
-    """Learns a camera's noise, the blur of its lens and its vignetting, and follows its motion."""
+    """Learns a camera's noise, the blur of its lens, its vignetting and compression, and follows its motion."""
 
     def __init__(self) -> None:
         self._noise = CameraNoise()
         self._vignetting = PaperVignetting()
+        self._compression = CameraCompression()
         self._lens: list[LensBlur] = []
         self._last: ViewFrame | None = None
         self._pose: Float64[np.ndarray, "4 4"] = np.eye(4)
@@ -75,10 +87,13 @@ class CameraArtifacts:
         if frame is not self._last:
             self._follow(frame, world_from_camera, place_m)
             self._vignetting.observe(frame)
+            self._compression.observe(frame)
             self._last, self._pose = frame, world_from_camera
         from_centre = np.nan_to_num(_pixel(frame, self._pose, place_m) - frame.camera.matrix[:2, 2])
         kernels = blur_kernels(self._lens_blur(), self._motion_px, from_centre)
-        return FrameArtifacts(frame, self._noise.model, kernels, self._vignetting.model)
+        return FrameArtifacts(
+            frame, self._noise.model, kernels, self._vignetting.model, self._compression.model
+        )
 
     def _lens_blur(self) -> LensBlur | None:
         """Return the medians of what was measured."""

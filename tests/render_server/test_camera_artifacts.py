@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -67,6 +68,28 @@ def test_objects_are_smeared_as_the_camera_moves(gpu: GpuContext, tmp_path: Path
     assert reached[1].max() > columns.max()
     assert abs(reached[0].min() - rows.min()) <= 1
     assert abs(reached[0].max() - rows.max()) <= 1
+
+
+def test_objects_are_compressed_as_the_picture_is(gpu: GpuContext, tmp_path: Path) -> None:
+    """From the first frame on; pixels without objects are those of the picture without it, to the bit."""
+    rows, columns = np.mgrid[: plain().shape[0], : plain().shape[1]]
+    clean = decode_lut(None)[plain(150), np.arange(3)] * (1 + 0.3 * np.sin(columns / 4 + rows / 9))[..., None]
+    noisy = ColorSensor(3e-4, 0.01).expose(clean.astype(np.float32), np.random.default_rng(1))
+    _, code = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 40])
+    seen = frame(np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR), np.uint8))
+    stage = Stage(tmp_path, COARSE)
+    document = stage.document([stage.virtual(cube(0.3))], [ambient(0.5)], floor())
+    pictures = {}
+    for asked in (False, True):
+        renderer = SceneRenderer(
+            gpu, document.replaced(output=document.output.replaced(camera_artifacts=asked))
+        )
+        pictures[asked] = renderer.render(seen).color
+        covered = fields_of(renderer).matte > 0
+        renderer.release()
+    without, with_it = pictures[False], pictures[True]
+    assert np.array_equal(with_it[~covered], without[~covered])
+    assert (with_it[covered] != without[covered]).any()
 
 
 def test_a_glowing_object_has_bloom_in_every_composite(gpu: GpuContext, tmp_path: Path) -> None:

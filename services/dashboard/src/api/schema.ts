@@ -2735,7 +2735,7 @@ export interface components {
             readonly bloom: number;
             /**
              * Camera Artifacts
-             * @description Put the camera's noise, sharpness, vignetting and motion blur on the virtual part, as its frames show them.
+             * @description Put the camera's noise, sharpness, vignetting, JPEG compression and motion blur on the virtual part, as its frames show them.
              * @default false
              */
             readonly camera_artifacts: boolean;
