@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from deltalight.protocol import columns
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.depth_mesh import back_faces
 from deltalight.render_server.scene.materials import Material
@@ -34,7 +35,7 @@ class ObjectExtent:
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates of the points, m."""
-        return self.points.min(axis=0), self.points.max(axis=0)
+        return columns.bounds(self.points)
 
     @property
     def volume_edge(self) -> float:
@@ -92,19 +93,18 @@ class GeometryState:
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates, m."""
-        return self.points.min(axis=0), self.points.max(axis=0)
+        return columns.bounds(self.points)
 
     @cached_property
     def triangle_boxes(self) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
         """Least and greatest coordinates of each triangle, m."""
-        a, b, c = (self.corners[:, corner, :3].astype(np.float64) for corner in range(3))
-        return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        return columns.boxes(self.corners[..., :3].astype(np.float64))
 
     @cached_property
     def triangle_edges(self) -> Float64[np.ndarray, " m"]:
         """Longest edge of each triangle's box, m."""
         low, high = self.triangle_boxes
-        return np.asarray(np.max(high - low, axis=1))
+        return columns.greatest(high - low)
 
     @property
     def lasting_points(self) -> Float64[np.ndarray, "k 3"]:
@@ -116,4 +116,4 @@ class GeometryState:
         """Where the set is throughout its animations, and as its objects turn."""
         points = self.lasting_points
         upright = points if self.upright_points is None else self.upright_points
-        return ObjectExtent(points, np.stack([upright.min(axis=0), upright.max(axis=0)]))
+        return ObjectExtent(points, np.stack(columns.bounds(upright)))

@@ -8,6 +8,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
+from deltalight.protocol import columns
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
@@ -63,6 +64,7 @@ class LightStages:
         keeps_views: bool = False,
     ) -> None:
         self._keeps_views = keeps_views
+        self._receivers: tuple[GeometryState, Points, Points] | None = None
         self.buffers = LightBuffers(gpu, tile_size, shadow_samples)
         self._mirrors = mirrors
         self._maps = ShadowMaps(gpu)
@@ -85,12 +87,19 @@ class LightStages:
         If an `area` of the picture is to be lit too, real shadows are those of the whole scene. Returns the records
         of both, which tell whether their maps are still those of the views.
         """
-        around = _snapped(extent.upright) if self._keeps_views else extent.upright
-        receivers = shadow_receivers(real, around) if area == NOWHERE else real.points
+        receivers = self._receivers_of(real, extent) if area == NOWHERE else real.points
         shining = list(lights.lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent.points, axis=0)) if self._mirrors else []
         self.buffers.place(shining, real.points, receivers, extent.points, mirrors)
         return self.buffers.real_records, self.buffers.virtual_records
+
+    def _receivers_of(self, real: GeometryState, extent: ObjectExtent) -> Points:
+        """Returns the real points on which shadows of the objects fall; the same while neither changes its place."""
+        around = _snapped(extent.upright) if self._keeps_views else extent.upright
+        known = self._receivers
+        if known is None or known[0] is not real or not np.array_equal(known[1], around):
+            known = self._receivers = real, around, shadow_receivers(real, around)
+        return known[2]
 
     def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
         """Draws the real scene as seen from the lights."""
@@ -171,7 +180,7 @@ def _extent_of(objects: GeometryState) -> ObjectExtent:
 
 def _snapped(extent: Points) -> Points:
     """Returns the corners of a box around points, snapped to half of its longest edge."""
-    low, high = extent.min(axis=0), extent.max(axis=0)
+    low, high = columns.bounds(extent)
     step = max(float(np.max(high - low)) / 2, 1e-6)
     step = 2.0 ** np.ceil(np.log2(step))  # an object that turns keeps it
     return np.stack([np.floor(low / step) * step, np.ceil(high / step) * step])
@@ -182,12 +191,12 @@ def shadow_receivers(real: GeometryState, extent: Points) -> Points:
 
     These are the vertices within reach and, for triangles too large to have a vertex there, their part of that cube.
     """
-    low, high = extent.min(axis=0), extent.max(axis=0)
+    low, high = columns.bounds(extent)
     centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
     points = real.points
-    near = points[np.linalg.norm(points - centre, axis=1) <= reach]
+    near = points[columns.lengths(points - centre) <= reach]
     first, last = real.triangle_boxes
-    meets = np.all((first <= centre + reach) & (last >= centre - reach), axis=1)
+    meets = columns.all_of((first <= centre + reach) & (last >= centre - reach))
     large = meets & (real.triangle_edges > LARGE_TRIANGLE * reach)
     corners = real.corners[large, :, :3].astype(np.float64)
     clipped = np.clip(corners.reshape(-1, 3), centre - reach, centre + reach)

@@ -230,7 +230,7 @@ class ObjectBvh:
         assert self._mesh is not None
         if self._corners is not self._built:
             self._built = self._corners
-            positions = self._corners[..., :3]
+            positions = np.ascontiguousarray(self._corners[..., :3])
             bvh = self._renewed(positions)
             self.release()
             self._nodes = self._ctx.buffer(bvh.packed())

@@ -9,6 +9,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from deltalight.protocol import columns
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import (
@@ -96,7 +97,8 @@ class VolumePlacement:
         """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
         voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
         voxels = np.clip(voxels, 0, self.size - 1)
-        return np.concatenate([voxels.min(axis=0), -voxels.max(axis=0)]).astype(np.int32)
+        low, high = columns.bounds(voxels)
+        return np.concatenate([low, -high]).astype(np.int32)
 
 
 def place_volume(
@@ -341,8 +343,8 @@ def pieces_in_volume(
 ) -> tuple[Float32[np.ndarray, "k 3 10"], int]:
     """Returns the triangles that meet the volume, long ones split, and a bound on their number of surfels."""
     low, high = _voxel_extents(corners, placement)
-    met = np.all((high >= 0) & (low < placement.size), axis=1)
-    short = np.all(high - low < LONGEST_EDGE_VOXELS / 2, axis=1)
+    met = columns.all_of((high >= 0) & (low < placement.size))
+    short = columns.all_of(high - low < LONGEST_EDGE_VOXELS / 2)
     kept = met & short
     split = split_triangles(corners[met & ~short], LONGEST_EDGE_VOXELS * placement.voxel_edge)
     bound = _voxels_in(low[kept], high[kept], placement) + _voxels_in(
@@ -358,8 +360,7 @@ def _voxel_extents(
 
     The shaders' arithmetic rounds in another way, so these are at least the voxels that they find.
     """
-    a, b, c = ((corners[:, i, :3] - placement.origin) / placement.voxel_edge for i in range(3))
-    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    low, high = columns.boxes((corners[..., :3] - placement.origin) / placement.voxel_edge)
     return np.floor(low - BORDER_VOXELS), np.floor(high + BORDER_VOXELS)
 
 
@@ -368,7 +369,8 @@ def _voxels_in(
 ) -> int:
     """Returns the number of voxels in the boxes, clipped to the volume."""
     first, last = (np.clip(v, 0, placement.size - 1) for v in (low, high))
-    return int(np.prod(last - first + 1, axis=1).sum())
+    x, y, z = (last - first + 1).T
+    return int((x * y * z).sum())
 
 
 class ClearVoxels:

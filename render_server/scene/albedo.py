@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 
+from deltalight.protocol import columns
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import LUMINANCE, BoardPose
@@ -71,7 +72,7 @@ def unclipped(
     `linear` is the picture decoded by the response alone, before division by the exposure.
     """
     bright = (linear >= CLIPPED_LINEAR) | (color == CLIPPED_CODE)
-    return np.asarray(~bright.any(axis=-1) & (linear @ LUMINANCE >= DARK_LINEAR))
+    return np.asarray(~columns.any_of(bright) & (linear @ LUMINANCE >= DARK_LINEAR))
 
 
 def _inside(masks: list[UInt8[np.ndarray, "h w"]], camera: CameraModel) -> Bool[np.ndarray, "h w"]:
@@ -149,7 +150,7 @@ class AlbedoVolume:
         """
         self._place_cube(*bounds)
         cell, inside = self._cells(position)
-        known = inside & (irradiance > 0).all(axis=1) & np.isfinite(measured).all(axis=1)
+        known = inside & columns.all_of(irradiance > 0) & columns.all_of(np.isfinite(measured))
         values = np.column_stack([measured, irradiance, np.ones(len(measured))])[known]
         new = np.stack([np.bincount(cell[known], column, CELLS**3) for column in values.T], axis=1)
         kept = np.minimum(1, np.maximum(MAX_WEIGHT - new[:, 6], 0) / np.maximum(self._sums[:, 6], 1e-9))
@@ -167,7 +168,7 @@ class AlbedoVolume:
         self, position: Float[np.ndarray, "k 3"]
     ) -> tuple[Int64[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
         place = np.floor((position - self.origin) / self.edge * CELLS)
-        inside = np.asarray(((place >= 0) & (place < CELLS)).all(axis=1))
+        inside = columns.all_of((place >= 0) & (place < CELLS))
         x, y, z = np.where(inside[:, None], place, 0).astype(np.int64).T
         return (z * CELLS + y) * CELLS + x, inside
 

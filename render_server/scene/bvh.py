@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
+from deltalight.protocol import columns
 from deltalight.protocol.errors import DeltalightError, install_command
 
 LEAF_SIZE = 4  # triangles at most: boxes around fewer cost as many tests as they save
@@ -53,8 +54,8 @@ class Bvh:
     @property
     def cost(self) -> float:
         """Expected number of boxes that a ray opens: the sum of their surface areas relative to the root's."""
-        extent = self.high.astype(np.float64) - self.low
-        areas = (extent * np.roll(extent, 1, axis=1)).sum(axis=1)
+        x, y, z = (self.high.astype(np.float64) - self.low).T
+        areas = x * z + y * x + z * y
         return float(areas.sum() / areas[0])
 
     def refitted(self, corners: Float32[np.ndarray, "m 3 3"]) -> "Bvh":
@@ -65,8 +66,9 @@ class Bvh:
         spans = np.stack([firsts[:-1], firsts[self.skip]], axis=1).ravel()
         ordered = corners[self.order]
         margin = np.float32(ROUNDING * float(np.abs(corners).max()))
-        low = _over_spans(np.minimum, ordered.min(axis=1), spans) - margin
-        high = _over_spans(np.maximum, ordered.max(axis=1), spans) + margin
+        least, greatest = columns.boxes(ordered)
+        low = _over_spans(np.minimum, least, spans) - margin
+        high = _over_spans(np.maximum, greatest, spans) + margin
         return replace(self, low=low, high=high)
 
 
@@ -100,7 +102,7 @@ def build_bvh(corners: Float32[np.ndarray, "m 3 3"]) -> Bvh:
 
     Deterministic: the same triangles give the same tree.
     """
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    low, high = columns.boxes(corners)
     boxes = _Boxes(low, high, (low + high) * np.float32(0.5))
     levels: list[_Level] = []
     leaf_of = np.zeros((len(corners), 2), np.int64)  # level and number of the leaf that holds a triangle
