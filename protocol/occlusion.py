@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.frames import DepthImage
 
 RAY_STEP_M = 0.01  # as fine as things on a table that can occlude a light
@@ -34,7 +34,7 @@ def is_occluded(
     points = (origin + along * direction) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
     pixels = np.rint(np.nan_to_num(depth.camera.project(points), nan=-1.0))
     height, width = depth.depth_m.shape
-    inside = columns.all_of((pixels >= 0) & (pixels < (width, height)))
+    inside = short_axis.all_of((pixels >= 0) & (pixels < (width, height)))
     column, row = np.where(inside[:, None], pixels, 0).astype(int).T
     behind = points[:, 2] - depth.depth_m[row, column]
     slack = DEPTH_TOLERANCE * np.abs(points[:, 2])

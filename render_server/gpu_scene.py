@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.depth_mesh import back_faces
 from deltalight.render_server.scene.materials import Material
@@ -35,7 +35,7 @@ class ObjectExtent:
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates of the points, m."""
-        return columns.bounds(self.points)
+        return short_axis.bounds(self.points)
 
     @property
     def volume_edge(self) -> float:
@@ -93,18 +93,18 @@ class GeometryState:
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates, m."""
-        return columns.bounds(self.points)
+        return short_axis.bounds(self.points)
 
     @cached_property
     def triangle_boxes(self) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
         """Least and greatest coordinates of each triangle, m."""
-        return columns.boxes(self.corners[..., :3].astype(np.float64))
+        return short_axis.boxes(self.corners[..., :3].astype(np.float64))
 
     @cached_property
     def triangle_edges(self) -> Float64[np.ndarray, " m"]:
         """Longest edge of each triangle's box, m."""
         low, high = self.triangle_boxes
-        return columns.greatest(high - low)
+        return short_axis.greatest(high - low)
 
     @property
     def lasting_points(self) -> Float64[np.ndarray, "k 3"]:
@@ -116,4 +116,4 @@ class GeometryState:
         """Where the set is throughout its animations, and as its objects turn."""
         points = self.lasting_points
         upright = points if self.upright_points is None else self.upright_points
-        return ObjectExtent(points, np.stack(columns.bounds(upright)))
+        return ObjectExtent(points, np.stack(short_axis.bounds(upright)))

@@ -8,7 +8,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
@@ -180,7 +180,7 @@ def _extent_of(objects: GeometryState) -> ObjectExtent:
 
 def _snapped(extent: Points) -> Points:
     """Returns the corners of a box around points, snapped to half of its longest edge."""
-    low, high = columns.bounds(extent)
+    low, high = short_axis.bounds(extent)
     step = max(float(np.max(high - low)) / 2, 1e-6)
     step = 2.0 ** np.ceil(np.log2(step))  # an object that turns keeps it
     return np.stack([np.floor(low / step) * step, np.ceil(high / step) * step])
@@ -191,12 +191,12 @@ def shadow_receivers(real: GeometryState, extent: Points) -> Points:
 
     These are the vertices within reach and, for triangles too large to have a vertex there, their part of that cube.
     """
-    low, high = columns.bounds(extent)
+    low, high = short_axis.bounds(extent)
     centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
     points = real.points
-    near = points[columns.lengths(points - centre) <= reach]
+    near = points[short_axis.lengths(points - centre) <= reach]
     first, last = real.triangle_boxes
-    meets = columns.all_of((first <= centre + reach) & (last >= centre - reach))
+    meets = short_axis.all_of((first <= centre + reach) & (last >= centre - reach))
     large = meets & (real.triangle_edges > LARGE_TRIANGLE * reach)
     corners = real.corners[large, :, :3].astype(np.float64)
     clipped = np.clip(corners.reshape(-1, 3), centre - reach, centre + reach)

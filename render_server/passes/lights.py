@@ -7,7 +7,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
@@ -275,7 +275,7 @@ def mirror_map_axes(mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]) -> 
     local = on_plane @ axes.T
     if not len(local):
         local = np.zeros((1, 2))
-    low, high = columns.bounds(local)
+    low, high = short_axis.bounds(local)
     extent = max(float((high - low).max()), NEAREST_M) * MIRROR_MAP_MARGIN
     offset = 0.5 - (low + high) / 2 / extent
     u, v = (np.append(axis / extent, shift) for axis, shift in zip(axes, offset, strict=True))

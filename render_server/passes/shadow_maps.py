@@ -9,7 +9,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
@@ -235,7 +235,7 @@ def _orthographic_view(
 ) -> LightView:
     rotation = frame_along(direction)
     local = receivers @ rotation.T
-    low, high = columns.bounds(local)
+    low, high = short_axis.bounds(local)
     first = min(float((occluders @ rotation[2]).min()), float(low[2]))
     centre = (low + high) / 2
     margin = 0.01 * float((high - low).max()) + NEAREST_M
@@ -246,7 +246,7 @@ def _orthographic_view(
 
 def _tangents(local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
     """Returns the greater tangent of each point's direction to +z, per axis; infinite behind the light."""
-    tangents = columns.greatest(np.abs(local[:, :2])) / np.maximum(local[:, 2], NEAREST_M)
+    tangents = short_axis.greatest(np.abs(local[:, :2])) / np.maximum(local[:, 2], NEAREST_M)
     return np.where(local[:, 2] > NEAREST_M, tangents, np.inf)
 
 
@@ -290,7 +290,7 @@ def _wide_view(
     local = (receivers - position) @ rotation.T
     near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
     # Triangles whose vertices lie beside this view reach nearer than any vertex in it.
-    reach = float(columns.lengths(local).max()) * FAR_MARGIN
+    reach = float(short_axis.lengths(local).max()) * FAR_MARGIN
     return LightView(_matrix(rotation, position), half, max(0.1 * near, NEAREST_M), max(far, reach), False)
 
 

@@ -9,7 +9,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import (
@@ -97,7 +97,7 @@ class VolumePlacement:
         """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
         voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
         voxels = np.clip(voxels, 0, self.size - 1)
-        low, high = columns.bounds(voxels)
+        low, high = short_axis.bounds(voxels)
         return np.concatenate([low, -high]).astype(np.int32)
 
 
@@ -343,8 +343,8 @@ def pieces_in_volume(
 ) -> tuple[Float32[np.ndarray, "k 3 10"], int]:
     """Returns the triangles that meet the volume, long ones split, and a bound on their number of surfels."""
     low, high = _voxel_extents(corners, placement)
-    met = columns.all_of((high >= 0) & (low < placement.size))
-    short = columns.all_of(high - low < LONGEST_EDGE_VOXELS / 2)
+    met = short_axis.all_of((high >= 0) & (low < placement.size))
+    short = short_axis.all_of(high - low < LONGEST_EDGE_VOXELS / 2)
     kept = met & short
     split = split_triangles(corners[met & ~short], LONGEST_EDGE_VOXELS * placement.voxel_edge)
     bound = _voxels_in(low[kept], high[kept], placement) + _voxels_in(
@@ -360,7 +360,7 @@ def _voxel_extents(
 
     The shaders' arithmetic rounds in another way, so these are at least the voxels that they find.
     """
-    low, high = columns.boxes((corners[..., :3] - placement.origin) / placement.voxel_edge)
+    low, high = short_axis.boxes((corners[..., :3] - placement.origin) / placement.voxel_edge)
     return np.floor(low - BORDER_VOXELS), np.floor(high + BORDER_VOXELS)
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import LUMINANCE, BoardPose
@@ -72,7 +72,7 @@ def unclipped(
     `linear` is the picture decoded by the response alone, before division by the exposure.
     """
     bright = (linear >= CLIPPED_LINEAR) | (color == CLIPPED_CODE)
-    return np.asarray(~columns.any_of(bright) & (linear @ LUMINANCE >= DARK_LINEAR))
+    return np.asarray(~short_axis.any_of(bright) & (linear @ LUMINANCE >= DARK_LINEAR))
 
 
 def _inside(masks: list[UInt8[np.ndarray, "h w"]], camera: CameraModel) -> Bool[np.ndarray, "h w"]:
@@ -150,7 +150,7 @@ class AlbedoVolume:
         """
         self._place_cube(*bounds)
         cell, inside = self._cells(position)
-        known = inside & columns.all_of(irradiance > 0) & columns.all_of(np.isfinite(measured))
+        known = inside & short_axis.all_of(irradiance > 0) & short_axis.all_of(np.isfinite(measured))
         values = np.column_stack([measured, irradiance, np.ones(len(measured))])[known]
         new = np.stack([np.bincount(cell[known], column, CELLS**3) for column in values.T], axis=1)
         kept = np.minimum(1, np.maximum(MAX_WEIGHT - new[:, 6], 0) / np.maximum(self._sums[:, 6], 1e-9))
@@ -168,7 +168,7 @@ class AlbedoVolume:
         self, position: Float[np.ndarray, "k 3"]
     ) -> tuple[Int64[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
         place = np.floor((position - self.origin) / self.edge * CELLS)
-        inside = columns.all_of((place >= 0) & (place < CELLS))
+        inside = short_axis.all_of((place >= 0) & (place < CELLS))
         x, y, z = np.where(inside[:, None], place, 0).astype(np.int64).T
         return (z * CELLS + y) * CELLS + x, inside
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError, install_command
 
 LEAF_SIZE = 4  # triangles at most: boxes around fewer cost as many tests as they save
@@ -66,7 +66,7 @@ class Bvh:
         spans = np.stack([firsts[:-1], firsts[self.skip]], axis=1).ravel()
         ordered = corners[self.order]
         margin = np.float32(ROUNDING * float(np.abs(corners).max()))
-        least, greatest = columns.boxes(ordered)
+        least, greatest = short_axis.boxes(ordered)
         low = _over_spans(np.minimum, least, spans) - margin
         high = _over_spans(np.maximum, greatest, spans) + margin
         return replace(self, low=low, high=high)
@@ -102,7 +102,7 @@ def build_bvh(corners: Float32[np.ndarray, "m 3 3"]) -> Bvh:
 
     Deterministic: the same triangles give the same tree.
     """
-    low, high = columns.boxes(corners)
+    low, high = short_axis.boxes(corners)
     boxes = _Boxes(low, high, (low + high) * np.float32(0.5))
     levels: list[_Level] = []
     leaf_of = np.zeros((len(corners), 2), np.int64)  # level and number of the leaf that holds a triangle

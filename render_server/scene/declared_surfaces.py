@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
@@ -84,10 +84,10 @@ def _inside(
     if first[3] == PLANE:
         inside = np.abs((points - first[:3]) @ second[:3]) <= second[3]
     elif first[3] == BOX:
-        inside = columns.all_of((points >= first[:3]) & (points <= second[:3]))
+        inside = short_axis.all_of((points >= first[:3]) & (points <= second[:3]))
     elif first[3] == SHEET:
         on_edges = np.abs((points[:, :2] - first[:2]) @ np.array([second[:2], (-second[1], second[0])]).T)
-        inside = columns.all_of(on_edges <= second[2:]) & (np.abs(points[:, 2]) <= first[2])
+        inside = short_axis.all_of(on_edges <= second[2:]) & (np.abs(points[:, 2]) <= first[2])
     elif materials is None:
         inside = np.zeros(len(points), bool)
     else:
@@ -180,7 +180,7 @@ def _sampled(
     """Returns the points of every fourth row and column whose normals are known."""
     grid = (slice(None, None, SAMPLE_STEP),) * 2
     z, facing, rays = depth.depth_m[grid], normals[grid], depth.camera.rays()[grid]
-    known = depth.valid[grid] & (z > 0) & columns.any_of(facing)
+    known = depth.valid[grid] & (z > 0) & short_axis.any_of(facing)
     z, rotation = z[known].astype(float), world_from_camera[:3, :3]
     along = np.column_stack([rays[known], np.ones(len(z))]) @ rotation.T
     points = along * z[:, None] + world_from_camera[:3, 3]

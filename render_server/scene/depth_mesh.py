@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
@@ -104,7 +104,7 @@ def _with_grazing(
     flat = _median_pixels(grazing, stride)
     by_pixel = _slopes(grazing)
     normals = surface_normals(grazing, by_ray(by_pixel, camera), camera).reshape(-1, 3)[flat]
-    added = (grazing.ravel()[flat] > 0) & (nodes.inverse_depth == 0) & columns.any_of(normals != 0)
+    added = (grazing.ravel()[flat] > 0) & (nodes.inverse_depth == 0) & short_axis.any_of(normals != 0)
     slope = np.hypot(*by_pixel.reshape(2, -1)[:, flat])
     joined = _Nodes(
         nodes.pixels,
@@ -253,7 +253,7 @@ def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Flo
     """
     positions = corners[..., :3]
     across = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
-    length = columns.lengths(across)[..., None]
+    length = short_axis.lengths(across)[..., None]
     normals = across / np.maximum(length, np.finfo(np.float32).tiny)
     backs = corners[:, ::-1].copy()
     backs[..., :3] -= BACK_OFFSET_VOXELS * voxel_edge * normals[:, None]

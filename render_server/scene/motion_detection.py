@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
@@ -119,7 +119,7 @@ def _recolored_fraction(old: FrameSamples, new: FrameSamples, thresholds: Motion
     A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
     """
     limit = _color_limit(old.color, thresholds)
-    return float(columns.any_of(np.abs(new.color - old.color) > limit).mean())
+    return float(short_axis.any_of(np.abs(new.color - old.color) > limit).mean())
 
 
 class KeptWorld:
@@ -164,7 +164,7 @@ def _compared(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds
     seen = old.inverse_depth[cells] > 0
     same_place = seen & (inverse >= farthest - limit) & (inverse <= nearest + limit)
     color, spare = new.color[known], _color_limit(old.color[cells], thresholds)
-    recolored = columns.any_of((color < low - spare) | (color > high + spare))
+    recolored = short_axis.any_of((color < low - spare) | (color > high + spare))
     appeared = (seen & (inverse > nearest + limit)) | (same_place & recolored)
     total = max(int(np.count_nonzero(new.inverse_depth)), 1)
     unseen = total - int(np.count_nonzero(same_place | appeared))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene.asset_check import MAX_TRIANGLES
 from deltalight.render_server.scene.materials import Material, material_table
@@ -28,8 +28,8 @@ def face_normals(
     corners = positions.astype(np.float64)[triangles]
     edges = np.roll(corners, -1, axis=1) - corners
     normals = np.cross(edges[:, 0], edges[:, 1])
-    double_area = columns.lengths(normals)
-    longest = columns.greatest(np.einsum("mij,mij->mi", edges, edges))
+    double_area = short_axis.lengths(normals)
+    longest = short_axis.greatest(np.einsum("mij,mij->mi", edges, edges))
     proper = double_area > DEGENERATE_RATIO * longest
     normals[proper] /= double_area[proper, None]
     return normals, proper
@@ -50,7 +50,7 @@ class Smoothing:
         weighted = weights * np.repeat(normals, 3, axis=0)
         groups = self.group[triangles.ravel()]
         sums = np.stack([np.bincount(groups, weighted[:, axis]) for axis in range(3)], axis=1)
-        lengths = np.maximum(columns.lengths(sums)[:, None], 1e-30)
+        lengths = np.maximum(short_axis.lengths(sums)[:, None], 1e-30)
         return np.asarray((sums / lengths)[self.group], np.float32)
 
 
@@ -163,14 +163,14 @@ class TriangleMesh:
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
         """Returns the least and greatest coordinates of the vertices that triangles use."""
         used = self.positions[self.triangles.ravel()]
-        return np.stack(columns.bounds(used))
+        return np.stack(short_axis.bounds(used))
 
     def transformed(self, matrix: Float64[np.ndarray, "4 4"]) -> "TriangleMesh":
         """Returns the mesh in another frame; a mirroring matrix reverses the winding."""
         linear = matrix[:3, :3]
         positions = self.positions @ linear.T + matrix[:3, 3]
         normals = self.normals @ np.linalg.inv(linear)
-        normals /= np.maximum(columns.lengths(normals)[:, None], 1e-30)
+        normals /= np.maximum(short_axis.lengths(normals)[:, None], 1e-30)
         mirrored = np.linalg.det(linear) < 0
         return replace(
             self,
@@ -393,8 +393,8 @@ def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> F
     _check_pieces(pending, max_edge)
     while len(pending):
         edges = np.roll(pending[..., :3], -1, axis=1) - pending[..., :3]
-        lengths = columns.lengths(edges)
-        long = columns.greatest(lengths) > max_edge
+        lengths = short_axis.lengths(edges)
+        long = short_axis.greatest(lengths) > max_edge
         done.append(pending[~long])
         pending = _bisected(pending[long], lengths[long].argmax(axis=1))
     return np.concatenate(done) if done else np.zeros_like(pending)
@@ -406,9 +406,9 @@ def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> Non
     An equilateral triangle is the largest that the limit allows; bisection makes a few times as many.
     """
     edges = np.roll(corners[..., :3], -1, axis=1) - corners[..., :3]
-    areas = columns.lengths(np.cross(edges[:, 0], edges[:, 1])) / 2
+    areas = short_axis.lengths(np.cross(edges[:, 0], edges[:, 1])) / 2
     by_area = areas / (np.sqrt(3) / 4 * max_edge**2)
-    by_length = columns.greatest(columns.lengths(edges)) / max_edge
+    by_length = short_axis.greatest(short_axis.lengths(edges)) / max_edge
     if np.maximum(by_area, by_length).sum() > MAX_PIECES:
         raise DeltalightError(
             f"a mesh splits into more than {MAX_PIECES} triangles; use fewer voxels or a smaller mesh."

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.render_server.scene.depth_mesh import REAL_MATERIAL
 from deltalight.render_server.scene.depth_surface import DepthSurface
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
@@ -63,8 +63,8 @@ def extract_mesh(volume: TsdfVolume) -> TriangleMesh:
     triangles = _triangles(cells)
     if volume.placement.hole is not None:
         least, greatest = volume.placement.hole
-        inside = columns.all_of((positions >= least) & (positions <= greatest))
-        triangles = triangles[~columns.all_of(inside[triangles])]
+        inside = short_axis.all_of((positions >= least) & (positions <= greatest))
+        triangles = triangles[~short_axis.all_of(inside[triangles])]
     return _only_used(positions, normals, triangles)
 
 
@@ -95,7 +95,7 @@ def _clustered(mesh: TriangleMesh, cell_m: float) -> TriangleMesh:
     positions = _sums(cluster, mesh.positions) / count
     normals = _unit(_sums(cluster, mesh.normals))
     corners = cluster[mesh.triangles]
-    proper = columns.all_of(corners != np.roll(corners, 1, axis=1))
+    proper = short_axis.all_of(corners != np.roll(corners, 1, axis=1))
     return _only_used(positions, normals, _without_copies(corners[proper]))
 
 
@@ -112,7 +112,7 @@ def _sums(groups: Int64[np.ndarray, " n"], values: Float32[np.ndarray, "n 3"]) -
 
 
 def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    return np.asarray(vectors / np.maximum(columns.lengths(vectors)[:, None], 1e-12))
+    return np.asarray(vectors / np.maximum(short_axis.lengths(vectors)[:, None], 1e-12))
 
 
 def _crossed_cells(volume: TsdfVolume) -> _Cells:
@@ -140,7 +140,7 @@ def _with_border(volume: TsdfVolume, blocks: Int64[np.ndarray, " k"]) -> Float32
     for step in CORNERS:
         place = volume.places[blocks] + step
         last = volume.placement.blocks - 1
-        slot = np.where(columns.all_of(place <= last), volume.slots[tuple(np.minimum(place, last).T)], -1)
+        slot = np.where(short_axis.all_of(place <= last), volume.slots[tuple(np.minimum(place, last).T)], -1)
         there = np.flatnonzero(slot >= 0)
         part = known[slot[there]].reshape(-1, *(BLOCK,) * 3)[
             :, *(slice(0, 1) if far else slice(None) for far in step)
@@ -195,7 +195,7 @@ def _find(
         return np.full(len(voxel), -1)
     wanted = np.ravel_multi_index(tuple(np.maximum(voxel, 0).T), (VOXELS,) * 3)
     place = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
-    known: Bool[np.ndarray, " m"] = (keys[place] == wanted) & columns.all_of(voxel >= 0)
+    known: Bool[np.ndarray, " m"] = (keys[place] == wanted) & short_axis.all_of(voxel >= 0)
     return np.where(known, place, -1)
 
 
@@ -342,7 +342,7 @@ def _seen_points(surface: DepthSurface, view: CameraView) -> _SeenPoints:
     known = surface.inverse_depth > 0
     z = 1 / surface.inverse_depth[known].astype(np.float64)
     rays = np.dstack([view.camera.rays(), np.ones(known.shape, np.float32)])[known].astype(np.float64)
-    cosine = np.abs(np.einsum("ni,ni->n", rays, surface.normals[known])) / columns.lengths(rays)
+    cosine = np.abs(np.einsum("ni,ni->n", rays, surface.normals[known])) / short_axis.lengths(rays)
     cosine = np.where(cosine > 0, cosine, 1)  # unknown normals count as facing the camera
     matrix, focal = view.world_from_camera, view.camera.matrix
     area = z * z / (focal[0, 0] * focal[1, 1]) / np.maximum(cosine, np.cos(np.radians(80)))

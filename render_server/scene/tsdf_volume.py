@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from deltalight.protocol import columns
+from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.render_server.scene.depth_surface import DepthSurface
 from deltalight.render_server.view import NEAR_M, CameraView
@@ -84,8 +84,8 @@ class PixelPlanes:
         inverse, rays = surface.inverse_depth.ravel(), _pixel_rays(camera)
         z = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
         normals = surface.normals.reshape(-1, 3)
-        facing = -rays / columns.lengths(rays)[:, None]
-        normals = np.where(columns.all_of(normals == 0)[:, None], facing, normals)
+        facing = -rays / short_axis.lengths(rays)[:, None]
+        normals = np.where(short_axis.all_of(normals == 0)[:, None], facing, normals)
         rows = np.zeros((len(z) + 1, 6), np.float32)
         rows[:-1, :3] = normals
         rows[:-1, 3] = np.einsum("ni,ni->n", normals, rays) * z
@@ -135,7 +135,7 @@ class TsdfVolume:
     def _add_blocks(self, world: Float32[np.ndarray, "n 3"]) -> None:
         placement = self.placement
         place = np.floor((world - placement.origin) / placement.block_m)
-        inside = columns.all_of((place >= 0) & (place < placement.blocks))
+        inside = short_axis.all_of((place >= 0) & (place < placement.blocks))
         wanted = np.zeros(self.slots.shape, bool)
         wanted[tuple(place[inside].astype(np.intp).T)] = True
         fresh = np.argwhere(wanted & (self.slots < 0)).astype(np.int32)
@@ -197,7 +197,7 @@ class TsdfVolume:
 
 
 def _inside(points: Float32[np.ndarray, "n 3"], box: Float64[np.ndarray, "2 3"]) -> Bool[np.ndarray, " n"]:
-    return columns.all_of((points >= box[0]) & (points <= box[1]))
+    return short_axis.all_of((points >= box[0]) & (points <= box[1]))
 
 
 def _in_hole(places: Int32[np.ndarray, "n 3"], placement: TsdfPlacement) -> Bool[np.ndarray, " n"]:
@@ -266,7 +266,7 @@ def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
     columns, rows = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
     rays = np.stack([columns, rows, np.ones_like(columns)], axis=-1).reshape(-1, 3)
     pixels = np.rint(np.nan_to_num(camera.project(rays), nan=-1.0)).clip(-1, 2**20).astype(np.int64)
-    inside = columns.all_of((pixels >= 0) & (pixels < (camera.width, camera.height)))
+    inside = short_axis.all_of((pixels >= 0) & (pixels < (camera.width, camera.height)))
     return np.where(inside, pixels[:, 1] * camera.width + pixels[:, 0], none).astype(np.int32)
 
 
@@ -313,7 +313,7 @@ def _alignment_points(
     stride = max(1, int(np.sqrt(surface.inverse_depth.size / ALIGNMENT_SAMPLES)))
     grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     inverse = surface.inverse_depth[grid]
-    known = (inverse > 0) & columns.any_of(surface.normals[grid] != 0)
+    known = (inverse > 0) & short_axis.any_of(surface.normals[grid] != 0)
     z = 1 / inverse[known].astype(np.float64)
     rays = np.column_stack([view.camera.rays()[grid][known], np.ones(len(z))])
     return rays * z[:, None], noise_sigma * z * z
@@ -350,7 +350,7 @@ def interpolate(
     """Interpolates trilinearly: indices of points in known cells, their distances (m) and unit gradients."""
     placement = volume.placement
     at = (world - placement.origin) / placement.voxel_m
-    found = np.flatnonzero(columns.all_of((at >= 0) & (at < placement.blocks * BLOCK - 1)))
+    found = np.flatnonzero(short_axis.all_of((at >= 0) & (at < placement.blocks * BLOCK - 1)))
     cell = np.floor(at[found]).astype(np.int64)
     fraction = at[found] - cell
     corners = np.stack([_at_voxels(volume, cell + step) for step in CORNERS], axis=1)
@@ -364,7 +364,7 @@ def interpolate(
         for axis in range(3)
     ]
     gradient = np.stack(slopes, axis=1)
-    length = columns.lengths(gradient)
+    length = short_axis.lengths(gradient)
     # Truncated distances have no gradient.
     steep = length > 0.5 * placement.voxel_m
     return found[steep], distance[steep], gradient[steep] / length[steep, None]
