@@ -24,6 +24,8 @@ MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 300
 LONGEST_INPUT = 32_768
 DISTILLED_BYTES = 6_000  # of a target
 MOST_CRASHES = 20
+# The kernel hands a process's peak memory on to what it starts, and libFuzzer would take it for its own: a shell between.
+OWN_PEAK = ("sh", "-c", '"$@"; exit "$?"', "sh")
 NO_ATHERIS = "fuzzing needs atheris, which there is for Linux on x86-64 and Python up to 3.13"
 
 
@@ -94,6 +96,7 @@ def run_fuzzer(target: str, grown: Path, kept: Path, *options: str) -> tuple[int
     folders = [str(each) for each in (grown, _seed_folder(grown), KEPT / target)]
     limits = [f"-rss_limit_mb={MEMORY_MB}", f"-malloc_limit_mb={ALLOCATION_MB}", f"-timeout={HANG_S}"]
     command = [
+        *OWN_PEAK,
         sys.executable,
         "-m",
         "tests.fuzz.child",
