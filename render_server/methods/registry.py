@@ -25,7 +25,9 @@ from deltalight.render_server.methods.method import (
     ResolvedSettings,
     Setup,
 )
+from deltalight.render_server.methods.precomputed_transfer import precomputed_radiance
 from deltalight.render_server.occlusion_fields import OcclusionFields
+from deltalight.render_server.precomputed_transfers import ObjectTransfers, require_rigid_transfer
 
 BUILT_IN: tuple[RelightingMethod[Any], ...] = (DVCT, DLPV, AROOF, DIFFERENTIAL)
 _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
@@ -64,22 +66,25 @@ class MethodChoice:
         return self.settings.resolved_composition
 
     def require(self, objects: Sequence[SceneObject]) -> None:
-        """Refuses visible objects that the method cannot render.
+        """Refuses visible objects that the method or the shading cannot render.
 
         Raises:
-            DeltalightError: an object's shape may change, but the method precomputes it.
+            DeltalightError: an object's shape may change, but the method or the shading precomputes it.
         """
-        if self.method.require is not None:
+        shading = require_rigid_transfer if self.shading.is_precomputed else None
+        for require in (self.method.require, shading):
             for item in objects:
-                if item.visible:
-                    self.method.require(item)
+                if item.visible and require is not None:
+                    require(item)
 
     def setup(self, picture_size: tuple[int, int], fields: OcclusionFields) -> Setup[Any]:
         """Returns what the method's stages are declared with, for pictures of this size."""
         return Setup(self.settings, self.resolved, picture_size, fields)
 
-    def declare(self, graph: Graph, resources: FrameResources, setup: Setup[Any]) -> Layers:
-        """Declares the method's stages.
+    def declare(
+        self, graph: Graph, resources: FrameResources, setup: Setup[Any], transfers: ObjectTransfers
+    ) -> Layers:
+        """Declares the method's stages, and those of the shading.
 
         Raises:
             DeltalightError: a plugin cannot.
@@ -88,6 +93,9 @@ class MethodChoice:
             layers = self.method.declare(graph, resources, setup)
         if self.shading.is_image_based:
             radiance = image_based_radiance(graph, resources, self.shading, setup.picture_size)
+            layers = replace(layers, radiance=radiance)
+        if self.shading.is_precomputed:
+            radiance = precomputed_radiance(graph, resources, self.shading, setup.picture_size, transfers)
             layers = replace(layers, radiance=radiance)
         return layers
 
