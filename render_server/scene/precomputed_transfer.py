@@ -22,7 +22,13 @@ from deltalight.render_server.scene.occlusion_field import (
     direction_set,
 )
 from deltalight.render_server.scene.occlusion_transfer import FACING, object_surface
-from deltalight.render_server.scene.triangle_mesh import TriangleMesh, face_normals, split_triangles, unit_or
+from deltalight.render_server.scene.triangle_mesh import (
+    CREASE_ANGLE_DEG,
+    TriangleMesh,
+    face_normals,
+    split_triangles,
+    unit_or,
+)
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -32,6 +38,7 @@ LONGEST_EDGE = 1 / 16
 LIFT = 1e-4  # of the radius: offset of rays along the normal, so that a surface does not hide itself
 # Offset of rays along the surface towards its triangles: a vertex of a crease lies in the other side's plane.
 INSET = 0.02
+SMOOTH_COSINE = math.cos(math.radians(CREASE_ANGLE_DEG))
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,8 @@ def _traced(
 ) -> Iterator[tuple[Int64[np.ndarray, " p"], Float32[np.ndarray, "p d"], RayHits]]:
     """Traces the rays above vertices' horizons, in chunks: yields vertices, cosines to all directions, and hits.
 
-    Triangles in whose plane a vertex lies hide nothing from it, though interpolated normals rise above them.
+    Triangles in whose plane a vertex lies, and whose way it faces, hide nothing from it, though its interpolated
+    normal leans over them.
     """
     starts = _ray_starts(surface, rays.radius)
     facing, _ = face_normals(surface.positions, surface.triangles)
@@ -155,7 +163,8 @@ def _traced(
         hits = rays.trace_hemisphere(starts[part], normals, directions)
         apart = surface.positions[part][hits.point] - surface.positions[surface.triangles[hits.triangle, 0]]
         off = np.abs((apart * facing[hits.triangle]).sum(axis=1))
-        yield part, cosine, _chosen(hits, off > LIFT * rays.radius)
+        turned = (normals[hits.point] * facing[hits.triangle]).sum(axis=1) < SMOOTH_COSINE
+        yield part, cosine, _chosen(hits, turned | (off > LIFT * rays.radius))
 
 
 def _chosen(hits: RayHits, which: Bool[np.ndarray, " h"]) -> RayHits:
