@@ -198,7 +198,10 @@ class FrameGraph:
         self.resources: FrameResources = declare_frame(self.graph, self.buffers)
         try:
             setup = method.setup(view.size, precomputed.fields)
-            self.layers: Layers = method.declare(self.graph, self.resources, setup, precomputed.transfers)
+            layers = method.declare(self.graph, self.resources, setup)
+            self.layers: Layers = method.shaded(
+                self.graph, self.resources, layers, view.size, precomputed.transfers
+            )
         except BaseException:
             self.release()
             raise

@@ -81,23 +81,31 @@ class MethodChoice:
         """Returns what the method's stages are declared with, for pictures of this size."""
         return Setup(self.settings, self.resolved, picture_size, fields)
 
-    def declare(
-        self, graph: Graph, resources: FrameResources, setup: Setup[Any], transfers: ObjectTransfers
-    ) -> Layers:
-        """Declares the method's stages, and those of the shading.
+    def declare(self, graph: Graph, resources: FrameResources, setup: Setup[Any]) -> Layers:
+        """Declares the method's stages.
 
         Raises:
             DeltalightError: a plugin cannot.
         """
         with _blamed(self.plugin), graph.of_plugin(self.plugin):
-            layers = self.method.declare(graph, resources, setup)
+            return self.method.declare(graph, resources, setup)
+
+    def shaded(
+        self,
+        graph: Graph,
+        resources: FrameResources,
+        layers: Layers,
+        size: tuple[int, int],
+        transfers: ObjectTransfers,
+    ) -> Layers:
+        """Declares the stages of a shading that takes the place of the method's own."""
         if self.shading.is_image_based:
-            radiance = image_based_radiance(graph, resources, self.shading, setup.picture_size)
-            layers = replace(layers, radiance=radiance)
-        if self.shading.is_precomputed:
-            radiance = precomputed_radiance(graph, resources, self.shading, setup.picture_size, transfers)
-            layers = replace(layers, radiance=radiance)
-        return layers
+            radiance = image_based_radiance(graph, resources, self.shading, size)
+        elif self.shading.is_precomputed:
+            radiance = precomputed_radiance(graph, resources, self.shading, size, transfers)
+        else:
+            return layers
+        return replace(layers, radiance=radiance)
 
 
 def choose_method(
