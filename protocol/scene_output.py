@@ -16,10 +16,14 @@ class Shading(StrictModel):
     name: Literal["auto", "volume", "image_based", "precomputed"] = Field(
         default="auto",
         description="As the method does (auto, volume), or by a map of all light around the objects alone "
-        "(image_based, docs/method.md 6.6).",
+        "(image_based, docs/method.md 6.6), where rigid objects may have their own shadows and bounced light "
+        "precomputed (precomputed, docs/method.md 6.5).",
     )
     samples: int = Field(
-        default=40, ge=1, le=64, description="Of image_based: samples a pixel of what a surface mirrors."
+        default=40,
+        ge=1,
+        le=64,
+        description="Of image_based and precomputed: samples a pixel of what a surface mirrors.",
     )
     occlusion_radius_m: float | None = Field(
         default=None,
@@ -28,11 +32,32 @@ class Shading(StrictModel):
         description="Of image_based: objects keep light off themselves within this distance, metres, and less up to "
         "twice of it; 0 = not at all, null = the longest edge of the largest object.",
     )
+    coefficients: Literal[9, 16] = Field(
+        default=9,
+        description="Of precomputed: spherical harmonics of the light that objects keep off themselves.",
+    )
+    bounces: int = Field(
+        default=2,
+        ge=0,
+        le=8,
+        description="Of precomputed: times that light goes on from an object to itself.",
+    )
+    rays: int = Field(
+        default=1024,
+        ge=64,
+        le=16384,
+        description="Of precomputed: rays over the sphere around each vertex; more = less noise, longer, once.",
+    )
 
     @property
     def is_image_based(self) -> bool:
-        """Whether objects are lit by a map of the light around them alone."""
+        """Whether objects are lit by a map of the light around them alone, less what the picture shows of them."""
         return self.name == "image_based"
+
+    @property
+    def is_precomputed(self) -> bool:
+        """Whether objects are lit by such a map and their precomputed transfer."""
+        return self.name == "precomputed"
 
 
 class Output(StrictModel):

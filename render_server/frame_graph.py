@@ -27,13 +27,13 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.lighting import Layers
 from deltalight.render_server.methods.registry import MethodChoice
-from deltalight.render_server.occlusion_fields import OcclusionFields
 from deltalight.render_server.passes.composite import Composite, DebugViews, RelitLayers
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.precomputed import Precomputed
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.view import NOWHERE, CameraView, Rectangle
 
@@ -186,7 +186,7 @@ class FrameGraph:
         gpu: GpuContext,
         view: CameraView,
         method: MethodChoice,
-        fields: OcclusionFields,
+        precomputed: Precomputed,
         timers: PassTimers,
         *,
         checks: bool = False,
@@ -197,7 +197,11 @@ class FrameGraph:
         self.graph.own(self.buffers)
         self.resources: FrameResources = declare_frame(self.graph, self.buffers)
         try:
-            self.layers: Layers = method.declare(self.graph, self.resources, method.setup(view.size, fields))
+            setup = method.setup(view.size, precomputed.fields)
+            layers = method.declare(self.graph, self.resources, setup)
+            self.layers: Layers = method.shaded(
+                self.graph, self.resources, layers, view.size, precomputed.transfers
+            )
         except BaseException:
             self.release()
             raise

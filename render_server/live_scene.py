@@ -21,8 +21,8 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.methods.registry import MethodChoice, choose_method
-from deltalight.render_server.occlusion_fields import OcclusionFields
 from deltalight.render_server.passes.composite import Composite, Crossfade, Enlarge, Picture
+from deltalight.render_server.precomputed import Precomputed
 from deltalight.render_server.real_geometry import RealGeometry
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
@@ -134,7 +134,7 @@ class LiveScene:
             object, ...
         ] = ()  # what the newest picture was made from, camera and room left out,
         self._changed_ns = 0  # and when that or anything else last changed
-        self._fields = OcclusionFields(self._notify, waits=waits)
+        self._precomputed = Precomputed(self._notify, waits=waits)
         self._waits = waits
         self._unobserved = False  # the real scene moved while its lights were provisional
         self._accumulated: ViewFrame | None = None  # last frame already accumulated
@@ -152,7 +152,7 @@ class LiveScene:
             self._notify(method.remark)
         method.require(scene.objects)
         self._objects.load(scene.objects)
-        for sentence in (*unsupported_requests(scene), *self._objects.left_out(scene.objects)):
+        for sentence in self._objects.left_out(scene.objects):
             self._notify(sentence)
         known = before if method.keeps_world else None
         return _Plan(scene, method, LightEstimator(scene.lights, self._notify, known, waits=self._waits))
@@ -171,7 +171,7 @@ class LiveScene:
         except BaseException:
             self._budget = before
             raise
-        self._fields.waits = False
+        self._precomputed.stop_waiting()
 
     def _new_budget(self, scene: SceneDocument) -> FrameBudget:
         budget_ms = scene.output.frame_budget_ms if self._is_paced else None
@@ -390,7 +390,7 @@ class LiveScene:
         if graph is not None and graph.fits(view):
             return graph
         release_all(graph)
-        return FrameGraph(self._gpu, view, method, self._fields, self.timers, checks=self._checks)
+        return FrameGraph(self._gpu, view, method, self._precomputed, self.timers, checks=self._checks)
 
     def describe_lights(self) -> list[dict[str, Any]]:
         """Returns the lights as plain values, registration included."""
@@ -407,7 +407,7 @@ class LiveScene:
             self._enlarge,
             self._crossfade,
             self._albedo,
-            self._fields,
+            self._precomputed,
         )
 
 
@@ -418,13 +418,3 @@ def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
 
 def _same_objects(some: Sequence[object], others: Sequence[object]) -> bool:
     return len(some) == len(others) and all(one is other for one, other in zip(some, others, strict=True))
-
-
-def unsupported_requests(scene: SceneDocument) -> list[str]:
-    """Returns sentences on requests of the document that this release does not render."""
-    requests = {
-        f"shading.name `{scene.shading.name}`": scene.shading.name == "precomputed",
-    }
-    return [
-        f"{name} arrives with a later release and is left out." for name, asked in requests.items() if asked
-    ]

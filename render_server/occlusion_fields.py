@@ -1,30 +1,19 @@
 """The occlusion fields of a scene's objects: found on disk by content, or computed before or beside rendering."""
 
 import hashlib
-import threading
-from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 from io import BytesIO
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
-import structlog
 from jaxtyping import Float32
-from rich.console import Console
-from rich.progress import Progress
 
-from deltalight.protocol.cached_files import (
-    cache_folder,
-    cache_limit_bytes,
-    mark_used,
-    prune,
-    read_cached,
-    write_cached,
-)
+from deltalight.protocol.cached_files import cache_limit_bytes, prune, write_cached
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_method import AroofMethod
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.precomputation import Job, Precomputations, load_arrays
 from deltalight.render_server.scene.occlusion_field import (
     FieldSettings,
     ObjectRays,
@@ -40,11 +29,22 @@ from deltalight.render_server.scene.occlusion_transfer import (
     object_surface,
     surface_pieces,
 )
-from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 FIELD_VERSION = 1  # rises when the same input gives another field
 CACHE = "occlusion-fields"
 OCCLUSION_FRACTION = 0.8  # of the computing time
+
+
+def field_settings(settings: AroofMethod) -> FieldSettings:
+    """Returns the settings of the method that a field depends on."""
+    return FieldSettings(
+        settings.sh_order,
+        settings.shells,
+        settings.resolution,
+        settings.reach,
+        settings.rays,
+        settings.indirect,
+    )
 
 
 def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings) -> str:
@@ -99,17 +99,8 @@ def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
 
 def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionField | None:
     """Reads a field; None if there is none, or if the file is damaged and must be replaced."""
-    path = folder / f"{digest}.npz"
-    content = read_cached(path)
-    if content is None:
-        return None
-    mark_used(path)
-    try:
-        with np.load(BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, BadZipFile, EOFError, NotImplementedError):
-        return None
-    if not _is_whole(arrays, settings):
+    arrays = load_arrays(folder / f"{digest}.npz")
+    if arrays is None or not _is_whole(arrays, settings):
         return None
     grid = ShellGrid(arrays["centre"], arrays["halves"])
     radius = float(arrays["radius"])
@@ -128,105 +119,22 @@ def _is_whole(arrays: dict[str, np.ndarray], settings: FieldSettings) -> bool:
     return all(array.dtype.kind == "f" and np.isfinite(array).all() for array in arrays.values())
 
 
-log = structlog.get_logger()
+class OcclusionFields(Precomputations[FieldSettings, OcclusionField]):
+    """The fields of a renderer's objects."""
 
+    cache, kind, meanwhile = CACHE, "occlusion field", "it keeps off no natural light"
 
-class _EndedError(Exception):
-    """The renderer was released; nobody waits for the field."""
+    def _surface_key(self, item: PlacedObject) -> bool:
+        return item.material is not None
 
-
-@dataclass(eq=False)
-class _Entry:
-    """One asset's field with one set of settings; holds `meshes`, whose identities are its key."""
-
-    meshes: tuple[TriangleMesh, ...]
-    name: str
-    field: OcclusionField | None = None
-    fault: str | None = None
-    thread: threading.Thread | None = None
-
-
-class OcclusionFields:
-    """Caches fields for the lifetime of a renderer; `notify` receives sentences for the user.
-
-    With `waits`, `find` blocks until a field is ready and shows a progress bar on a terminal. Without, a
-    thread computes it (embree and matrix products release the interpreter lock) and `find` returns None
-    meanwhile.
-    """
-
-    def __init__(
-        self, notify: Callable[[str], None], folder: Path | None = None, *, waits: bool = True
-    ) -> None:
-        self.waits = waits
-        self._notify = notify
-        self._folder = folder or cache_folder(CACHE)
-        self._entries: dict[tuple[object, ...], _Entry] = {}
-        self._one_at_a_time = threading.Lock()
-        self._ended = threading.Event()
-
-    def find(self, item: PlacedObject, settings: FieldSettings) -> OcclusionField | None:
-        """Returns the field of an object's asset; None while it is being computed.
-
-        Raises:
-            DeltalightError: the field cannot be computed.
-        """
-        plain = item.material is not None
-        key = (*(id(mesh) for mesh in item.meshes), plain, settings)
-        entry = self._entries.get(key)
-        if entry is None:
-            entry = self._entries[key] = _Entry(item.meshes, item.id)
-            self._begin(entry, settings, plain=plain)
-        if entry.thread is not None and self.waits:
-            entry.thread.join()
-        if entry.fault is not None:
-            self._notify(entry.fault)
-        return entry.field
-
-    def _begin(self, entry: _Entry, settings: FieldSettings, *, plain: bool) -> None:
-        surface = object_surface(entry.meshes, plain=plain)
+    def _job(self, item: PlacedObject, settings: FieldSettings) -> Job[OcclusionField]:
+        surface = object_surface(item.meshes, plain=item.material is not None)
         digest = field_digest(surface, settings)
-        entry.field = load_field(self._folder, digest, settings)
-        if entry.field is not None:
-            return
-
-        def make(step: ProgressCallback) -> None:
-            made = compute_field(surface, settings, step)
-            try:
-                store_field(self._folder, digest, made)
-            except DeltalightError as error:
-                entry.fault = f"object `{entry.name}`: its occlusion field is not kept: {error}"
-            entry.field = made
-
-        if self.waits:
-            with Progress(console=Console(stderr=True), transient=True) as progress:
-                task = progress.add_task(f"occlusion field of `{entry.name}`", total=1.0)
-                make(lambda fraction: progress.update(task, completed=fraction))
-            return
-        self._notify(
-            f"object `{entry.name}`: its occlusion field is being computed, once; until then it keeps off no natural "
-            "light."
+        return Job(
+            lambda: load_field(self._folder, digest, settings),
+            lambda step: compute_field(surface, settings, step),
+            lambda made: store_field(self._folder, digest, made),
         )
-        entry.thread = threading.Thread(target=self._beside, args=(entry, make), daemon=True)
-        entry.thread.start()
-
-    def _beside(self, entry: _Entry, make: Callable[[ProgressCallback], None]) -> None:
-        def step(_fraction: float) -> None:
-            if self._ended.is_set():
-                raise _EndedError
-
-        try:
-            with self._one_at_a_time:
-                step(0.0)
-                make(step)
-        except _EndedError:
-            pass
-        except Exception as error:  # whatever it is, the picture goes on without this shadow
-            entry.fault = f"object `{entry.name}`: its occlusion field cannot be computed ({error})."
-            log.debug("occlusion field", exc_info=error)
-
-    def release(self) -> None:
-        """Lets threads end at their next step."""
-        self._ended.set()
 
 
 def require_rigid(item: SceneObject) -> None:

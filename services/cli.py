@@ -30,6 +30,7 @@ from deltalight.services.commands.graph import graph
 from deltalight.services.commands.keys import keys
 from deltalight.services.commands.node import node
 from deltalight.services.commands.ping import ping
+from deltalight.services.commands.precompute import precompute
 from deltalight.services.commands.record import record
 from deltalight.services.commands.recordings import recordings
 from deltalight.services.commands.render import render
@@ -73,6 +74,7 @@ app = typer.Typer(
 for command in (
     render,
     demo,
+    precompute,
     node,
     server,
     up,

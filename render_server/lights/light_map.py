@@ -42,9 +42,33 @@ def _disc(
     return np.asarray((share / across)[..., None] * arriving.irradiance, np.float32)
 
 
+def coefficients_around(
+    lights: LightSet, residual: Float64[np.ndarray, "k 3"], position: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "k 3"]:
+    """Returns the harmonics of all light that arrives at a position, as `light_map` has it, lights being points.
+
+    `residual`: those of the light that is the same everywhere (`distant_coefficients`).
+    """
+    if lights.whole is not None or not lights.lights:
+        return residual
+    arriving = [incident_light(light, position) for light in lights.lights]
+    basis = harmonics(np.stack([each.to_light for each in arriving]), round(len(residual) ** 0.5))
+    return np.asarray(residual + basis.T @ np.stack([each.irradiance for each in arriving]))
+
+
+def distant_coefficients(lights: LightSet, order: int) -> Float64[np.ndarray, "k 3"]:
+    """Returns the harmonics of the map that the lights were cut out of, or else of what is left without them."""
+    return light_coefficients(lights.environment if lights.whole is None else lights.whole, order)
+
+
 def irradiance_coefficients(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray, "9 3"]:
     """Returns the nine coefficients c of E(n) = sum c_k Y_k(n) (Ramamoorthi & Hanrahan 2001)."""
+    return np.asarray(COSINE_BANDS[:, None] * light_coefficients(radiance, ORDER))
+
+
+def light_coefficients(radiance: Float32[np.ndarray, "n n 3"], order: int) -> Float64[np.ndarray, "k 3"]:
+    """Projects a map onto the harmonics of `order` bands: the integrals of radiance times each."""
     size = len(radiance)
-    basis = harmonics(octahedral_grid(size).reshape(-1, 3), ORDER)
+    basis = harmonics(octahedral_grid(size).reshape(-1, 3), order)
     weighted = radiance.reshape(-1, 3) * texel_solid_angles(size).reshape(-1, 1)
-    return np.asarray(COSINE_BANDS[:, None] * (basis.T @ weighted))
+    return np.asarray(basis.T @ weighted)

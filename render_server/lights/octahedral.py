@@ -179,6 +179,16 @@ def harmonics(directions: Float[np.ndarray, "n 3"], order: int) -> Float64[np.nd
     return np.stack(functions[: order**2], axis=1)
 
 
+def turned_harmonics(rotation: Float64[np.ndarray, "3 3"], order: int) -> Float64[np.ndarray, "k k"]:
+    """Returns the matrix that turns coefficients of harmonics: f'(R d) = f(d) for the rotation R.
+
+    Bands turn among themselves, so that their values in more directions than there are functions determine it.
+    """
+    directions = even_directions(4 * order**2)
+    turned, own = harmonics(directions @ rotation.T, order), harmonics(directions, order)
+    return np.asarray(np.linalg.lstsq(turned, own)[0])
+
+
 def even_directions(count: int) -> Float64[np.ndarray, "count 3"]:
     """Returns unit directions of equal solid angle over the sphere (a spiral by the golden angle)."""
     k = np.arange(count)

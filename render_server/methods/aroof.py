@@ -18,7 +18,7 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import light_stages
 from deltalight.render_server.methods.lighting import Layers, Shading, ShadingOptions, shading_stages
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
-from deltalight.render_server.occlusion_fields import OcclusionFields, require_rigid
+from deltalight.render_server.occlusion_fields import OcclusionFields, field_settings, require_rigid
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.occlusion_fields import (
     FieldTextures,
@@ -272,18 +272,6 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
         return g.stage("cones", own.write_fields, changed, reflecting, scene, grid, hidden)
 
     return shading_stages(g, s, shading, lit, volume, trace, voxels=shown)
-
-
-def field_settings(settings: AroofMethod) -> FieldSettings:
-    """Returns the settings of the method that a field depends on."""
-    return FieldSettings(
-        settings.sh_order,
-        settings.shells,
-        settings.resolution,
-        settings.reach,
-        settings.rays,
-        settings.indirect,
-    )
 
 
 def resolve(settings: AroofMethod, defaults: ResolvedSettings) -> ResolvedSettings:

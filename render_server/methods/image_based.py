@@ -29,11 +29,6 @@ class ImageBasedShading:
         self._occlusion = AmbientOcclusion(gpu, size)
         self._surface = ImageBasedSurface(gpu, size, settings.samples)
 
-    def map_light(self, lights: LightSet, extent: ObjectExtent) -> Float32[np.ndarray, "n n 3"]:
-        """Puts the lights as the objects' middle sees them back into the environment."""
-        low, high = extent.bounds
-        return light_map(lights, (low + high) / 2)
-
     def set_light(self, radiance: Float32[np.ndarray, "n n 3"]) -> SurroundingLight:
         """Averages the map over cones, and finds its irradiance."""
         self._light.set_map(radiance)
@@ -54,7 +49,7 @@ class ImageBasedShading:
         self, scene: Bindings, surface: ObjectSurface, light: SurroundingLight, occlusion: AmbientOcclusion
     ) -> moderngl.Texture:
         """Shades the objects by the map alone."""
-        self._surface.run(light, occlusion, surface.rectangle, scene)
+        self._surface.run(light, occlusion.bindings, surface.rectangle, scene)
         return self._surface.radiance
 
     def release(self) -> None:
@@ -68,11 +63,17 @@ def image_based_radiance(
     """Declares the stages; returns the objects' radiance, to take the place of a method's own."""
     g.section("image-based shading")
     own = ImageBasedShading(g.gpu, size, settings)
-    radiance = g.value("map of light", own.map_light, s.lights, object_extent(g, s), same=np.array_equal)
+    radiance = g.value("map of light", map_light, s.lights, object_extent(g, s), same=np.array_equal)
     light = g.stage("filtered light", own.set_light, radiance)
     reach_m = g.value("occlusion radius", own.reach_m, s.objects, same=eq)
     occlusion = g.stage("ambient occlusion", own.occlude, s.geometry, s.object_surface, reach_m)
     return g.stage("image-based surface", own.shade, s.geometry, s.object_surface, light, occlusion)
+
+
+def map_light(lights: LightSet, extent: ObjectExtent) -> Float32[np.ndarray, "n n 3"]:
+    """Puts the lights as the objects' middle sees them back into the environment."""
+    low, high = extent.bounds
+    return light_map(lights, (low + high) / 2)
 
 
 def _longest_edge(item: PlacedObject) -> float:

@@ -25,7 +25,9 @@ from deltalight.render_server.methods.method import (
     ResolvedSettings,
     Setup,
 )
+from deltalight.render_server.methods.precomputed_transfer import precomputed_radiance
 from deltalight.render_server.occlusion_fields import OcclusionFields
+from deltalight.render_server.precomputed_transfers import ObjectTransfers, require_rigid_transfer
 
 BUILT_IN: tuple[RelightingMethod[Any], ...] = (DVCT, DLPV, AROOF, DIFFERENTIAL)
 _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
@@ -64,15 +66,16 @@ class MethodChoice:
         return self.settings.resolved_composition
 
     def require(self, objects: Sequence[SceneObject]) -> None:
-        """Refuses visible objects that the method cannot render.
+        """Refuses visible objects that the method or the shading cannot render.
 
         Raises:
-            DeltalightError: an object's shape may change, but the method precomputes it.
+            DeltalightError: an object's shape may change, but the method or the shading precomputes it.
         """
-        if self.method.require is not None:
+        shading = require_rigid_transfer if self.shading.is_precomputed else None
+        for require in (self.method.require, shading):
             for item in objects:
-                if item.visible:
-                    self.method.require(item)
+                if item.visible and require is not None:
+                    require(item)
 
     def setup(self, picture_size: tuple[int, int], fields: OcclusionFields) -> Setup[Any]:
         """Returns what the method's stages are declared with, for pictures of this size."""
@@ -85,11 +88,24 @@ class MethodChoice:
             DeltalightError: a plugin cannot.
         """
         with _blamed(self.plugin), graph.of_plugin(self.plugin):
-            layers = self.method.declare(graph, resources, setup)
+            return self.method.declare(graph, resources, setup)
+
+    def shaded(
+        self,
+        graph: Graph,
+        resources: FrameResources,
+        layers: Layers,
+        size: tuple[int, int],
+        transfers: ObjectTransfers,
+    ) -> Layers:
+        """Declares the stages of a shading that takes the place of the method's own."""
         if self.shading.is_image_based:
-            radiance = image_based_radiance(graph, resources, self.shading, setup.picture_size)
-            layers = replace(layers, radiance=radiance)
-        return layers
+            radiance = image_based_radiance(graph, resources, self.shading, size)
+        elif self.shading.is_precomputed:
+            radiance = precomputed_radiance(graph, resources, self.shading, size, transfers)
+        else:
+            return layers
+        return replace(layers, radiance=radiance)
 
 
 def choose_method(

@@ -62,27 +62,34 @@ class AmbientOcclusion:
             own: Bindings = {"rectangle": rectangle, "occlusion_radius": radius_m}
             self._kernel.run(rectangle[2:], own, scene, occlusion_out=self.open)
 
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The binding of image_based_surface.comp.glsl."""
+        return {"ambient_occlusion": self.open}
+
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.open, self._kernel)
 
 
 class ImageBasedSurface:
-    """Radiance of the virtual surfaces (RGBA16F) under a map of all light, on the picture's grid."""
+    """Radiance of the virtual surfaces (RGBA16F) under a map of all light, on the picture's grid.
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int], samples: int) -> None:
+    `precomputed`: what the objects hide of it comes by their transfer, not by ambient occlusion.
+    """
+
+    def __init__(
+        self, gpu: GpuContext, size: tuple[int, int], samples: int, *, precomputed: bool = False
+    ) -> None:
         self._samples = samples
         self.radiance = texture_2d(gpu, size, 4, "f2")
-        self._kernel = Kernel(gpu, "image_based_surface")
+        self._kernel = Kernel(gpu, "image_based_surface", **({"PRECOMPUTED": 1} if precomputed else {}))
 
-    def run(
-        self, light: SurroundingLight, occlusion: AmbientOcclusion, rectangle: Rectangle, scene: Bindings
-    ) -> None:
-        """Shades the objects in the rectangle."""
+    def run(self, light: SurroundingLight, hidden: Bindings, rectangle: Rectangle, scene: Bindings) -> None:
+        """Shades the objects in the rectangle; `hidden` binds what they hide of the light."""
         if min(rectangle[2:]) > 0:
             own: Bindings = {"rectangle": rectangle, "sample_count": self._samples}
-            light_here: Bindings = {**light.bindings, "ambient_occlusion": occlusion.open}
-            self._kernel.run(rectangle[2:], own, light_here, scene, radiance_out=self.radiance)
+            self._kernel.run(rectangle[2:], own, light.bindings, hidden, scene, radiance_out=self.radiance)
 
     def release(self) -> None:
         """Frees the GL objects."""

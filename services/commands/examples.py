@@ -6,6 +6,7 @@ EXAMPLES = {
         "deltalight render take.mcap -o pictures --scene scene.json --method dlpv --frames 0:30",
     ),
     "demo": ("deltalight demo", "deltalight demo --headless --frames 30 -o pictures"),
+    "precompute": ("deltalight precompute scene.json",),
     "node": ("deltalight node --source synthetic", "deltalight node --source take.mcap"),
     "server": ("deltalight server --scene scene.json",),
     "up": (

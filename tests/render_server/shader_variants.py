@@ -10,7 +10,7 @@ from typing import Any
 
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
 from deltalight.render_server.passes.caustics import TILE
 from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.cones import reuse_define
@@ -145,10 +145,19 @@ def image_based(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
             Kernel(gpu, name, **defines).release()
 
 
+def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
+    """Compiles shading by precomputed transfer, without and with materials that have maps."""
+    for defines in ({}, {"MATERIAL_MAPS": 1}):
+        Kernel(gpu, "image_based_surface", PRECOMPUTED=1, **defines).release()
+    Kernel(gpu, "transfer_light").release()
+    RasterKernel(gpu, "transfer_raster").release()
+
+
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
     "by device": by_device,
     "image-based shading": image_based,
+    "precomputed transfer": precomputed_transfer,
 }

@@ -21,6 +21,7 @@ from tests.services.conftest import ROOT, RunCli
 COMMANDS = {
     "render",
     "demo",
+    "precompute",
     "node",
     "server",
     "up",

@@ -1,5 +1,6 @@
 // Radiance of the virtual surfaces under a map of all light around them ([D] 4.2, docs/method.md 6.6): irradiance by nine
-// harmonics, what surfaces mirror by filtered importance sampling, both less what the objects hide of it themselves.
+// harmonics, what surfaces mirror by filtered importance sampling, both less what the objects hide of it themselves. With
+// PRECOMPUTED that and the light from surface to surface come by the vertices' transfer (docs/method.md 6.5).
 #include "common/geometry.glsl"
 #include "common/brdf.glsl"
 #include "common/environment.glsl"
@@ -14,7 +15,14 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform sampler2D virtual_raster_tint;
+#ifdef PRECOMPUTED
+uniform sampler2D transferred_light;      // at the object's raster: irradiance, open fraction of what is mirrored
+uniform sampler2D transferred_position;   // world m; w: 0 nothing
+uniform vec4 transfer_pinhole;            // fx, fy, cx, cy of that raster
+uniform bool transfer_bends;              // it is sampled through the lens model
+#else
 uniform sampler2D ambient_occlusion;   // open fraction of the hemisphere; the pixels of a block share its slices
+#endif
 uniform vec3 irradiance_coefficients[9];
 uniform int sample_count;
 uniform ivec4 rectangle;               // that may show an object: first pixel, size
@@ -27,6 +35,28 @@ vec3 irradiance(vec3 n) {
     return max(sum, vec3(0.0));
 }
 
+#ifdef PRECOMPUTED
+const float SAME_SURFACE = 2.0;   // pixels off the plane
+
+// Light of the texel that shows this place, else the mean of its neighbours that do; a surface without transfer has all light.
+vec4 arriving_light(ivec2 pixel, vec4 position, vec3 normal) {
+    vec2 ray = texelFetch(picture_rays, pixel, 0).xy;
+    ivec2 texel = transfer_bends ? ivec2(floor(transfer_pinhole.xy * ray + transfer_pinhole.zw + 0.5)) : pixel;
+    float off = SAME_SURFACE * position.w / camera_pinhole.x;
+    vec4 sum = vec4(0.0);
+    float found = 0.0;
+    for (int i = 0; i < 9; ++i) {
+        ivec2 beside = texel + ivec2((i + 4) % 9 % 3, (i + 4) % 9 / 3) - 1;   // the middle first
+        beside = clamp(beside, ivec2(0), textureSize(transferred_position, 0) - 1);
+        vec4 p = texelFetch(transferred_position, beside, 0);
+        if (p.w == 0.0 || abs(dot(p.xyz - position.xyz, normal)) > off || distance(p.xyz, position.xyz) > 4.0 * off) continue;
+        sum += texelFetch(transferred_light, beside, 0);
+        found += 1.0;
+        if (i == 0) break;
+    }
+    return found > 0.0 ? sum / found : vec4(irradiance(normal), 1.0);
+}
+#else
 // Mean over a block of pixels that show the same surface.
 float open_fraction(ivec2 pixel, vec4 position, vec3 normal) {
     float sum = 0.0, total = 0.0, pixels = 2.0 * position.w / camera_pinhole.x;
@@ -43,16 +73,22 @@ float open_fraction(ivec2 pixel, vec4 position, vec3 normal) {
     return sum / total;
 }
 
+vec4 arriving_light(ivec2 pixel, vec4 position, vec3 normal) {
+    float open = open_fraction(pixel, position, normal);
+    return vec4(open * irradiance(normal), open);
+}
+#endif
+
 vec3 shaded(ivec2 pixel, ivec2 raster, vec4 position) {
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
     vec3 n = normalize(normal.xyz), v = normalize(camera_position - position.xyz);
     Material m = material_at(raster, int(normal.w), texelFetch(virtual_raster_tint, raster, 0));
-    float open = open_fraction(pixel, position, n);
+    vec4 light = arriving_light(pixel, position, n);
     vec3 across = change_along(pixel, ivec2(1, 0), position, normal).normal;
     vec3 down = change_along(pixel, ivec2(0, 1), position, normal).normal;
     float footprint = max(length(across), length(down));   // half of the turn of what is mirrored
     int count = has_interface(m.f0) ? sample_count : 0;
-    Indirect arriving = Indirect(open * irradiance(n), open * lobe_radiance(n, v, m.f0, m.roughness, footprint, count));
+    Indirect arriving = Indirect(light.rgb, light.a * lobe_radiance(n, v, m.f0, m.roughness, footprint, count));
     return with_gathered(m.emission, m, max(dot(n, v), 1e-3), arriving);
 }
 

@@ -3557,8 +3557,21 @@ export interface components {
          */
         readonly Shading: {
             /**
+             * Bounces
+             * @description Of precomputed: times that light goes on from an object to itself.
+             * @default 2
+             */
+            readonly bounces: number;
+            /**
+             * Coefficients
+             * @description Of precomputed: spherical harmonics of the light that objects keep off themselves.
+             * @default 9
+             * @enum {integer}
+             */
+            readonly coefficients: 9 | 16;
+            /**
              * Name
-             * @description As the method does (auto, volume), or by a map of all light around the objects alone (image_based, docs/method.md 6.6).
+             * @description As the method does (auto, volume), or by a map of all light around the objects alone (image_based, docs/method.md 6.6), where rigid objects may have their own shadows and bounced light precomputed (precomputed, docs/method.md 6.5).
              * @default auto
              * @enum {string}
              */
@@ -3569,8 +3582,14 @@ export interface components {
              */
             readonly occlusion_radius_m?: number | null;
             /**
+             * Rays
+             * @description Of precomputed: rays over the sphere around each vertex; more = less noise, longer, once.
+             * @default 1024
+             */
+            readonly rays: number;
+            /**
              * Samples
-             * @description Of image_based: samples a pixel of what a surface mirrors.
+             * @description Of image_based and precomputed: samples a pixel of what a surface mirrors.
              * @default 40
              */
             readonly samples: number;

@@ -1,0 +1,160 @@
+"""What is precomputed of objects: found on disk by content, or computed before or beside rendering."""
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import ClassVar, Generic, TypeVar
+from zipfile import BadZipFile
+
+import numpy as np
+import structlog
+from rich.console import Console
+from rich.progress import Progress
+
+from deltalight.protocol.cached_files import cache_folder, mark_used, read_cached
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.scene.occlusion_field import ProgressCallback
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+
+Settings = TypeVar("Settings", bound=Hashable)
+Data = TypeVar("Data")
+log = structlog.get_logger()
+
+
+class _EndedError(Exception):
+    """Nobody waits for the data any more."""
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
+    """Returns the arrays of a cached .npz file; None if there is none, or it is damaged and must be replaced."""
+    content = read_cached(path)
+    if content is None:
+        return None
+    mark_used(path)
+    try:
+        with np.load(BytesIO(content), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, BadZipFile, EOFError, NotImplementedError):
+        return None
+
+
+@dataclass(frozen=True)
+class Job(Generic[Data]):
+    """How the data of one object come about: read from the cache (None: not there), or computed and stored."""
+
+    load: Callable[[], Data | None]
+    compute: Callable[[ProgressCallback], Data]
+    store: Callable[[Data], None]
+
+
+@dataclass(eq=False)
+class _Entry(Generic[Data]):
+    """One asset's data with one set of settings; holds `meshes`, whose identities are its key."""
+
+    meshes: tuple[TriangleMesh, ...]
+    name: str
+    data: Data | None = None
+    fault: str | None = None
+    thread: threading.Thread | None = None
+    ended: threading.Event = field(default_factory=threading.Event)
+
+
+class Precomputations(ABC, Generic[Settings, Data]):
+    """Caches data for the lifetime of a renderer; `notify` receives sentences for the user.
+
+    With `waits`, `find` blocks until they are ready and shows a progress bar on a terminal. Without, a thread
+    computes them (embree and matrix products release the interpreter lock) and `find` returns None meanwhile.
+    """
+
+    cache: ClassVar[str]
+    kind: ClassVar[str]
+    meanwhile: ClassVar[str]
+    """What the user is told of the time until they are ready."""
+
+    def __init__(
+        self, notify: Callable[[str], None], folder: Path | None = None, *, waits: bool = True
+    ) -> None:
+        self.waits = waits
+        self._notify = notify
+        self._folder = folder or cache_folder(self.cache)
+        self._entries: dict[tuple[tuple[Hashable, ...], Settings], _Entry[Data]] = {}
+        self._one_at_a_time = threading.Lock()
+
+    @abstractmethod
+    def _surface_key(self, item: PlacedObject) -> Hashable:
+        """Returns what the data depend on besides meshes and settings."""
+
+    @abstractmethod
+    def _job(self, item: PlacedObject, settings: Settings) -> Job[Data]:
+        """Returns how the data come about."""
+
+    def find(self, item: PlacedObject, settings: Settings) -> Data | None:
+        """Returns the data of an object's asset; None while they are being computed.
+
+        Raises:
+            DeltalightError: they cannot be computed.
+        """
+        key = (*(id(mesh) for mesh in item.meshes), self._surface_key(item))
+        entry = self._entries.get((key, settings))
+        if entry is None:
+            self._forget_earlier(item.id, settings)
+            entry = self._entries[key, settings] = _Entry(item.meshes, item.id)
+            self._begin(entry, self._job(item, settings))
+        if entry.thread is not None and self.waits:
+            entry.thread.join()
+        if entry.fault is not None:
+            self._notify(entry.fault)
+        return entry.data
+
+    def _forget_earlier(self, name: str, settings: Settings) -> None:
+        """Drops what the object was before; while a colour is being chosen, no queue of all its shades builds up."""
+        for key in [key for key in self._entries if key[1] == settings and self._entries[key].name == name]:
+            self._entries.pop(key).ended.set()
+
+    def _begin(self, entry: _Entry[Data], job: Job[Data]) -> None:
+        entry.data = job.load()
+        if entry.data is not None:
+            return
+
+        def make(step: ProgressCallback) -> None:
+            made = job.compute(step)
+            try:
+                job.store(made)
+            except DeltalightError as error:
+                entry.fault = f"object `{entry.name}`: its {self.kind} is not kept: {error}"
+            entry.data = made
+
+        if self.waits:
+            with Progress(console=Console(stderr=True), transient=True) as progress:
+                task = progress.add_task(f"{self.kind} of `{entry.name}`", total=1.0)
+                make(lambda fraction: progress.update(task, completed=fraction))
+            return
+        self._notify(
+            f"object `{entry.name}`: its {self.kind} is being computed, once; until then {self.meanwhile}."
+        )
+        entry.thread = threading.Thread(target=self._beside, args=(entry, make), daemon=True)
+        entry.thread.start()
+
+    def _beside(self, entry: _Entry[Data], make: Callable[[ProgressCallback], None]) -> None:
+        def step(_fraction: float) -> None:
+            if entry.ended.is_set():
+                raise _EndedError
+
+        try:
+            with self._one_at_a_time:
+                step(0.0)
+                make(step)
+        except _EndedError:
+            pass
+        except Exception as error:  # whatever it is, the picture goes on without
+            entry.fault = f"object `{entry.name}`: its {self.kind} cannot be computed ({error})."
+            log.debug(self.kind, exc_info=error)
+
+    def release(self) -> None:
+        """Lets threads end at their next step."""
+        for entry in self._entries.values():
+            entry.ended.set()

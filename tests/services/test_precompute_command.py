@@ -1,0 +1,63 @@
+"""`deltalight precompute`: computed once, kept, broken off without a trace."""
+
+import json
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from tests.services.conftest import RunCli
+
+
+def scene_with(folder: Path, **changes: object) -> Path:
+    trimesh.creation.box((0.2, 0.2, 0.2)).export(folder / "box.ply")
+    path = folder / "scene.json"
+    objects = [{"id": "box", "asset": "box.ply"}]
+    path.write_text(
+        json.dumps({"objects": objects, "shading": {"name": "precomputed", "rays": 64}, **changes})
+    )
+    return path
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache/precomputed-transfer"
+
+
+def test_computes_once_with_a_bar(
+    cli: RunCli, tmp_path: Path, kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    scene = scene_with(tmp_path)
+    done = cli("precompute", str(scene))
+    assert done.returncode == 0, done.stderr
+    assert "object `box`: light transfer of" in done.stdout
+    assert "light transfer of `box`" in done.stderr
+    (file,) = kept.glob("*.npz")
+    before = file.read_bytes()
+    again = cli("precompute", str(scene))
+    assert again.stdout == done.stdout
+    assert "light transfer of `box`" not in again.stderr
+    assert file.read_bytes() == before
+
+
+def test_fields_of_a_scene_with_aroof(cli: RunCli, tmp_path: Path, kept: Path) -> None:
+    method = {"name": "aroof", "shells": 2, "resolution": 12, "rays": 64}
+    done = cli("precompute", str(scene_with(tmp_path, method=method, shading={})))
+    assert done.stdout == "object `box`: occlusion field of 2 shells\n"
+    assert not kept.exists()
+    assert len(list(kept.with_name("occlusion-fields").glob("*.npz"))) == 1
+
+
+def test_what_cannot_be_precomputed_is_said_in_one_sentence(cli: RunCli, tmp_path: Path, kept: Path) -> None:
+    nothing = cli("precompute", str(scene_with(tmp_path, shading={})))
+    moving = cli("precompute", str(scene_with(tmp_path, objects=[{"asset": "box.ply", "rigid": False}])))
+    for done, sentence in (
+        (nothing, "asks for nothing precomputed"),
+        (moving, "holds for rigid objects only"),
+    ):
+        assert done.returncode == 2
+        assert sentence in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    assert not kept.exists()
