@@ -24,7 +24,7 @@ MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 300
 LONGEST_INPUT = 32_768
 DISTILLED_BYTES = 6_000  # of a target
 MOST_CRASHES = 20
-# A process that is started inherits the peak memory of its parent, which libFuzzer takes for its own: a shell between.
+# A new process inherits its parent's peak memory, which libFuzzer would take for its own: a shell between.
 OWN_PEAK = ("sh", "-c", '"$@"; exit "$?"', "sh")
 NO_ATHERIS = "fuzzing needs atheris, which there is for Linux on x86-64 and Python up to 3.13"
 
