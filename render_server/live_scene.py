@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import View
@@ -127,6 +128,7 @@ class LiveScene:
         self.graph: FrameGraph | None = None
         self._best: FrameGraph | None = None
         self._spare: FrameGraph | None = None  # of the picture size before, which a budget may choose again
+        self._refused: tuple[tuple[MethodChoice, tuple[int, int]], str] | None = None
         self._enlarge: Enlarge | None = None
         self._crossfade: Crossfade | None = None
         self._refined_ns: int | None = None  # the refined picture has shown since
@@ -333,7 +335,8 @@ class LiveScene:
     def _refined(self, inputs: FrameInputs) -> FrameGraph | None:
         """Works on the frame in the best quality for REFINE_S; returns its graph once it is ready."""
         best = self._plan.method.in_best_quality(software=self._gpu.is_software)
-        self._best = self._fitting(self._best, inputs.view, best)
+        before, self._best = self._best, None
+        self._best = self._fitting(before, inputs.view, best)
         self._best.upload(inputs.frame)
         self._best.set_inputs(inputs)
         options = self._options(self._plan.scene.output)
@@ -383,14 +386,27 @@ class LiveScene:
         """
         if self._gpu.is_software and self.graph is not None and not self.graph.fits(view):
             self.graph, self._spare = self._spare, self.graph
-        self.graph = self._fitting(self.graph, view, self._plan.method)
+        before, self.graph = self.graph, None
+        self.graph = self._fitting(before, view, self._plan.method)
         return self.graph
 
     def _fitting(self, graph: FrameGraph | None, view: CameraView, method: MethodChoice) -> FrameGraph:
+        """Returns this graph if it fits, else a new one in its place.
+
+        Raises:
+            DeltalightError: something is larger than this GPU allows; it is not tried again for every frame.
+        """
         if graph is not None and graph.fits(view):
             return graph
         release_all(graph)
-        return FrameGraph(self._gpu, view, method, self._precomputed, self.timers, checks=self._checks)
+        wanted = method, view.size
+        if self._refused is not None and self._refused[0] == wanted:
+            raise DeltalightError(self._refused[1])
+        try:
+            return FrameGraph(self._gpu, view, method, self._precomputed, self.timers, checks=self._checks)
+        except DeltalightError as refusal:
+            self._refused = wanted, str(refusal)
+            raise
 
     def describe_lights(self) -> list[dict[str, Any]]:
         """Returns the lights as plain values, registration included."""

@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage, ViewFrame
+from deltalight.protocol.messages import MAX_PART_BYTES
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
 
@@ -173,12 +175,22 @@ class PosedFrame:
 
 
 def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
-    """Returns width and height of the composite; a missing one follows from the camera's aspect ratio."""
+    """Returns width and height of the composite; a missing one follows from the camera's aspect ratio.
+
+    Raises:
+        DeltalightError: no message holds a picture of that size.
+    """
     camera = frame.camera
     if output.width is None and output.height is None:
         return camera.width, camera.height
-    width = output.width or round(camera.width * (output.height or 0) / camera.height)
-    return width, output.height or round(camera.height * width / camera.width)
+    width = output.width or max(round(camera.width * (output.height or 0) / camera.height), 1)
+    height = output.height or max(round(camera.height * width / camera.width), 1)
+    if 3 * width * height > MAX_PART_BYTES:
+        raise DeltalightError(
+            f"A picture of {width} x {height} pixels is asked for, and {MAX_PART_BYTES // 3e6:.0f} million are the "
+            "most: lower output.width and output.height."
+        )
+    return width, height
 
 
 def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:

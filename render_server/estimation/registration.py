@@ -1,6 +1,6 @@
 """The lights' common factor, found from the picture (docs/method.md 1.4)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Float32, Float64
 from deltalight.protocol.frames import LUMINANCE
 from deltalight.render_server.estimation.samples import bounced_light, sample_light
 from deltalight.render_server.frame_graph import FrameGraph
-from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.lights.lights import DirectionalLight, LightSet
+from deltalight.render_server.lights.octahedral import solid_angle_mean
 from deltalight.render_server.scene.albedo import MIN_PIXELS
 
 OUTLIER_DEVIATIONS = 3.0
@@ -20,6 +21,7 @@ PERCENTILE = 99.0
 # Relative misfit from which users are warned: people notice unexplained differences of a few per cent within one
 # surface.
 POOR_RESIDUAL = 0.1
+GREATEST_TRIAL = 1000.0  # irradiance: what is more is measured in a smaller unit
 MAX_AVERAGED = 30  # registrations: reduces noise to a fifth, and still keeps up with slow drift
 
 
@@ -169,12 +171,25 @@ def register_lights(graph: FrameGraph, lights: LightSet) -> Registration:
     `lights` are not registered yet. Light that other real surfaces reflect is measured, so it is in camera units
     already; the cones are therefore traced twice, with and without the environment.
     """
-    samples = sample_light(graph, lights, bounced_light(graph, lights))
+    scale = _trial_scale(lights)
+    trial = lights if scale == 1 else lights.registered(np.full(3, scale, np.float32))
+    samples = sample_light(graph, trial, bounced_light(graph, trial))
     known = samples.usable & (samples.albedo > 0)
     found = registration_from_patch(
         samples.measured[known], samples.light[known], samples.bounce[known], samples.albedo[known]
     )
-    if found is not None:
-        return found
-    lit = samples.usable & samples.unshadowed
-    return registration_from_albedo_percentile(samples.measured[lit], samples.light[lit], samples.bounce[lit])
+    if found is None:
+        lit = samples.usable & samples.unshadowed
+        found = registration_from_albedo_percentile(
+            samples.measured[lit], samples.light[lit], samples.bounce[lit]
+        )
+    return replace(found, factor=found.factor * np.float32(scale))
+
+
+def _trial_scale(lights: LightSet) -> float:
+    """Returns a power of two that brings light in units such as cd/m^2 to where half floats hold it."""
+    whole = 4 * np.pi * float(solid_angle_mean(lights.environment).max())
+    whole += sum(
+        float(light.irradiance.max()) for light in lights.lights if isinstance(light, DirectionalLight)
+    )
+    return 1.0 if whole <= GREATEST_TRIAL else float(2.0 ** -np.ceil(np.log2(whole)))

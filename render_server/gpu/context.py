@@ -117,6 +117,7 @@ class GpuContext:
             GpuMemoryError: something could not be stored.
         """
         check_reset(self.reset_status())
+        self._release_unreferenced()
         error = self.ctx.error
         if error == OUT_OF_MEMORY:
             raise GpuMemoryError(
@@ -125,6 +126,13 @@ class GpuContext:
             )
         if error != NO_ERROR:
             self.errors[error] += 1
+
+    def _release_unreferenced(self) -> None:
+        """Frees what nobody refers to any more, such as the passes of a graph that failed while it was declared."""
+        while self.ctx.objects:
+            release = getattr(self.ctx.objects.popleft(), "release", None)  # what was freed before has none
+            if release is not None:
+                release()
 
     @cached_property
     def defines(self) -> dict[str, str]:
@@ -267,6 +275,7 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
         ctx = moderngl.create_context(require=430, standalone=True, context=context)
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise DeltalightError(explain_context_failure(str(error))) from error
+    ctx.gc_mode = "context_gc"  # collects what is to be freed; `check` does that, on the context's thread
     name = str(ctx.info["GL_RENDERER"])
     software = is_software_renderer(name)
     if software and not allow_software:

@@ -12,8 +12,6 @@ from deltalight.render_server.lights.light_map import irradiance_coefficients
 from deltalight.render_server.passes.lights import LightingBlock, environment_texture
 from deltalight.render_server.view import Rectangle
 
-BRIGHTEST = float(np.finfo(np.float16).max)
-
 
 class SurroundingLight:
     """A map of all light around the objects: averaged over cones, and its irradiance in nine harmonics."""
@@ -27,7 +25,7 @@ class SurroundingLight:
     def set_map(self, radiance: Float32[np.ndarray, "n n 3"]) -> None:
         """Takes an octahedral map, world axes."""
         release_all(self._map)
-        self._map, half_angle = environment_texture(self._gpu, np.minimum(radiance, BRIGHTEST))
+        self._map, half_angle = environment_texture(self._gpu, radiance)
         self._block.write(LightingBlock(0, self._map.layers, half_angle))
         self._coefficients = irradiance_coefficients(radiance).astype(np.float32)
 

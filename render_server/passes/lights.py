@@ -29,6 +29,8 @@ from deltalight.render_server.passes.shadow_maps import (
 
 LIGHT_BYTES = 160  # of a std430 Light (shaders/common/lights.glsl)
 EMPTY = b"\0" * 256
+BRIGHTEST = float(np.finfo(np.float16).max)
+GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up has to fit, too
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
 MIRROR_MAP_MARGIN = 1.1  # of the extent that the map has to cover
 NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
@@ -245,13 +247,20 @@ class MirrorVisibility:
 def environment_texture(
     gpu: GpuContext, radiance: Float32[np.ndarray, "n n 3"]
 ) -> tuple[moderngl.TextureArray, float]:
-    """Returns a map averaged over cones (shaders/common/environment.glsl), and the half-angle of layer 0 (rad)."""
+    """Returns a map averaged over cones (shaders/common/environment.glsl), and the half-angle of layer 0 (rad).
+
+    Half floats have to hold it and the light it gives: a map of more irradiance than `GREATEST_IRRADIANCE` is
+    darkened as a whole, which no picture shows, because all that it lights is white by far.
+    """
     prefiltered = prefilter(radiance)
     size, count = len(radiance), len(prefiltered.levels)
     directions = octahedral_grid(size)
     layers = [radiance, *(sample_octahedral(level, directions) for level in prefiltered.levels[1:])]
+    irradiance = np.pi * float(prefiltered.levels[-1].max())
+    if irradiance > GREATEST_IRRADIANCE:
+        layers = [layer * (GREATEST_IRRADIANCE / irradiance) for layer in layers]
     rgba = np.ones((count, size, size, 4), np.float16)
-    rgba[..., :3] = np.stack(layers)
+    rgba[..., :3] = np.minimum(np.stack(layers), BRIGHTEST)
     texture = gpu.ctx.texture_array((size, size, count), 4, rgba.tobytes(), dtype="f2")
     texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
     texture.repeat_x = texture.repeat_y = False

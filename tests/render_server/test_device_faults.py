@@ -9,15 +9,18 @@ import glcontext
 import numpy as np
 import pytest
 
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_output import Output
 from deltalight.render_server import renderer as renderer_module
 from deltalight.render_server.gpu import lost_context
-from deltalight.render_server.gpu.context import GpuContext, GpuMemoryError
+from deltalight.render_server.gpu.context import GpuContext, GpuMemoryError, count_gl_objects
 from deltalight.render_server.gpu.lost_context import GpuResetError, ReportingContext, reporting
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.scenes import Stage, cube, directional, floor, frame
+from tests.render_server.scenes import HEIGHT, WIDTH, Stage, cube, directional, floor, frame
 
 RESET_NOTIFICATION_STRATEGY, LOSE_CONTEXT_ON_RESET = 0x8256, 0x8252  # GL_KHR_robustness
 INVALID_CAPABILITY = 0xFFFF
+LARGE_PICTURE = 2_000_000  # bytes of a buffer for 640x480 pixels, and not of one for 160x120
 ENORMOUS = 1 << 46  # bytes: more than any device has
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -84,6 +87,46 @@ def test_full_memory_refuses_frames_until_a_scene_was_built_anew(
     gpu.ctx.buffer(reserve=ENORMOUS).release()
     assert np.array_equal(renderer.render(frame()).color, before)  # built anew
     assert not gpu.errors
+    renderer.release()
+
+
+def test_a_size_beyond_the_gpu_is_refused_and_nothing_of_it_stays(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The refusal comes in the middle, when textures of that size are there already. It is not tried every frame."""
+    refused: list[int] = []
+
+    def check(_: GpuContext, size: int, lower: str) -> None:
+        if "output.width" in lower and size > LARGE_PICTURE:
+            refused.append(size)
+            raise DeltalightError("too large")
+
+    monkeypatch.setattr(GpuContext, "check_storage", check)
+    document = stage.document([stage.virtual(cube())], [directional()], floor())
+    large, small = (document.replaced(output=Output(height=height)) for height in (4 * HEIGHT, HEIGHT // 2))
+    renderer = SceneRenderer(gpu, document)
+    before = renderer.render(frame()).color
+    renderer.set_scene(small)
+    assert renderer.render(frame()).color.shape == (HEIGHT // 2, WIDTH // 2, 3)
+    held = count_gl_objects()["Texture"]
+    renderer.set_scene(large)
+    for _ in range(3):
+        with pytest.raises(DeltalightError, match="too large"):
+            renderer.render(frame())
+    assert len(refused) == 1
+    renderer.set_scene(document)
+    assert np.array_equal(renderer.render(frame()).color, before)
+    assert count_gl_objects()["Texture"] <= held
+    renderer.release()
+
+
+def test_a_size_that_no_message_holds_is_refused(gpu: GpuContext, stage: Stage) -> None:
+    document = stage.document([stage.virtual(cube())], [directional()], floor())
+    renderer = SceneRenderer(gpu, document.replaced(output=Output(height=6699)))
+    with pytest.raises(
+        DeltalightError, match=r"8932 x 6699 pixels is asked for, and 22 million .* lower output"
+    ):
+        renderer.render(frame())
     renderer.release()
 
 

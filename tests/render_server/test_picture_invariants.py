@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from deltalight.protocol.scene import parse_scene
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_objects import Pose
 from deltalight.render_server.gpu.context import GpuContext
@@ -65,6 +66,36 @@ def test_without_pose_the_cameras_bytes_and_the_status_say_so(gpu: GpuContext, s
     renderer.release()
     assert result.status == "no_pose"
     assert np.array_equal(result.color, noisy())
+
+
+@pytest.mark.parametrize("radiance", [1e5, 1e9])
+def test_light_beyond_half_floats_shows_as_the_brightest_that_they_hold(
+    gpu: GpuContext, stage: Stage, radiance: float
+) -> None:
+    document = everyday(stage)
+    pictures = []
+    for strength in (1e3, radiance):
+        lights = parse_scene({"lights": {"manual": [ambient(strength)]}}).lights
+        renderer = SceneRenderer(gpu, document.replaced(lights=lights))
+        result = renderer.render(frame(noisy()))
+        renderer.release()
+        pictures.append(result.color.astype(int))
+        assert np.isfinite(result.lights[-1]["mean_radiance"]).all()
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2
+
+
+def test_lights_may_be_measured_in_a_small_unit_where_their_registration_is_found(
+    gpu: GpuContext, stage: Stage
+) -> None:
+    """Of about camera units, and what a meter might write in lux and cd/m^2 outdoors."""
+    document = everyday(stage)
+    pictures = []
+    for unit in (0.25, 0.25 * 2**18):
+        lights = {"registration": "auto", "manual": [directional(irradiance=2 * unit), ambient(0.3 * unit)]}
+        lit = document.replaced(lights=parse_scene({"lights": lights}).lights)
+        pictures.append(composite(gpu, lit, frame(noisy())).astype(int))
+    assert (pictures[0] != noisy()).any(axis=-1).sum() > 300
+    assert np.abs(pictures[0] - pictures[1]).max() <= 1
 
 
 def test_object_behind_the_camera_without_light_changes_nothing(gpu: GpuContext, stage: Stage) -> None:
