@@ -140,7 +140,7 @@ class LightEstimator:
 
     def _register(self, graph: FrameGraph, raw: LightSet) -> None:
         """Registers the lights on this frame and averages the result with earlier ones."""
-        found = register_lights(graph, raw)
+        found = register_lights(graph, raw, self._factor)
         if self._factor is None:
             factor = ", ".join(f"{value:.3g}" for value in found.factor)
             fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"

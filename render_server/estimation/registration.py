@@ -22,6 +22,8 @@ PERCENTILE = 99.0
 # surface.
 POOR_RESIDUAL = 0.1
 GREATEST_TRIAL = 1000.0  # irradiance: what is more is measured in a smaller unit
+MAX_TRIALS = 4
+TRIALS_AGREE = 0.01  # relative change of the factor
 MAX_AVERAGED = 30  # registrations: reduces noise to a fifth, and still keeps up with slow drift
 
 
@@ -165,14 +167,32 @@ class RegistrationAverage:
         return self._mean.astype(np.float32)
 
 
-def register_lights(graph: FrameGraph, lights: LightSet) -> Registration:
+def register_lights(
+    graph: FrameGraph, lights: LightSet, estimate: Float32[np.ndarray, "3"] | None = None
+) -> Registration:
     """Estimates a factor R G B on all lights: from white paper and grey cards, else from the brightest albedo.
 
-    `lights` are not registered yet. Light that other real surfaces reflect is measured, so it is in camera units
-    already; the cones are therefore traced twice, with and without the environment.
+    `lights` are not registered yet. Light that visible real surfaces reflect is measured, so it is in camera units
+    already; what the others reflect is in those of the lights. So a factor is tried before another is found, until
+    they agree; an `estimate` from earlier frames is tried once.
     """
-    scale = _trial_scale(lights)
-    trial = lights if scale == 1 else lights.registered(np.full(3, scale, np.float32))
+    if estimate is not None:
+        return _registered_again(graph, lights, estimate)
+    found = _registered_again(graph, lights, np.full(3, _trial_scale(lights), np.float32))
+    for _ in range(MAX_TRIALS - 1):
+        tried = found.factor
+        found = _registered_again(graph, lights, tried)
+        if np.allclose(found.factor, tried, rtol=TRIALS_AGREE, atol=0):
+            break
+    return found
+
+
+def _registered_again(graph: FrameGraph, lights: LightSet, tried: Float32[np.ndarray, "3"]) -> Registration:
+    """Returns the registration that the picture shows while this factor is tried.
+
+    The cones are traced twice, with and without the environment.
+    """
+    trial = lights.registered(tried)
     samples = sample_light(graph, trial, bounced_light(graph, trial))
     known = samples.usable & (samples.albedo > 0)
     found = registration_from_patch(
@@ -183,7 +203,7 @@ def register_lights(graph: FrameGraph, lights: LightSet) -> Registration:
         found = registration_from_albedo_percentile(
             samples.measured[lit], samples.light[lit], samples.bounce[lit]
         )
-    return replace(found, factor=found.factor * np.float32(scale))
+    return replace(found, factor=found.factor * tried)
 
 
 def _trial_scale(lights: LightSet) -> float:

@@ -84,18 +84,19 @@ def test_light_beyond_half_floats_shows_as_the_brightest_that_they_hold(
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
 
 
-def test_lights_may_be_measured_in_a_small_unit_where_their_registration_is_found(
+def test_the_unit_of_lights_does_not_matter_where_their_registration_is_found(
     gpu: GpuContext, stage: Stage
 ) -> None:
-    """Of about camera units, and what a meter might write in lux and cd/m^2 outdoors."""
+    """A quarter and four times of camera units, and what a meter might write in lux and cd/m^2 outdoors."""
     document = everyday(stage)
     pictures = []
-    for unit in (0.25, 0.25 * 2**18):
+    for unit in (0.25, 4.0, 40_000.0):
         lights = {"registration": "auto", "manual": [directional(irradiance=2 * unit), ambient(0.3 * unit)]}
         lit = document.replaced(lights=parse_scene({"lights": lights}).lights)
         pictures.append(composite(gpu, lit, frame(noisy())).astype(int))
     assert (pictures[0] != noisy()).any(axis=-1).sum() > 300
-    assert np.abs(pictures[0] - pictures[1]).max() <= 1
+    for other in pictures[1:]:
+        assert np.abs(pictures[0] - other).max() <= 2
 
 
 def test_object_behind_the_camera_without_light_changes_nothing(gpu: GpuContext, stage: Stage) -> None:
