@@ -21,7 +21,7 @@ PERCENTILE = 99.0
 # Relative misfit from which users are warned: people notice unexplained differences of a few per cent within one
 # surface.
 POOR_RESIDUAL = 0.1
-GREATEST_TRIAL = 1000.0  # irradiance: what is more is measured in a smaller unit
+GREATEST_TRIAL = 1000.0  # irradiance, in the unit of the lights: those of more are tried darker first
 MAX_TRIALS = 4
 TRIALS_AGREE = 0.01  # relative change of the factor
 MAX_AVERAGED = 30  # registrations: reduces noise to a fifth, and still keeps up with slow drift
@@ -177,17 +177,17 @@ def register_lights(
     they agree; an `estimate` from earlier frames is tried once.
     """
     if estimate is not None:
-        return _registered_again(graph, lights, estimate)
-    found = _registered_again(graph, lights, np.full(3, _trial_scale(lights), np.float32))
+        return _registered_with(graph, lights, estimate)
+    found = _registered_with(graph, lights, np.full(3, _trial_scale(lights), np.float32))
     for _ in range(MAX_TRIALS - 1):
         tried = found.factor
-        found = _registered_again(graph, lights, tried)
+        found = _registered_with(graph, lights, tried)
         if np.allclose(found.factor, tried, rtol=TRIALS_AGREE, atol=0):
             break
     return found
 
 
-def _registered_again(graph: FrameGraph, lights: LightSet, tried: Float32[np.ndarray, "3"]) -> Registration:
+def _registered_with(graph: FrameGraph, lights: LightSet, tried: Float32[np.ndarray, "3"]) -> Registration:
     """Returns the registration that the picture shows while this factor is tried.
 
     The cones are traced twice, with and without the environment.
