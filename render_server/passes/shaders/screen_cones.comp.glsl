@@ -18,7 +18,7 @@ const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its 
 // Radiance times fraction of one cone, across the picture.
 vec4 look_across(vec3 from, vec3 d, float spread) {
     ScreenHit hit = screen_hit(from, d, spread);
-    if (hit.fraction <= 0.0 || closest_hit(Ray(from, d)).distance < hit.distance) return vec4(0.0);
+    if (hit.fraction <= 0.0 || is_blocked(Ray(from, d), hit.distance)) return vec4(0.0);
     return shown_at(hit, spread);
 }
 

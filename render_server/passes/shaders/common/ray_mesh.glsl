@@ -57,12 +57,13 @@ void meet_triangle(int at, Ray ray, inout MeshHit hit) {
     hit = MeshHit(t, at, vec2(u, v));
 }
 
-MeshHit closest_hit(Ray ray) {
+// The hit nearest to the origin, or with `any` the first that is found, before `limit`.
+MeshHit hit_before(Ray ray, float limit, bool any) {
     vec3 safe = mix(ray.direction, vec3(1e-12), lessThan(abs(ray.direction), vec3(1e-12)));
     vec3 inverse = 1.0 / safe;
-    MeshHit hit = MeshHit(1e30, -1, vec2(0.0));
+    MeshHit hit = MeshHit(limit, -1, vec2(0.0));
     int count = nodes[0].skip;
-    for (int i = 0; i < count;) {
+    for (int i = 0; i < count && !(any && hit.triangle >= 0);) {
         Node node = nodes[i];
         bool met = meets_box(node.low, node.high, ray.from, inverse, hit.distance);
         int last = met && node.leaf >= 0 ? (node.leaf >> 3) + (node.leaf & 7) : 0;
@@ -71,6 +72,11 @@ MeshHit closest_hit(Ray ray) {
     }
     return hit;
 }
+
+MeshHit closest_hit(Ray ray) { return hit_before(ray, 1e30, false); }
+
+// Whether anything is nearer to the ray's origin than `limit`.
+bool is_blocked(Ray ray, float limit) { return hit_before(ray, limit, true).triangle >= 0; }
 
 struct MeshSurface { vec3 position; vec3 normal; vec2 uv; vec3 tint; int material; };
 
