@@ -9,12 +9,16 @@
 #endif
 uniform float noise_sigma;   // m at 1 m
 
+// Of a point, and of any point in a sphere around it; `bias`: m, the least of all points.
 #ifdef SHADOW_CONES
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
+bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return true; }
 #elif defined(REAL_SHADOWS)
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return false; }
+bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return false; }
 #else
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_may_shadow(p, bias, false); }
+bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return object_may_shadow_sphere(p, radius, bias); }
 #endif
 
 float shadow_bias(float depth) { return 3.0 * noise_sigma * depth * depth; }

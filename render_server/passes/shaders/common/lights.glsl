@@ -353,6 +353,33 @@ bool object_may_shadow(vec3 p, float bias, bool in_box) {
     return false;
 }
 
+// Whether object_may_block may hold of a point within `radius` of p. The distance to casters is known in cells, so it
+// may differ by two of their diagonals more than its points are apart.
+bool object_may_block_sphere(Light light, vec3 p, float radius, float bias) {
+    bool found = false;
+    for (int j = light.views.z; j < light.views.z + light.views.w && !found; ++j) {
+        LightView view = light_views[j];
+        vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
+        float deepest = v.z + radius, nearest = v.z - radius;
+        if (deepest - bias <= view.range.x) continue;
+        vec2 s = lateral(view, v);
+        bool straight = view.range.z > 0.5;
+        float apart = straight ? radius : radius * (1.0 + length(s)) / max(nearest, 1e-6);
+        float texel = 2.0 * view.tile.w / view.tile.z, reach = light.shape.x * drift(view, deepest, view.range.x);
+        found = (!straight && nearest <= 0.0)
+            || texels_to_caster(view, s) <= (reach + apart) / texel + COMPARED_TEXELS + 2.0 * sqrt(2.0) * CASTER_CELL;
+    }
+    return found;
+}
+
+// Whether object_may_shadow may hold of a point within `radius` of p; of images and rectangles, only the points tell.
+bool object_may_shadow_sphere(vec3 p, float radius, float bias) {
+    if (has_rectangles || has_mirror_images) return true;
+    for (int i = 0; i < light_count; ++i)
+        if (object_may_block_sphere(lights[i], p, radius, bias)) return true;
+    return false;
+}
+
 // If the penumbra is many texels wide, few samples would show as steps.
 int samples_for(Occluder o) {
     if (!o.present) return 1;
