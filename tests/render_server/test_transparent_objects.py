@@ -237,6 +237,22 @@ def test_ball_lens_gathers_light_in_its_focus(gpu: GpuContext, stage: Stage) -> 
     assert within == pytest.approx(passed * np.pi * (0.85 * RADIUS) ** 2 * IRRADIANCE, rel=0.03)
 
 
+def test_both_faces_of_a_pane_throw_light_back(gpu: GpuContext, stage: Stage) -> None:
+    """Of light on a pane 2 R / (1 + R) is thrown back and (1 - R) / (1 + R) goes through (Stokes 1862)."""
+    elevation = np.radians(30)
+    sun = directional((0.0, np.cos(elevation), -np.sin(elevation)), IRRADIANCE)
+    upright = shifted(trimesh.creation.box((0.16, 0.0005, 0.06)), 0, 0, 0.04)
+    beams = beams_of(gpu, stage.document([glass(stage, upright)], [sun], floor()))
+    level = np.abs(beams[:, 6] + np.sin(elevation)) < 1e-3
+    through, back = (beams[level & (sign * beams[:, 5] > 0.5), 8].sum() for sign in (1, -1))
+    reflectance = fresnel(np.array([np.cos(elevation)]), 1 / IOR)[0]
+    met = IRRADIANCE * 0.16 * 0.06 * np.cos(elevation)
+    print(f"back {back / met:.4f}, through {through / met:.4f}, R {reflectance:.4f}")
+    assert back / met == pytest.approx(2 * reflectance / (1 + reflectance), rel=0.04)
+    assert through / met == pytest.approx((1 - reflectance) / (1 + reflectance), rel=0.01)
+    assert back + through < 1.005 * met
+
+
 def below_pane(found: Fields) -> np.ndarray:
     """Pixels of the floor below the middle of the pane."""
     place = found.position

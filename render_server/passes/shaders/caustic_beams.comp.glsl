@@ -1,6 +1,7 @@
 // Beams of light that smooth virtual surfaces reflect: the flux of each block of a light's map of the objects is
 // split over a few rays, each traced to the first surface that it hits. WIDE: they sample the GGX lobe; otherwise all
-// go in the mirror direction. REFRACTED: they go through transparent objects, along the strongest path.
+// go in the mirror direction. REFRACTED: they go through transparent objects, each
+// along the strongest of the paths into which surfaces divide it.
 #include "common/light_rays.glsl"
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"
@@ -153,38 +154,64 @@ ivec2 texel_of_ray(LightView view, ivec2 block, vec4 numbers) {
 }
 
 #ifdef REFRACTED
-const int MOST_SURFACES = 12;    // that a path meets
+const int MOST_SURFACES = 24;    // that the paths of one ray meet
+const int LONGEST_WAY = 16;      // surfaces that one of them meets
+const int HELD = 4;              // paths that wait
 const float LEAST_PART = 0.01;   // of the light, that a path must keep
 
-// A path through transparent objects: where it leaves them, and what is left of its light. `ways`: whether it was reflected (1) or
-// went on (0) at each surface, after a leading 1; 0 where there is no such path. `bent`: how far rough surfaces turn it, relative to
-// a mirror's lobe.
-struct Passage { uint ways; vec3 from; vec3 direction; vec3 part; float bent; };
+// A path through transparent objects: where it goes on, and what is left of its light. `ways`: whether it was reflected (1) or went
+// on (0) at each surface, after a leading 1; 0 where there is no such path. `medium`: the material that it is in, -1 for none.
+// `bent`: how far rough surfaces turn it, relative to a mirror's lobe.
+struct Passage { uint ways; vec3 from; vec3 direction; vec3 part; float bent; int medium; };
 
-Passage passage(LightView view, vec2 s) {
+Passage held[HELD];
+int held_count;
+
+float greatest(vec3 c) { return max(max(c.r, c.g), c.b); }
+
+void hold(Passage way) {
+    if (held_count < HELD && greatest(way.part) >= LEAST_PART) held[held_count++] = way;
+}
+
+Passage strongest_held() {
+    int best = 0;
+    for (int k = 1; k < held_count; ++k)
+        if (greatest(held[k].part) > greatest(held[best].part)) best = k;
+    Passage way = held[best];
+    held[best] = held[--held_count];
+    return way;
+}
+
+Passage first_passage(LightView view, vec2 s) {
     vec3 start = ray_point(view, s, view.range.z > 0.5 ? 0.0 : view.range.x);
-    Ray ray = Ray(start, normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0)));
-    Passage way = Passage(1u, ray.from, ray.direction, vec3(1.0), 0.0);
-    int medium = -1;
-    for (int met = 0; met < MOST_SURFACES; ++met) {
-        MeshHit hit = closest_hit(ray);
-        bool ends = hit.triangle < 0 || !is_transparent(material_of_triangle(max(hit.triangle, 0)));
-        if (ends) { if (met == 0) way.ways = 0u; break; }
-        Interface i = interface_at(hit, ray, 0.0);
-        way.part *= kept_over(medium, hit.distance);
-        bool inside = medium >= 0;
-        vec3 reflectance = interface_reflectance(i, ray.direction, inside);
-        bool back = inside && reflectance.r == 1.0;
-        way.direction = back ? mirrored(i, ray.direction) : refracted(i, ray.direction, inside);
-        if (!back) {
-            way.part *= (1.0 - reflectance) * i.surface.passing;
-            medium = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
-            float bent = max(materials[i.material].medium.w, 1.0) - 1.0, alpha = i.surface.roughness * i.surface.roughness;
-            way.bent = length(vec2(way.bent, 0.5 * bent * alpha));
-        }
-        way.from = leave(i, way.direction);
-        way.ways = way.ways << 1u | (back ? 1u : 0u);
-        ray = Ray(way.from, way.direction);
+    return Passage(1u, start, normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0)), vec3(1.0), 0.0, -1);
+}
+
+bool meets_transparent(MeshHit hit) { return hit.triangle >= 0 && is_transparent(material_of_triangle(max(hit.triangle, 0))); }
+
+// What a surface reflects of a path (`back`) or lets on; its part is 0 if there is no such path.
+Passage divided(Passage way, MeshHit hit, bool back) {
+    Interface i = interface_at(hit, Ray(way.from, way.direction), 0.0);
+    bool inside = way.medium >= 0;
+    vec3 reflectance = interface_reflectance(i, way.direction, inside);
+    way.part *= kept_over(way.medium, hit.distance) * (back ? reflectance : (1.0 - reflectance) * i.surface.passing);
+    float index = max(materials[i.material].medium.w, 1.0), alpha = i.surface.roughness * i.surface.roughness;
+    way.bent = length(vec2(way.bent, alpha * (back ? (inside ? index : 1.0) : 0.5 * (index - 1.0))));
+    if (!back) way.medium = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
+    way.direction = back ? mirrored(i, way.direction) : refracted(i, way.direction, inside);
+    way.from = leave(i, way.direction);
+    way.ways = way.ways << 1u | (back ? 1u : 0u);
+    return way;
+}
+
+// The path by the same ways from another place of the light's view.
+Passage along_ways(LightView view, vec2 s, uint ways) {
+    Passage way = first_passage(view, s);
+    for (int k = findMSB(ways) - 1; k >= 0; --k) {
+        MeshHit hit = closest_hit(Ray(way.from, way.direction));
+        if (meets_transparent(hit)) way = divided(way, hit, (ways >> uint(k) & 1u) != 0u);
+        else way.part = vec3(0.0);
+        if (way.part == vec3(0.0)) { way.ways = 0u; break; }
     }
     return way;
 }
@@ -193,13 +220,38 @@ Passage passage(LightView view, vec2 s) {
 Drift drift_through(LightView view, ivec2 texel, ivec2 axis, Passage here, float side) {
     int apart = max(block_edge / 2, 1);
     for (int sign = 1; sign >= -1; sign -= 2) {
-        Passage other = passage(view, texel_lateral(view, texel + sign * apart * axis));
+        Passage other = along_ways(view, texel_lateral(view, texel + sign * apart * axis), here.ways);
         if (other.ways != here.ways) continue;
         float blocks = float(sign * block_edge) / float(apart) * RAYS_APART;
         return Drift(blocks * (other.from - here.from), blocks * (other.direction - here.direction));
     }
     vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * RAYS_APART;
     return Drift(across, vec3(0.0));
+}
+
+void leave_objects(LightView view, ivec2 texel, float side, Passage way, vec3 flux, float radius) {
+    Drift x = drift_through(view, texel, ivec2(1, 0), way, side), y = drift_through(view, texel, ivec2(0, 1), way, side);
+    send(way.from, way.direction, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * radius)), x, y);
+}
+
+// Sends a beam for each of the strongest PATHS paths of a ray; what its first surface reflects, mirrors' beams bring.
+void send_paths(LightView view, ivec2 texel, float side, vec3 flux, float radius) {
+    Passage start = first_passage(view, texel_lateral(view, texel));
+    MeshHit first = closest_hit(Ray(start.from, start.direction));
+    held_count = 0;
+    if (meets_transparent(first)) hold(divided(start, first, false));
+    int sent = 0;
+    for (int met = 1; met < MOST_SURFACES && held_count > 0 && sent < PATHS; ++met) {
+        Passage way = strongest_held();
+        MeshHit hit = closest_hit(Ray(way.from, way.direction));
+        if (!meets_transparent(hit)) {
+            leave_objects(view, texel, side, way, flux, radius);
+            ++sent;
+        } else if (findMSB(way.ways) < LONGEST_WAY) {
+            hold(divided(way, hit, false));
+            hold(divided(way, hit, true));
+        }
+    }
 }
 
 bool lets_through(int material) {
@@ -217,11 +269,8 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     vec3 flux = float(block_edge * block_edge) / float(RAY_COUNT) * texel_light(light, view, s);
     if (flux == vec3(0.0)) return;
     flux *= real_visibility(light, spot.point, spot.normal, bias_real);
-    Passage way = passage(view, s);
-    if (way.ways == 0u || all(lessThan(way.part, vec3(LEAST_PART)))) return;
     float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
-    Drift x = drift_through(view, texel, ivec2(1, 0), way, side), y = drift_through(view, texel, ivec2(0, 1), way, side);
-    send(way.from, way.direction, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * radius)), x, y);
+    send_paths(view, texel, side, flux, radius);
 }
 #else
 // Ray j of a block: its texel is one of RAY_COUNT spread evenly over the block, which share the block's flux.
