@@ -1,7 +1,7 @@
 """H.264 of live pictures (extra `video`): one picture in, one access unit out at once, and the other way round.
 
-Access units are byte streams (ITU-T H.264, Annex B) with parameter sets before each IDR picture, which WebCodecs takes
-as they are. Colour is stated as it is: BT.709 primaries and matrix, sRGB transfer, codes 16 to 235 (ITU-T H.273).
+Access units are byte streams (ITU-T H.264, Annex B) with parameter sets before each IDR picture: WebCodecs takes them as
+they are. Colour is stated as it is: BT.709 primaries and matrix, sRGB transfer, codes 16 to 235 (ITU-T H.273).
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ USUAL_RATE = 30  # that encoders reckon with; pictures come when they come
 NO_PERIOD = 1_000_000  # pictures between IDR pictures that nobody asked for
 BT709, SRGB, LIMITED_RANGE = 1, 13, 1  # code points of ITU-T H.273, and FFmpeg's AVCOL_RANGE_MPEG
 SEQUENCE_PARAMETERS = b"\x00\x00\x01\x67"  # start code and header of that NAL unit
-# Constant quality, of which x264 gives more to what moves less: with `veryfast` the demo's moving pictures take a ninth
-# of their JPEGs and differ from them by 40 dB. Sliced threads would cost more than they save at such sizes.
+# Constant quality, of which x264 gives more to what moves less: with `veryfast` the demo's moving pictures take a
+# ninth of their JPEGs and differ from them by 40 dB. Sliced threads would cost more than they save at such sizes.
 OPTIONS = {
     SOFTWARE: {
         "preset": "veryfast",
