@@ -1,7 +1,7 @@
 """H.264 of live pictures (extra `video`): one picture in, one access unit out at once, and the other way round.
 
-Access units are byte streams (ITU-T H.264, Annex B) with parameter sets before each IDR picture: WebCodecs takes them as
-they are. Colour is stated as it is: BT.709 primaries and matrix, sRGB transfer, codes 16 to 235 (ITU-T H.273).
+Access units are byte streams (ITU-T H.264, Annex B) with parameter sets before each IDR picture: WebCodecs takes them
+as they are. Colour is stated as it is: BT.709 primaries and matrix, sRGB transfer, codes 16 to 235 (ITU-T H.273).
 """
 
 from dataclasses import dataclass

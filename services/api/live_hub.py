@@ -45,6 +45,11 @@ class Viewer:
         self.view = view
         self._hub.note_views()
 
+    def prefer(self, codec: LiveCodec) -> None:
+        """Take pictures coded so from now on, where they are there."""
+        self.codec = codec
+        self._hub.wake()
+
     def leave(self) -> None:
         """Leave the encoded pictures that it followed."""
         if self._track is not None:
@@ -233,13 +238,14 @@ class LiveHub:
 
     def _wake_soon(self) -> None:
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._wake)
+            self._loop.call_soon_threadsafe(self.wake)
 
     def _publish_coded(self, note: Callable[[], None]) -> None:
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(note)
         self._wake_soon()
 
-    def _wake(self) -> None:
+    def wake(self) -> None:
+        """Have all viewers look what they can take (in the event loop)."""
         arrived, self.arrived = self.arrived, asyncio.Event()
         arrived.set()

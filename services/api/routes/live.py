@@ -236,7 +236,7 @@ async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay
             elif not text.startswith("codec"):
                 under_way.acknowledge()
             elif (codec := text.removeprefix("codec").strip()) in CODECS:
-                viewer.codec = CODECS[codec]
+                viewer.prefer(CODECS[codec])
             else:
                 await socket.close(POLICY_VIOLATION, UNKNOWN_CODEC)
                 return
