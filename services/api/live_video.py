@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import structlog
@@ -191,9 +191,13 @@ class LiveVideo:
     def __init__(
         self, publish: Callable[[Callable[[], None]], None], on_failure: Callable[[str], None]
     ) -> None:
-        self.why_not = why_unavailable()
         self._publish, self._on_failure = publish, on_failure
         self._tracks: dict[ShownView, VideoTrack] = {}
+
+    @cached_property
+    def why_not(self) -> str | None:
+        """Why there is no H.264 here; None where there is. Found out when first asked for: PyAV is large."""
+        return why_unavailable()
 
     @property
     def encoders(self) -> int:
