@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import cast
 
 import cv2
 import httpx
@@ -82,7 +83,6 @@ def relit_pictures() -> list[Relit]:
 
 def _message(relit: "dl.RelitPicture") -> CompositeMessage:
     composite = relit.composite
-    pose = composite.world_from_camera
     return CompositeMessage(
         node="render-server",
         frame_id=composite.frame_id,
@@ -91,7 +91,7 @@ def _message(relit: "dl.RelitPicture") -> CompositeMessage:
         shape=(*relit.color.shape[:2], 3),
         status="ok" if composite.status == "ok" else "no_pose",
         camera=composite.camera.to_dict(),
-        world_from_camera=None if pose is None else tuple(map(_row, pose)),
+        world_from_camera=_rows(composite.world_from_camera),
         received_ns=0,
         rendered_ns=0,
         pass_times_ms=composite.pass_times_ms,
@@ -100,9 +100,8 @@ def _message(relit: "dl.RelitPicture") -> CompositeMessage:
     )
 
 
-def _row(values: Float64[np.ndarray, "4"]) -> Row:
-    a, b, c, d = map(float, values)
-    return a, b, c, d
+def _rows(pose: Float64[np.ndarray, "4 4"] | None) -> tuple[Row, Row, Row, Row] | None:
+    return None if pose is None else cast("tuple[Row, Row, Row, Row]", tuple(map(tuple, pose.tolist())))
 
 
 def coded(relit: Sequence[Relit], size: tuple[int, int], motion: str) -> list[tuple[CompositeMessage, bytes]]:
