@@ -1,14 +1,15 @@
-"""One message of the live stream (`WS /live`): a header that describes the picture, then the JPEG.
+"""One message of the live stream (`WS /live`): a header that describes the picture, then the picture.
 
 The models here define the header: the service packs with them, the Python client reads with them, and the dashboard's
 types are generated from the OpenAPI description, whose component `LiveHeader` they are.
 """
 
+import json
 import struct
 import time
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from deltalight.protocol.camera_model import DistortionModel
 from deltalight.protocol.documents import validate
@@ -67,6 +68,15 @@ class PictureHeader(BaseModel):
         description="The quality that it was rendered in; null: nothing was rendered."
     )
     scale: float = Field(description="Fraction of its width and height that was rendered, and then enlarged.")
+    codec: str = Field(
+        "jpeg",
+        description="What the picture is coded as: `jpeg`, or H.264 by its name in RFC 6381, such as `avc1.64001e`.",
+    )
+    keyframe: bool = Field(
+        default=True,
+        description="Whether it is decoded without those before it. The header of one that is not leaves out what is "
+        "as in the message before.",
+    )
 
     @classmethod
     def of(
@@ -104,17 +114,17 @@ class LiveHeader(PictureHeader, ViewerHeader):
     """The JSON header of a message of `WS /live`."""
 
 
-def pack(picture_header: bytes, viewer_header: ViewerHeader, jpeg: bytes) -> bytes:
-    """Return the message: little-endian uint32 length of the JSON header, the header, the JPEG.
+def pack(picture_header: bytes, viewer_header: ViewerHeader, coded: bytes) -> bytes:
+    """Return the message: little-endian uint32 length of the JSON header, the header, the coded picture.
 
-    `picture_header` is the JSON text of a `PictureHeader`, encoded once for all viewers.
+    `picture_header` is the JSON text of a `PictureHeader`, or of a part of one, encoded once for all viewers.
     """
     header = viewer_header.model_dump_json().encode()[:-1] + b"," + picture_header[1:]
-    return _LENGTH.pack(len(header)) + header + jpeg
+    return _LENGTH.pack(len(header)) + header + coded
 
 
-def unpack(message: bytes) -> tuple[LiveHeader, bytes]:
-    """Return the header and the JPEG of a message.
+def unpack(message: bytes, before: LiveHeader | None = None) -> tuple[LiveHeader, bytes]:
+    """Return the header and the coded picture of a message; `before` is the header of the one before it.
 
     Raises:
         DeltalightError: it is malformed.
@@ -122,8 +132,11 @@ def unpack(message: bytes) -> tuple[LiveHeader, bytes]:
     try:
         (length,) = _LENGTH.unpack_from(message)
         end = _LENGTH.size + length
-        return LiveHeader.model_validate_json(message[_LENGTH.size : end]), message[end:]
-    except (struct.error, ValidationError) as fault:
+        header = json.loads(message[_LENGTH.size : end])
+        if before is not None and not header.get("keyframe", before.keyframe):
+            header = before.model_dump() | header
+        return LiveHeader.model_validate(header), message[end:]
+    except (struct.error, ValueError, AttributeError) as fault:
         raise DeltalightError("The service sent a live picture without a valid header; update it.") from fault
 
 

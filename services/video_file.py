@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.services.files import appearing, make_output_folder
+from deltalight.services.h264 import even_sized
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -49,7 +50,7 @@ class VideoWriter:
 
         if timestamp_ns <= self._last_ns:
             raise DeltalightError("A picture is not later than the one before; give them in order of time.")
-        even = _even(picture)
+        even = even_sized(picture)
         if self._stream is None:
             self._stream = self._begin(even)
             self._first_ns = timestamp_ns
@@ -127,9 +128,3 @@ def _rate(timestamps_ns: Sequence[int]) -> Fraction:
     if not steps_ns:
         return USUAL_RATE
     return Fraction(10**9, round(statistics.median(steps_ns))).limit_denominator(1001)
-
-
-def _even(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Repeat the last row and column where a size is odd: colour has half the resolution."""
-    height, width = picture.shape[:2]
-    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -137,6 +137,7 @@ class _Streams(Collector):
         """Return all metric families."""
         live = self._live
         yield _gauge("deltalight_live_viewers", "Viewers of the live video.", live.viewers)
+        yield _gauge("deltalight_live_encoders", "Views that are encoded as H.264.", live.video.encoders)
         yield _counter("deltalight_live_frames_received", "Composites that came.", live.received)
         yield _counter("deltalight_live_frames_sent", "Frames sent, to all viewers together.", live.sent)
         yield _counter(

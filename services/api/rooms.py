@@ -178,7 +178,7 @@ class _Builder:
             on_delivery=lambda status: events.publish("picture", asdict(status)),
             chooses_source=self._settings.jobs,
         )
-        live_hub = LiveHub(link.watch)
+        live_hub = LiveHub(link.watch, on_failure=lambda reason: events.publish("notice", {"text": reason}))
 
         def publish_recording(session: RecordingSession, is_growing: bool) -> None:
             body = recordings.recording_event(self._recordings, session, is_growing=is_growing)

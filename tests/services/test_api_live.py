@@ -20,8 +20,7 @@ from deltalight.protocol.messages import ControlRequest
 from deltalight.services import ports
 from deltalight.services.api.credentials import OPEN_TICKETS, TICKET_LIFE_S, Principal, Tickets
 from deltalight.services.api.limits import STREAMS_PER_CLIENT
-from deltalight.services.api.live_hub import LiveHub
-from deltalight.services.api.routes.live import WINDOW
+from deltalight.services.api.live_hub import WINDOW, LiveHub
 from deltalight.services.live_message import unpack
 from tests.services.api_samples import running_api, sentence
 from tests.services.conftest import HEIGHT, ROOT, WIDTH

@@ -98,6 +98,7 @@ SLOW_DECODER = """
 
 def test_the_delay_is_from_the_capture_to_the_page(live: LiveApi, page: Desk) -> None:
     live.stream.ages_s = (60.0, *[10.0] * 6)
+    page.page.add_init_script("delete globalThis.VideoDecoder")  # pictures come as JPEG
     page.page.add_init_script(SLOW_DECODER)
     page.open()
     page.named("tab", "Performance").click()

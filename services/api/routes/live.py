@@ -18,14 +18,16 @@ from deltalight.services.api.events import EventQueue, packed
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.fisheye import FisheyeLight, lights_in_picture
 from deltalight.services.api.live_hub import LiveHub, Viewer
+from deltalight.services.api.live_video import LiveCodec
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.storage.faults import NotFoundError
 
-WINDOW = 2  # frames in flight to one viewer before it has to acknowledge
 PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
 VIEW_TIMEOUT_S = 10.0  # the same, and its shaders' compilation
 POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
 BOUNDARY = "frame"
+CODECS: dict[str, LiveCodec] = {"jpeg": "jpeg", "h264": "h264"}
+UNKNOWN_CODEC = f"there is no such codec; ask for one of {', '.join(CODECS)}"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 NO_ANSWER = "The render server does not answer, or (with Retry-After) too many requests wait for it."
 JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
@@ -90,12 +92,15 @@ def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
 
 
 @live_router.websocket("/live")
-async def live(socket: WebSocket, shared: Shared, view: WantedView = None) -> None:
+async def live(socket: WebSocket, shared: Shared, view: WantedView = None, codec: str = "jpeg") -> None:
     """Send the newest frame whenever this viewer acknowledged enough; others are not affected."""
     await socket.accept()
-    credits = asyncio.BoundedSemaphore(WINDOW)
-    with shared.live.viewer(view) as viewer:
-        await _first_of(_send_frames(socket, viewer, credits), _take_messages(socket, viewer, credits))
+    if codec not in CODECS:
+        await socket.close(POLICY_VIOLATION, UNKNOWN_CODEC)
+        return
+    under_way = _UnderWay()
+    with shared.live.viewer(view, CODECS[codec]) as viewer:
+        await _first_of(_send_frames(socket, viewer, under_way), _take_messages(socket, viewer, under_way))
 
 
 @live_router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description cannot express
@@ -181,25 +186,60 @@ async def _first_of(*streams: Coroutine[Any, Any, None]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _send_frames(socket: WebSocket, viewer: Viewer, credits: asyncio.Semaphore) -> None:
+class _UnderWay:
+    """Counts the messages that a viewer has not acknowledged yet."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._acknowledged = asyncio.Event()
+
+    async def wait_for(self, viewer: Viewer) -> None:
+        """Wait until another one may be sent."""
+        while self._count >= viewer.window:
+            self._acknowledged.clear()
+            await self._acknowledged.wait()
+
+    def add(self) -> None:
+        """Count a message that is sent."""
+        self._count += 1
+
+    def acknowledge(self) -> None:
+        """Count an acknowledgement.
+
+        Raises:
+            ValueError: nothing is under way.
+        """
+        if self._count == 0:
+            raise ValueError
+        self._count -= 1
+        self._acknowledged.set()
+
+
+async def _send_frames(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) -> None:
     while True:
-        await credits.acquire()
-        frame = await viewer.next()
-        if frame is None:
+        await under_way.wait_for(viewer)
+        message = await viewer.next_message()
+        if message is None:
             await socket.close(GOING_AWAY)
             return
-        await socket.send_bytes(frame.packed(viewer.view, viewer.skipped))
+        under_way.add()
+        await socket.send_bytes(message)
 
 
-async def _take_messages(socket: WebSocket, viewer: Viewer, credits: asyncio.BoundedSemaphore) -> None:
-    """Take acknowledgements, and `view NAME` for another view (`view` alone: the scene's own)."""
+async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) -> None:
+    """Take acknowledgements, `view NAME` for another view (`view` alone: the scene's own), and `codec NAME`."""
     try:
         while True:
             text = await socket.receive_text()
             if text.startswith("view"):
                 viewer.look_at(_VIEW.validate_python(text.removeprefix("view").strip() or None))
+            elif not text.startswith("codec"):
+                under_way.acknowledge()
+            elif (codec := text.removeprefix("codec").strip()) in CODECS:
+                viewer.prefer(CODECS[codec])
             else:
-                credits.release()
+                await socket.close(POLICY_VIOLATION, UNKNOWN_CODEC)
+                return
     except WebSocketDisconnect:
         return
     except (ValueError, KeyError):  # it acknowledged a frame that it never got, sent bytes, or named no view

@@ -9,7 +9,8 @@ from pydantic import BaseModel, Field
 from deltalight import __version__
 from deltalight.services.api.camera_finder import CamerasAnswer
 from deltalight.services.api.context import Shared, in_pool
-from deltalight.services.api.live_hub import LiveFrame
+from deltalight.services.api.live_frame import LiveFrame
+from deltalight.services.api.live_video import LiveCodec
 from deltalight.services.api.metrics import MEDIA_TYPE
 from deltalight.services.api.models import PictureState, ProcessAnswer
 from deltalight.services.api.problems import ProblemError, responses, unavailable
@@ -60,6 +61,8 @@ class Settings(BaseModel):
     upload_limit_bytes: int
     requests_per_s: float
     has_poster: bool = Field(description="Whether `/poster.jpg` stands for the live picture until it comes.")
+    live_codecs: list[LiveCodec] = Field(description="What `WS /live` sends pictures as, for the asking.")
+    no_h264: str | None = Field(description="Why `h264` is not among them; null where it is.")
 
 
 class NodeAnswer(ProcessAnswer):
@@ -131,6 +134,8 @@ def settings(shared: Shared) -> Settings:
         upload_limit_bytes=shared.settings.upload_limit_mb << 20,
         requests_per_s=shared.settings.requests_per_s,
         has_poster=shared.store.poster.is_file(),
+        live_codecs=["jpeg", "h264"] if shared.live.video.why_not is None else ["jpeg"],
+        no_h264=shared.live.video.why_not,
     )
 
 

@@ -2,7 +2,7 @@ import { describe, expect, it } from "vitest";
 import { delayFigures, delayText } from "../src/live/delay";
 import { droppedFrames, parseLiveMessage, qualityText } from "../src/live/message";
 import { lateBy } from "../src/live/picture";
-import { RateMeter } from "../src/live/rate";
+import { BitMeter, RateMeter } from "../src/live/rate";
 import { backoff } from "../src/live/socket";
 import { leadingPasses, OTHERS, stacked, timeOf, type Sample } from "../src/live/telemetry";
 import { awaitedChange } from "../src/state/liveState";
@@ -22,10 +22,19 @@ function sample(at: number, passes: Record<string, number>): Sample {
 
 describe("a message of the live picture", () => {
   it("comes apart into header and picture", () => {
-    const { header, jpeg } = parseLiveMessage(message({ frame_id: 7, renderer: "é" }, [255, 216, 255]));
+    const { header, coded } = parseLiveMessage(message({ frame_id: 7, renderer: "é" }, [255, 216, 255]));
     expect(header.frame_id).toBe(7);
     expect(header.renderer).toBe("é");
-    expect([...jpeg]).toEqual([255, 216, 255]);
+    expect([...coded]).toEqual([255, 216, 255]);
+  });
+
+  it("takes from the one before what its header leaves out, unless it is a key", () => {
+    const { header } = parseLiveMessage(message({ frame_id: 7, codec: "avc1.64001e", keyframe: true }, []));
+    const next = parseLiveMessage(message({ frame_id: 8, keyframe: false }, []), header).header;
+    expect(next).toEqual({ frame_id: 8, codec: "avc1.64001e", keyframe: false });
+    expect(parseLiveMessage(message({ frame_id: 9 }, []), next).header.codec).toBe("avc1.64001e");
+    const key = { frame_id: 10, codec: "jpeg", keyframe: true };
+    expect(parseLiveMessage(message(key, []), next).header).toEqual(key);
   });
 
   it("is refused where it is cut short", () => {
@@ -90,6 +99,16 @@ describe("the rate", () => {
     expect(meter.rate(11_000)).toBeCloseTo(1, 9);
     meter.note(1, 12_000);
     expect(meter.rate(12_500)).toBeNull();
+  });
+});
+
+describe("the bit rate", () => {
+  it("is that of the last three seconds, up to now", () => {
+    const meter = new BitMeter();
+    for (let second = 0; second <= 10; second++) meter.note(1000, 1000 * second);
+    expect(meter.kilobits(10_000)).toBeCloseTo(8, 9);
+    expect(meter.kilobits(12_000)).toBeCloseTo(4, 9); // nothing came since
+    expect(new BitMeter().kilobits(0)).toBeNull();
   });
 });
 

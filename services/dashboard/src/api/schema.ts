@@ -2292,6 +2292,12 @@ export interface components {
              */
             readonly capture_ns: number;
             /**
+             * Codec
+             * @description What the picture is coded as: `jpeg`, or H.264 by its name in RFC 6381, such as `avc1.64001e`.
+             * @default jpeg
+             */
+            readonly codec: string;
+            /**
              * Drops
              * @description What was lost before, by cause.
              */
@@ -2308,6 +2314,12 @@ export interface components {
              * @description Rate at which pictures come; null before the second.
              */
             readonly frames_per_s: number | null;
+            /**
+             * Keyframe
+             * @description Whether it is decoded without those before it. The header of one that is not leaves out what is as in the message before.
+             * @default true
+             */
+            readonly keyframe: boolean;
             /**
              * Lights
              * @description What it was lit with.
@@ -3542,8 +3554,18 @@ export interface components {
              * @description Whether `/poster.jpg` stands for the live picture until it comes.
              */
             readonly has_poster: boolean;
+            /**
+             * Live Codecs
+             * @description What `WS /live` sends pictures as, for the asking.
+             */
+            readonly live_codecs: readonly ("jpeg" | "h264")[];
             /** Needs Token */
             readonly needs_token: boolean;
+            /**
+             * No H264
+             * @description Why `h264` is not among them; null where it is.
+             */
+            readonly no_h264: string | null;
             /** Requests Per S */
             readonly requests_per_s: number;
             /** Upload Limit Bytes */

@@ -1,20 +1,23 @@
-// One message of the live picture: uint32 little-endian length of a JSON header, the header, a JPEG.
+// One message of the live picture: uint32 little-endian length of a JSON header, the header, a coded picture.
 import type { LiveHeader } from "../api/types";
 
 export interface LiveMessage {
   readonly header: LiveHeader;
-  readonly jpeg: Uint8Array<ArrayBuffer>;
+  /** A JPEG or an access unit of H.264, as the header says; empty where the picture is the one before. */
+  readonly coded: Uint8Array<ArrayBuffer>;
 }
 
 const LENGTH_BYTES = 4;
 
-/** Take a message apart; throws a RangeError or SyntaxError for what is none. */
-export function parseLiveMessage(data: ArrayBuffer): LiveMessage {
+/** Take a message apart, `before` the header of the one before it; throws a RangeError or SyntaxError for what is none. */
+export function parseLiveMessage(data: ArrayBuffer, before: LiveHeader | null = null): LiveMessage {
   const headerLength = new DataView(data).getUint32(0, true);
   const text = new TextDecoder().decode(new Uint8Array(data, LENGTH_BYTES, headerLength));
+  const said = JSON.parse(text) as Partial<LiveHeader>;
+  const isWhole = said.keyframe ?? before?.keyframe ?? true;
   return {
-    header: JSON.parse(text) as LiveHeader,
-    jpeg: new Uint8Array(data, LENGTH_BYTES + headerLength),
+    header: (isWhole ? said : { ...before, ...said }) as LiveHeader,
+    coded: new Uint8Array(data, LENGTH_BYTES + headerLength),
   };
 }
 

@@ -5,10 +5,11 @@ import type { LiveHeader } from "../api/types";
 import { lensOf, type Pixel, type View } from "../math/camera";
 import { lookedAt } from "../state/scene";
 import { noteDrawn } from "./delay";
-import { RateMeter } from "./rate";
+import { BitMeter, RateMeter } from "./rate";
 import { note, slowestMs } from "./telemetry";
 import { parseLiveMessage } from "./message";
 import { ReconnectingSocket, type Connection } from "./socket";
+import { noVideo, VideoPictures, videoProblem } from "./video";
 
 // A frame is late when three of the slowest of the last minute would have fitted in, within these bounds.
 const LATE_FRAMES = 3;
@@ -30,15 +31,35 @@ export const rate = signal<number | null>(null);
 /** How long the next frame has kept this page waiting, ms; 0 until it is late. */
 export const lateMs = signal(0);
 const meter = new RateMeter();
+/** What the pictures take on the network. */
+export const bitrate = signal<number | null>(null);
+const bits = new BitMeter();
 let lastArrival = 0;
 let canvas: HTMLCanvasElement | null = null;
+/** Of the newest message, which the next one may build on. */
+let lastHeader: LiveHeader | null = null;
 
+const video = new VideoPictures(
+  show,
+  () => socket.send("ack"),
+  (reason) => (noVideo.value = reason),
+);
 const socket = new ReconnectingSocket(`${API}/live`, (event) => void receive(event));
 export const connection = socket.state as ReadonlySignal<Connection>;
 
 effect(() => {
   const view = lookedAt.value ?? "";
   if (connection.value === "open") socket.send(`view ${view}`);
+});
+
+effect(() => {
+  if (connection.value === "open") return;
+  lastHeader = null;
+  video.close();
+});
+
+effect(() => {
+  if (connection.value === "open") socket.send(`codec ${noVideo.value === null ? "h264" : "jpeg"}`);
 });
 
 /** The newest frame's camera in the world; null without a pose. */
@@ -54,6 +75,11 @@ export function showPictureOn(target: HTMLCanvasElement | null): void {
 
 let watch: ReturnType<typeof setInterval> | undefined;
 
+/** Ask for H.264 where the service has it (else why not) and this browser decodes it. */
+export async function chooseCodec(whyNot: string | null): Promise<void> {
+  noVideo.value = whyNot ?? (await videoProblem());
+}
+
 export function startPicture(): void {
   socket.start();
   clearInterval(watch);
@@ -63,6 +89,8 @@ export function startPicture(): void {
 function tick(): void {
   const now = performance.now();
   rate.value = meter.rate(now);
+  bitrate.value = bits.kilobits(now);
+  video.checkAt(now);
   lateMs.value = frame.value === null ? 0 : lateBy(now - lastArrival, slowestMs());
 }
 
@@ -83,15 +111,25 @@ export function retryPicture(): void {
 async function receive(event: MessageEvent<unknown>): Promise<void> {
   if (!(event.data instanceof ArrayBuffer)) return;
   const arrival = performance.now();
+  const { header, coded } = parseLiveMessage(event.data, lastHeader);
+  lastHeader = header;
+  bits.note(event.data.byteLength, arrival);
+  if (header.codec !== "jpeg" && coded.length > 0 && noVideo.value === null) {
+    video.decode(header, coded, arrival);
+    return;
+  }
   try {
-    const { header, jpeg } = parseLiveMessage(event.data);
-    const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
-    draw(bitmap, header);
-    noteDrawn(header.age_ms, arrival);
-    bitmap.close();
+    if (header.codec === "jpeg") await showJpeg(header, coded, arrival);
+    else if (coded.length === 0 && video.isIdle) noteFrame(header, arrival); // the picture before is still right
   } finally {
     socket.send("ack");
   }
+}
+
+async function showJpeg(header: LiveHeader, coded: Uint8Array<ArrayBuffer>, arrival: number): Promise<void> {
+  const bitmap = await createImageBitmap(new Blob([coded], { type: "image/jpeg" }));
+  show(bitmap, header, arrival);
+  bitmap.close();
 }
 
 /** Mean linear brightness around a pixel of the picture, as sRGB codes it; null outside. */
@@ -113,17 +151,23 @@ function linearFromCode(code: number): number {
   return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
 }
 
-function draw(bitmap: ImageBitmap, header: LiveHeader): void {
-  const { width, height } = bitmap;
+/** Draw a picture; the codec may have enlarged it to an even size. */
+function show(picture: ImageBitmap | VideoFrame, header: LiveHeader, arrival: number): void {
+  const { width, height } = header.camera;
   if (pictureSize.value?.width !== width || pictureSize.value.height !== height) pictureSize.value = { width, height };
   if (canvas) {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
+    canvas.getContext("2d")?.drawImage(picture, 0, 0, width, height, 0, 0, width, height);
   }
+  noteFrame(header, arrival);
+}
+
+function noteFrame(header: LiveHeader, arrival: number): void {
   lastArrival = performance.now();
   lateMs.value = 0;
   meter.note(header.number, lastArrival);
   rate.value = meter.rate(lastArrival);
   frame.value = header;
   note(header, lastArrival, rate.value);
+  noteDrawn(header.age_ms, arrival);
 }

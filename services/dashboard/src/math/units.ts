@@ -53,6 +53,12 @@ export function rateText(perSecond: number | null): string {
   return perSecond === null ? "–" : `${perSecond.toFixed(perSecond < 1 ? 2 : 1)} fps`;
 }
 
+/** Of a stream; a thousand and more in millions. */
+export function bitrateText(kilobits: number | null): string {
+  if (kilobits === null) return "–";
+  return kilobits >= 1000 ? `${(kilobits / 1000).toFixed(1)} Mbit/s` : `${kilobits.toFixed(0)} kbit/s`;
+}
+
 export function size(metres: number): string {
   return sizesText([metres]);
 }

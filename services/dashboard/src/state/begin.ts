@@ -3,7 +3,7 @@ import { effect, signal } from "@preact/signals";
 import { API, ProblemError, request } from "../api/http";
 import { keepToken, phase, signInProblem, token } from "../api/session";
 import type { Settings } from "../api/types";
-import { startPicture, stopPicture } from "../live/picture";
+import { chooseCodec, startPicture, stopPicture } from "../live/picture";
 import { startEvents, stopEvents } from "./events";
 import { readSchemas } from "../forms/schemas";
 
@@ -23,6 +23,7 @@ export async function begin(): Promise<void> {
     hasPoster.value = settings.has_poster;
     await readSchemas();
     phase.value = "ready";
+    await chooseCodec(settings.no_h264);
     startEvents();
     startPicture();
   } catch (fault) {

@@ -1,8 +1,9 @@
 import type uPlot from "uplot";
 import { delay, DELAY_TIP, delayText, shown } from "../../live/delay";
-import { frame, rate } from "../../live/picture";
+import { bitrate, frame, rate } from "../../live/picture";
+import { noVideo } from "../../live/video";
 import { leadingPasses, OTHERS, samples, stacked, timeOf, type Sample } from "../../live/telemetry";
-import { milliseconds, rateText } from "../../math/units";
+import { bitrateText, milliseconds, rateText } from "../../math/units";
 import { Empty } from "../ui/Empty";
 import { Plot, type Series } from "./Plot";
 
@@ -42,12 +43,22 @@ export function PerformancePanel() {
       </figure>
       <figure class="plot-box">
         <figcaption>
-          Rate <b>{rateText(rate.value)}</b>
+          Rate <b>{rateText(rate.value)}</b> <span title={codecTip()}>{codecText()}</span>
         </figcaption>
         <Plot label="Frames per second" series={line("rate", "#5b9df0")} data={[times, all.map((each) => each.rate)]} />
       </figure>
     </div>
   );
+}
+
+/** What the pictures are coded as, and what they take on the network: "H.264, 412 kbit/s". */
+function codecText(): string {
+  const name = frame.value?.codec.startsWith("avc1") ? "H.264" : "JPEG";
+  return `${name}, ${bitrateText(bitrate.value)}`;
+}
+
+function codecTip(): string {
+  return noVideo.value === null ? `Coded as ${frame.value?.codec ?? "–"}` : `JPEG: ${noVideo.value}`;
 }
 
 /** Times before `now`, and the delay of what was shown then. */
