@@ -168,6 +168,7 @@ def test_an_override_of_the_material_begins_with_the_files_own(stack: Stack, pag
     page.until(lambda: stack.object("knot")["material"], "the material")
     red, green, _ = stack.object("knot")["material"]["base_color"]
     assert green > 2 * red, "the file's own green"
+    page.photograph("material")
     page.named("switch", "Override material").click()
     page.until(lambda: stack.object("knot")["material"] is None, "the file's material")
 
