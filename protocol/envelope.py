@@ -4,7 +4,8 @@ Everything that arrives is validated before anything of its size is allocated; a
 nothing else.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import msgpack
 import numpy as np
@@ -103,8 +104,15 @@ def unpack_header(header: Buffer) -> Message:
     stream = fields.get("stream")
     if not isinstance(stream, str) or stream not in MESSAGE_TYPES:
         raise EnvelopeError(f"the header names no known stream: use one of {', '.join(MESSAGE_TYPES)}")
-    try:
+    with refusing(stream):
         return MESSAGE_TYPES[stream].model_validate(fields)
+
+
+@contextmanager
+def refusing(stream: str) -> Iterator[None]:
+    """Turn what is wrong with the fields of a message that is made within the block into `EnvelopeError`."""
+    try:
+        yield
     except ValidationError as error:
         raise EnvelopeError(_sentence(stream, error)) from error
 

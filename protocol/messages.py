@@ -41,6 +41,7 @@ from deltalight.protocol.scene_fields import LightCount, PeakThreshold, ShownVie
 SCHEMA_VERSION: Final = 8
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
+MAX_UNPACKED_BYTES = 256 * 1024 * 1024  # of all parts together; 24 compressed pictures could take 1.6 GB
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
 RESPONSE_SHAPE = (256, 3)
 MAX_OTHERS = len(get_args(ShownView)) - 1
@@ -109,9 +110,16 @@ class MessageBase(BaseModel):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:
-        for rule in self.part_rules():
+        rules = self.part_rules()
+        for rule in rules:
             if rule.raw_bytes > MAX_PART_BYTES:
                 raise ValueError(f"{rule.name} of shape {rule.shape} is larger than {MAX_PART_BYTES} bytes")
+        unpacked = sum(rule.raw_bytes for rule in rules)
+        if unpacked > MAX_UNPACKED_BYTES:
+            raise ValueError(
+                f"its {len(rules)} parts unpack to {unpacked} bytes and {MAX_UNPACKED_BYTES} are allowed: "
+                "send fewer or smaller pictures"
+            )
         return self
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.codecs import encode_array, encode_color, encode_depth
-from deltalight.protocol.envelope import EnvelopeError, encode
+from deltalight.protocol.envelope import EnvelopeError, encode, refusing
 from deltalight.protocol.fisheye_lens import describe_calibration
 from deltalight.protocol.frames import (
     BoardPose,
@@ -54,15 +54,16 @@ def depth_multipart(
     """Return the depth message; `step_m` is the step of the stored depth, None = as fine as its range allows."""
     step_m = step_m or fitting_step_m(depth)
     height, width = depth.depth_m.shape
-    message = DepthMessage(
-        **stamps,
-        stream=stream,
-        encoding="blosc2",
-        shape=(height, width),
-        depth_scale_m=step_m,
-        camera=depth.camera.to_dict(),
-        noise_sigma_m=depth.noise_sigma_m,
-    )
+    with refusing(stream):
+        message = DepthMessage(
+            **stamps,
+            stream=stream,
+            encoding="blosc2",
+            shape=(height, width),
+            depth_scale_m=step_m,
+            camera=depth.camera.to_dict(),
+            noise_sigma_m=depth.noise_sigma_m,
+        )
     return encode(message, [encode_depth(depth.depth_m, depth.valid, "blosc2", step_m)])
 
 
@@ -92,18 +93,23 @@ def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stam
 def color_multipart(
     frame: SensorFrame, stamps: Stamps, encoding: Literal["jpeg", "raw"], jpeg_quality: int
 ) -> list[bytes]:
-    """Return the colour message; JPEG bytes of the frame are sent unchanged."""
+    """Return the colour message; JPEG bytes of the frame are sent unchanged.
+
+    Raises:
+        EnvelopeError: the picture is too large for a message.
+    """
     recorded = frame.color_jpeg if encoding == "jpeg" else None
     picture = recorded or encode_color(frame.color, encoding, jpeg_quality)
     height, width = frame.color.shape[:2]
-    message = ColorMessage(
-        **stamps,
-        encoding=encoding,
-        shape=(height, width, 3),
-        camera=frame.camera.to_dict(),
-        has_response=frame.response is not None,
-        exposure_s=frame.exposure_s,
-    )
+    with refusing("color"):
+        message = ColorMessage(
+            **stamps,
+            encoding=encoding,
+            shape=(height, width, 3),
+            camera=frame.camera.to_dict(),
+            has_response=frame.response is not None,
+            exposure_s=frame.exposure_s,
+        )
     return encode(message, [picture] if frame.response is None else [picture, frame.response])
 
 
@@ -113,7 +119,7 @@ def fisheye_multipart(
     """Return the message of fish-eye pictures; linear ones are sent raw. The stamps are those of their own capture.
 
     Raises:
-        EnvelopeError: the pictures differ in size or kind.
+        EnvelopeError: the pictures differ in size or kind, or are too many or too large for a message.
     """
     first = fisheye.pictures[0]
     if any(picture.shape != first.shape or picture.dtype != first.dtype for picture in fisheye.pictures):
@@ -122,15 +128,16 @@ def fisheye_multipart(
     code: Literal["jpeg", "raw"] = "raw" if is_linear else encoding
     camera, response = describe_calibration(fisheye.calibration)
     height, width = first.shape[:2]
-    message = FisheyeMessage(
-        **stamps,
-        encoding=code,
-        shape=(height, width, 3),
-        dtype="float32" if is_linear else "uint8",
-        camera=camera,
-        has_response=response is not None,
-        exposures_s=fisheye.exposures_s,
-    )
+    with refusing("fisheye"):
+        message = FisheyeMessage(
+            **stamps,
+            encoding=code,
+            shape=(height, width, 3),
+            dtype="float32" if is_linear else "uint8",
+            camera=camera,
+            has_response=response is not None,
+            exposures_s=fisheye.exposures_s,
+        )
     parts = [
         encode_array(picture, "raw") if is_linear else encode_color(picture, code, jpeg_quality)
         for picture in fisheye.pictures

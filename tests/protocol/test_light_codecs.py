@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -284,3 +285,14 @@ def test_mutated_messages_raise_nothing_but_sentences() -> None:
         except DeltalightError:
             refused += 1
     assert refused > 100
+
+
+def test_brackets_that_unpack_to_gigabytes_are_refused_on_both_sides() -> None:
+    pixels = np.zeros((4700, 4700, 3), np.uint8)  # 66 MB; as a jpeg less than one
+    pictures = replace(coded(NOW, (0.1,) * 5), pictures=(pixels,) * 5)
+    with pytest.raises(EnvelopeError, match=r"6 parts unpack to .* fewer or smaller"):
+        fisheye_multipart(pictures, STAMPS, "jpeg", JPEG_QUALITY)
+    topic, header, *parts = fisheye_multipart(coded(NOW, (None,)), STAMPS, "jpeg", JPEG_QUALITY)
+    fields = {**msgpack.unpackb(header), "shape": [4700, 4700, 3], "exposures_s": [0.1] * 5}
+    with pytest.raises(EnvelopeError, match="unpack to"):
+        decode([topic, msgpack.packb(fields), *parts[:1] * 5, *parts[1:]])

@@ -1,20 +1,24 @@
 """The dashboard in a real browser: the room in 3-D, lamps beside the picture, models of the shelf."""
 
 import gzip
+import os
+import signal
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Route
+from playwright.sync_api import Browser, Route, expect
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import RECORDING, SCENE
 from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
+    PATIENCE_S,
     SIZE,
     Desk,
     Stack,
@@ -197,6 +201,29 @@ def test_fingers_turn_the_room(stack: Stack, browser: Browser, first_document: d
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         changes(phone, "a turn by a finger", lambda: phone.swipe((x, y), (x + 90, y)))
         assert phone.beyond_the_edge() == []
+
+
+def test_a_page_that_is_left_open_recovers_when_the_web_process_was_killed(stack: Stack, page: Desk) -> None:
+    port = int(stack.address.rpartition(":")[2])
+    (web,) = {
+        each.pid
+        for each in psutil.net_connections("tcp")
+        if each.laddr.port == port and each.status == psutil.CONN_LISTEN
+    }
+    state = page.page.locator(".live-state [role=status]")
+    expect(state).to_have_text("Live", timeout=1000 * PATIENCE_S)
+    page.page.wait_for_load_state("networkidle")
+    os.kill(web, signal.SIGKILL)
+    expect(state).to_have_text("Reconnecting", timeout=1000 * PATIENCE_S)
+    expect(state).to_have_text("Live", timeout=1000 * PATIENCE_S)
+    stack.client.patch(f"{stack.path}/output", json={"view": "delta"}).raise_for_status()
+    page.shows_newest()
+    refused = (
+        "WebSocket connection",
+        "ERR_CONNECTION_REFUSED",
+        "ERR_CONNECTION_RESET",
+    )  # while nobody was there
+    page.complaints[:] = [each for each in page.complaints if not any(part in each for part in refused)]
 
 
 def test_relit_pictures_are_recorded_and_downloaded_as_a_video(stack: Stack, page: Desk) -> None:

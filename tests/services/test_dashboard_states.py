@@ -8,8 +8,9 @@ import shutil
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Route, expect
+from playwright.sync_api import Browser, Route, WebSocketRoute, expect
 
+from deltalight import __version__
 from deltalight.services.demo import POSTER
 from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
@@ -138,6 +139,23 @@ def test_fisheye_light_cannot_be_chosen_without_a_fisheye_camera(stack: Stack, p
     page.photograph("no_fisheye")
     stack.client.patch(f"{stack.path}/lights", json={"mode": "fisheye"}).raise_for_status()
     expect(page.page.locator(".picture-banner")).to_contain_text("lit by a fish-eye camera")
+
+
+def test_a_page_that_meets_a_service_of_another_version_is_loaded_anew(page: Desk) -> None:
+    connections: list[WebSocketRoute] = []
+
+    def pass_on(ours: WebSocketRoute) -> None:
+        theirs = ours.connect_to_server()
+        connections.append(ours)
+        newer = "9.9.9" if len(connections) > 1 else __version__
+        theirs.on_message(lambda text: ours.send(str(text).replace(__version__, newer)))
+
+    page.page.route_web_socket("**/api/v1/events", pass_on)
+    page.open()
+    page.until(lambda: connections, "a connection")
+    with page.page.expect_event("load"):
+        connections[0].close()
+    page.shows_newest()
 
 
 def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk) -> None:

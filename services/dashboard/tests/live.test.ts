@@ -1,9 +1,9 @@
-import { describe, expect, it } from "vitest";
+import { describe, expect, it, vi } from "vitest";
 import { delayFigures, delayText } from "../src/live/delay";
 import { droppedFrames, parseLiveMessage, qualityText } from "../src/live/message";
 import { lateBy } from "../src/live/picture";
 import { BitMeter, RateMeter } from "../src/live/rate";
-import { backoff } from "../src/live/socket";
+import { backoff, LONGEST_SILENCE_MS, ReconnectingSocket } from "../src/live/socket";
 import { leadingPasses, OTHERS, stacked, timeOf, type Sample } from "../src/live/telemetry";
 import { awaitedChange } from "../src/state/liveState";
 
@@ -58,6 +58,38 @@ describe("the quality of a picture", () => {
 describe("the connection", () => {
   it("waits longer after each failure, up to ten seconds", () => {
     expect([0, 1, 2, 3, 10].map(backoff)).toEqual([500, 1000, 2000, 4000, 10_000]);
+  });
+
+  it("is made anew when nothing was heard for a minute", async () => {
+    const made: { onopen?: () => void; onmessage?: (event: object) => void; close: () => void }[] = [];
+    const close = vi.fn();
+    vi.useFakeTimers();
+    vi.stubGlobal("document", { baseURI: "http://127.0.0.1/" });
+    vi.stubGlobal(
+      "WebSocket",
+      class {
+        close = close;
+        constructor() {
+          made.push(this);
+        }
+      },
+    );
+    const socket = new ReconnectingSocket("/live", () => undefined);
+    socket.start();
+    await vi.advanceTimersByTimeAsync(0);
+    made[0]!.onopen!();
+    await vi.advanceTimersByTimeAsync(LONGEST_SILENCE_MS - 1);
+    made[0]!.onmessage!({});
+    await vi.advanceTimersByTimeAsync(LONGEST_SILENCE_MS - 1);
+    expect(made.length).toBe(1);
+    await vi.advanceTimersByTimeAsync(1);
+    expect(made.length).toBe(2);
+    expect(close).toHaveBeenCalledOnce();
+    made[1]!.onopen!();
+    expect(socket.state.value).toBe("open");
+    socket.stop();
+    vi.useRealTimers();
+    vi.unstubAllGlobals();
   });
 });
 

@@ -1,4 +1,5 @@
-// A WebSocket that comes back by itself, waiting longer after each failure.
+// A WebSocket that comes back by itself, waiting longer after each failure, and is made anew after long silence:
+// pages are not told of a connection that a sleeping laptop or a router has lost.
 import { signal, type Signal } from "@preact/signals";
 import { socketAddress } from "../api/tickets";
 
@@ -6,12 +7,14 @@ export type Connection = "connecting" | "open" | "waiting" | "closed";
 
 const FIRST_WAIT_MS = 500;
 const LONGEST_WAIT_MS = 10_000;
+export const LONGEST_SILENCE_MS = 60_000;
 
 export class ReconnectingSocket {
   readonly state: Signal<Connection> = signal("closed");
   private socket: WebSocket | null = null;
   private failures = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
+  private silence: ReturnType<typeof setTimeout> | undefined;
 
   constructor(
     private readonly path: string,
@@ -24,6 +27,7 @@ export class ReconnectingSocket {
 
   stop(): void {
     clearTimeout(this.timer);
+    clearTimeout(this.silence);
     this.state.value = "closed";
     this.socket?.close();
     this.socket = null;
@@ -58,9 +62,13 @@ export class ReconnectingSocket {
   private open(socket: WebSocket): void {
     this.socket = socket;
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => (this.state.value = "open");
+    socket.onopen = () => {
+      this.state.value = "open";
+      this.expectMessage();
+    };
     socket.onmessage = (event: MessageEvent<unknown>) => {
       this.failures = 0;
+      if (this.socket === socket) this.expectMessage();
       this.onMessage(event);
     };
     socket.onclose = () => {
@@ -68,7 +76,18 @@ export class ReconnectingSocket {
     };
   }
 
+  private expectMessage(): void {
+    clearTimeout(this.silence);
+    this.silence = setTimeout(() => {
+      const lost = this.socket;
+      this.socket = null; // its end, whenever it comes, is no news
+      lost?.close();
+      void this.connect();
+    }, LONGEST_SILENCE_MS);
+  }
+
   private wait(): void {
+    clearTimeout(this.silence);
     this.state.value = "waiting";
     this.timer = setTimeout(() => void this.connect(), backoff(this.failures));
     this.failures += 1;

@@ -96,8 +96,12 @@ interface SceneEvent {
 
 type PictureEvent = PictureState & { readonly scene_id: string };
 
-/** The first event of each connection: what happened before it is not known. */
+/** The first event of each connection: what happened before it is not known, and the service may be another one. */
 async function takeHello(hello: Hello): Promise<void> {
+  if (version.value !== "" && version.value !== hello.version) {
+    location.reload();
+    return;
+  }
   role.value = hello.role;
   version.value = hello.version;
   await readAll();
