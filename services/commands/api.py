@@ -88,7 +88,7 @@ def serve(
     key_settings = configuration.section("keys", KeySettings)
     given["subscribe"] = _subscriptions(subscribe, node, key_settings)
     settings = configuration.section("api", ApiSettings, {k: v for k, v in given.items() if v is not None})
-    endpoints = [settings.control, *settings.subscribe] if settings.rooms is None else [settings.rooms]
+    endpoints = [settings.rooms or settings.control, *settings.subscribe]
     run_api(settings, key_settings.load(endpoints), scene)
 
 

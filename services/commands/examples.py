@@ -13,6 +13,7 @@ EXAMPLES = {
         "deltalight up --source synthetic",
         "deltalight up --source take.mcap --scene scene.json",
         "deltalight up --rooms rooms.yaml",
+        "deltalight up --rooms rooms.yaml --placer ray --ray-address auto",
     ),
     "record": ("deltalight record -o take.mcap --duration 10",),
     "replay": ("deltalight replay take.mcap",),

@@ -12,10 +12,12 @@ if TYPE_CHECKING:
     from deltalight.services.rooms.status import RoomList
 
 rooms = typer.Typer(
-    no_args_is_help=True, help="List, move, drain and start the rooms of `deltalight up --rooms`."
+    no_args_is_help=True,
+    help="List, move, drain and start the rooms of `deltalight up --rooms`, and drain its hosts.",
 )
 
 Room = Annotated[str, typer.Argument(help="Name of the room, as in the rooms file.")]
+Host = Annotated[str, typer.Argument(help="Name of a host, as `rooms list` prints it behind its slots.")]
 Directory = Annotated[str, typer.Option(help="Endpoint of the directory of rooms.")]
 HERE = endpoint(ROOMS_PORT)
 
@@ -59,6 +61,18 @@ def move(
     _print_rooms(_directory(directory, config_file).command("move", room, slot))
 
 
+@rooms.command("drain-host")
+def drain_host(host: Host, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
+    """Move the rooms of a host to other hosts, one after another; those without a slot there end and wait."""
+    _print_rooms(_directory(directory, config_file).host_command("drain-host", host))
+
+
+@rooms.command("undrain-host")
+def undrain_host(host: Host, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
+    """Let rooms start on a drained host again."""
+    _print_rooms(_directory(directory, config_file).host_command("undrain-host", host))
+
+
 def _directory(address: str, config_file: ConfigFile) -> "DirectoryClient":
     from deltalight.protocol.keys import KeySettings
     from deltalight.services.rooms.directory import DirectoryClient
@@ -81,4 +95,7 @@ def _print_rooms(found: "RoomList") -> None:
     console = Console(soft_wrap=True)
     console.print(table)
     for place in found.slots:
-        console.print(escape(f"{place.name} ({place.device}): {place.room or 'free'}"))
+        drained = ", drained" if place.drained else ""
+        console.print(
+            escape(f"{place.name} ({place.device}, host {place.host}{drained}): {place.room or 'free'}")
+        )

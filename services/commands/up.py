@@ -1,5 +1,6 @@
 """`deltalight up`: all processes of one host, supervised."""
 
+from enum import StrEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +13,13 @@ from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NO
 
 if TYPE_CHECKING:
     from deltalight.services.host import HostCommands
+
+
+class PlacerKind(StrEnum):
+    """What runs the render servers of rooms."""
+
+    LOCAL = "local"
+    RAY = "ray"
 
 
 def up(
@@ -56,6 +64,15 @@ def up(
     rooms_port: Annotated[
         int, typer.Option(min=1, max=65535, help="Port of the directory of rooms, with --rooms.")
     ] = ROOMS_PORT,
+    placer: Annotated[
+        PlacerKind, typer.Option(help="What runs the rooms: this host, or the hosts of a Ray cluster.")
+    ] = PlacerKind.LOCAL,
+    ray_address: Annotated[
+        str | None,
+        typer.Option(
+            help="Cluster to join, HOST:PORT or `auto`, with --placer ray; default: one of this host alone."
+        ),
+    ] = None,
     config_file: ConfigFile = None,
 ) -> None:
     """Run node, render server and dashboard on this machine until Ctrl-C, and restart what fails.
@@ -67,6 +84,8 @@ def up(
     from deltalight.services.host_store import open_store, scene_to_show, session_file
     from deltalight.services.supervisor import Supervisor
 
+    if ray_address is not None and placer is not PlacerKind.RAY:
+        raise DeltalightError("--ray-address names the cluster of --placer ray; give both, or neither.")
     if rooms is not None:
         if source is not None or node is not None or scene is not None or device is not None:
             raise DeltalightError(
@@ -74,8 +93,19 @@ def up(
                 " --scene and --device."
             )
         commands = HostCommands(config_file, "info", spares, allow_software)
-        _run_rooms(rooms, commands, data_folder(data, config_file), port, rooms_port)
+        on_cluster = placer is PlacerKind.RAY
+        _run_rooms(
+            rooms,
+            commands,
+            data_folder(data, config_file),
+            port=port,
+            rooms_port=rooms_port,
+            on_cluster=on_cluster,
+            ray_address=ray_address,
+        )
         return
+    if placer is PlacerKind.RAY:
+        raise DeltalightError("--placer ray runs the rooms of a rooms file; name one with --rooms.")
     if node is None:
         source = source or _configured_source(config_file)
     elif source is not None:
@@ -106,13 +136,23 @@ def up(
             supervisor.run()
 
 
-def _run_rooms(path: Path, commands: "HostCommands", data: Path, port: int, rooms_port: int) -> None:
+def _run_rooms(
+    path: Path,
+    commands: "HostCommands",
+    data: Path,
+    *,
+    port: int,
+    rooms_port: int,
+    on_cluster: bool,
+    ray_address: str | None,
+) -> None:
     from deltalight.services.rooms.host import RoomsHost
-    from deltalight.services.rooms.rooms_file import load_rooms
+    from deltalight.services.rooms.rooms_file import load_rooms, require_cluster_form, require_local_form
 
     rooms = load_rooms(path)
+    (require_cluster_form if on_cluster else require_local_form)(rooms)
     with TemporaryDirectory(prefix="deltalight-") as folder:
-        host = RoomsHost(rooms, commands, data, Path(folder), port, rooms_port)
+        host = RoomsHost(rooms, commands, data, Path(folder), port, rooms_port, on_cluster, ray_address)
         host.require_free_ports()
         typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
         host.run(lambda line: typer.echo(line, err=True))

@@ -19,6 +19,7 @@ from deltalight.services.rooms.status import RoomList
 
 ANSWER_TIMEOUT_S = 2.0
 LIST, DRAIN, START, MOVE = "rooms", "drain", "start", "move"
+DRAIN_HOST, UNDRAIN_HOST = "drain-host", "undrain-host"
 
 
 class SilentDirectoryError(DeltalightError):
@@ -45,6 +46,8 @@ class DirectoryServer:
             DRAIN: lambda: self._keeper.drain(_word(request, "room")),
             START: lambda: self._keeper.start(_word(request, "room")),
             MOVE: lambda: self._keeper.move(_word(request, "room"), _optional_word(request, "slot")),
+            DRAIN_HOST: lambda: self._keeper.drain_host(_word(request, "host")),
+            UNDRAIN_HOST: lambda: self._keeper.undrain_host(_word(request, "host")),
         }
         if request.op == CLOCK_OP:
             return clock_payload(time.time_ns())
@@ -85,6 +88,15 @@ class DirectoryClient:
             DeltalightError: it refuses.
         """
         return self._ask(op, {"room": room, **({} if slot is None else {"slot": slot})})
+
+    def host_command(self, op: str, host: str) -> RoomList:
+        """Drain a host or end that, and return all rooms after it.
+
+        Raises:
+            SilentDirectoryError: the directory does not answer.
+            DeltalightError: it refuses.
+        """
+        return self._ask(op, {"host": host})
 
     def _ask(self, op: str, payload: dict[str, object] | None = None) -> RoomList:
         request = ControlRequest(

@@ -1,7 +1,7 @@
 """What `deltalight up --rooms` runs on one host: nodes, a render server per room with a slot, the web process."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +20,8 @@ from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
 from deltalight.services.rooms.local_placer import LocalPlacer
 from deltalight.services.rooms.placer import Placement, RoomOrder
+from deltalight.services.rooms.ray_cluster import RayCluster
+from deltalight.services.rooms.ray_placer import RayPlacer, reachable_endpoint
 from deltalight.services.rooms.rooms_file import RoomEntry, RoomsFile
 from deltalight.services.rooms.status import RoomNode
 from deltalight.services.settings import load_configuration
@@ -31,7 +33,10 @@ NODE_RETRY_S = 10.0
 
 @dataclass(frozen=True)
 class RoomsHost:
-    """The rooms of a file on this host; `data` is the folder of scenes, `sessions` holds the session files."""
+    """The rooms of a file on this host; `data` is the folder of scenes, `sessions` holds the session files.
+
+    `on_cluster`: their render servers run on the Ray cluster at `ray_address`; None = one of this host alone.
+    """
 
     rooms: RoomsFile
     commands: HostCommands
@@ -39,6 +44,8 @@ class RoomsHost:
     sessions: Path
     page_port: int = ports.PAGE_PORT
     rooms_port: int = ports.ROOMS_PORT
+    on_cluster: bool = False
+    ray_address: str | None = None
 
     def require_free_ports(self) -> None:
         """Check the ports that have been chosen, before a child is started.
@@ -61,18 +68,20 @@ class RoomsHost:
         Raises:
             DeltalightError: a source, a scene, a key or a port cannot be used, or the web process keeps dying.
         """
-        endpoints = self._node_endpoints()
-        plans = self._plans(endpoints)
         with ExitStack() as stack:
-            placer = self.placer(forward)
+            cluster = self._cluster(stack)
+            address = ports.LOOPBACK if cluster is None else cluster.own_address
+            endpoints = self._node_endpoints(address)
+            plans = self._plans(endpoints)
+            placer = self._local_placer(forward) if cluster is None else self._ray_placer(cluster, forward)
             stack.callback(placer.close)
             keeper = RoomKeeper(plans, placer, forward)
             directory = DirectoryServer(self.directory, keeper, self.commands.keys([self.directory]))
             stack.callback(directory.close)
-            nodes = [NodeSupervisor(spec, forward) for spec in self._nodes()]
+            nodes = [NodeSupervisor(spec, forward) for spec in self._nodes(address)]
             for node in nodes:
                 stack.callback(node.stop)
-            supervisor = stack.enter_context(Supervisor([self._web()], forward=forward))
+            supervisor = stack.enter_context(Supervisor([self._web(endpoints.values())], forward=forward))
             while not until():
                 supervisor.poll()
                 keeper.note_nodes({node.name: node.fault for node in nodes if node.poll()})
@@ -84,8 +93,19 @@ class RoomsHost:
         """The endpoint of the directory of rooms."""
         return ports.endpoint(self.rooms_port)
 
-    def placer(self, forward: Callable[[str], None]) -> LocalPlacer:
-        """Return the placer of this host."""
+    def _cluster(self, stack: ExitStack) -> RayCluster | None:
+        if not self.on_cluster:
+            return None
+        cluster = RayCluster(self.ray_address, len(self.rooms.devices))
+        stack.callback(cluster.close)
+        return cluster
+
+    def _ray_placer(self, cluster: RayCluster, forward: Callable[[str], None]) -> RayPlacer:
+        config = None if self.commands.config is None else self.commands.config.absolute()
+        commands = replace(self.commands, config=config)
+        return RayPlacer(cluster, self._server, commands, forward=forward)
+
+    def _local_placer(self, forward: Callable[[str], None]) -> LocalPlacer:
         spare = replace(self.commands.child("spare", "server"), warm=PREPARED["server"])
         return LocalPlacer(
             self.rooms.devices,
@@ -103,26 +123,28 @@ class RoomsHost:
         spec = self.commands.server(label, order.session_file, *endpoints, device, *identity, *sources)
         return replace(spec, warm=())  # the placer has one spare for all rooms
 
-    def _nodes(self) -> list[ChildSpec]:
+    def _nodes(self, address: str) -> list[ChildSpec]:
         specs = []
         for name, node in self.rooms.nodes.items():
             if node.source is not None:
-                publish = ports.endpoint(self.node_ports[name])
+                publish = reachable_endpoint(self.commands, address, self.node_ports[name])
                 more = ("--name", name, "--loop")
                 specs.append(self.commands.node(f"node {name}", node.source, publish, self.directory, *more))
         return specs
 
-    def _web(self) -> ChildSpec:
-        return self.commands.web(self.data, self.page_port, "--rooms", self.directory)
+    def _web(self, nodes: Iterable[str]) -> ChildSpec:
+        """Return the web process; it is told where `nodes` are, so that it loads keys if one is elsewhere."""
+        sources = [word for node in nodes for word in ("--subscribe", node)]
+        return self.commands.web(self.data, self.page_port, "--rooms", self.directory, *sources)
 
-    def _node_endpoints(self) -> dict[str, str]:
+    def _node_endpoints(self, address: str) -> dict[str, str]:
         settings = load_configuration(self.commands.config).section("keys", KeySettings)
         found = {}
         for name, node in self.rooms.nodes.items():
             if node.found is not None:
                 found[name] = node_endpoint(node.found, settings)
             else:
-                found[name] = ports.endpoint(self.node_ports[name])
+                found[name] = reachable_endpoint(self.commands, address, self.node_ports[name])
         return found
 
     def _plans(self, endpoints: Mapping[str, str]) -> list[RoomPlan]:
@@ -134,7 +156,7 @@ class RoomsHost:
                 path = self.sessions / f"{name}.json"
                 write_scene(path, document)
                 nodes = tuple(RoomNode(name=node, endpoint=endpoints[node]) for node in room.nodes)
-                plans.append(RoomPlan(name, room.title, nodes, path))
+                plans.append(RoomPlan(name, room.title, nodes, path, room.labels))
         return plans
 
 

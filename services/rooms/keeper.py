@@ -7,12 +7,12 @@ that they have waited.
 import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, Placer, RoomOrder
+from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, Placer, RoomOrder, Slot
 from deltalight.services.rooms.status import (
     RoomEndpoints,
     RoomList,
@@ -27,12 +27,16 @@ MAXIMUM_FAILED_STARTS = 3  # in a row
 
 @dataclass(frozen=True)
 class RoomPlan:
-    """A room to keep; `session_file` holds its scene document, which survives a change of its render server."""
+    """A room to keep; `session_file` holds its scene document, which survives a change of its render server.
+
+    Its host has all `labels`.
+    """
 
     name: str
     title: str
     nodes: tuple[RoomNode, ...]
     session_file: Path
+    labels: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(eq=False)
@@ -66,6 +70,7 @@ class RoomKeeper:
         self._epochs = itertools.count(1)
         self._rooms = {plan.name: _Room(plan, next(self._queue)) for plan in plans}
         self._faults: Mapping[str, str] = {}  # of nodes
+        self._drained_hosts: set[str] = set()
         self._lock = threading.Lock()
 
     def poll(self) -> None:
@@ -73,6 +78,7 @@ class RoomKeeper:
         with self._lock:
             for event in self._placer.watch():
                 self._note(event)
+            self._empty_drained_hosts()
             self._place_waiting()
 
     def note_nodes(self, faults: Mapping[str, str]) -> None:
@@ -83,7 +89,7 @@ class RoomKeeper:
         """Return all rooms, in their order, and slots."""
         with self._lock:
             rooms = tuple(self._described(room) for room in self._rooms.values())
-            slots = tuple(SlotStatus(**vars(slot)) for slot in self._placer.slots())
+            slots = tuple(self._described_slot(slot) for slot in self._placer.slots())
         return RoomList(rooms=rooms, slots=slots)
 
     def drain(self, name: str) -> None:
@@ -94,10 +100,8 @@ class RoomKeeper:
         """
         with self._lock:
             room = self._room(name)
-            for placement in (room.placement, room.successor):
-                if placement is not None:
-                    self._placer.release(placement)
-            room.successor, room.drained = None, True
+            self._release(room)
+            room.drained = True
             room.wait(f"It was drained; `deltalight rooms start {name}` starts it again.")
             self._notice(f"room {name}: drained.")
 
@@ -129,6 +133,35 @@ class RoomKeeper:
             room.successor = self._placer.place(self._order(room), slot)
             self._notice(f"room {name}: moves from {room.placement.slot} to {room.successor.slot}.")
 
+    def drain_host(self, host: str) -> None:
+        """Move the rooms of a host elsewhere, one after another, and place none there until `undrain_host`.
+
+        A room for which there is no other slot ends and waits.
+
+        Raises:
+            DeltalightError: there is no such host.
+        """
+        with self._lock:
+            hosts = dict.fromkeys(slot.host for slot in self._placer.slots())
+            if host not in hosts:
+                hint = nearest(host, hosts) or ", ".join(hosts) or "none"
+                raise DeltalightError(f"there is no host {host[:80]} with a slot; did you mean {hint}?")
+            self._drained_hosts.add(host)
+            self._notice(f"host {host}: drained.")
+
+    def undrain_host(self, host: str) -> None:
+        """Let rooms start on a host again.
+
+        Raises:
+            DeltalightError: it is not drained.
+        """
+        with self._lock:
+            if host not in self._drained_hosts:
+                known = ", ".join(sorted(self._drained_hosts)) or "none is"
+                raise DeltalightError(f"the host {host[:80]} is not drained ({known}).")
+            self._drained_hosts.remove(host)
+            self._notice(f"host {host}: takes rooms again.")
+
     def _room(self, name: str) -> _Room:
         if name not in self._rooms:
             hint = nearest(name, self._rooms) or ", ".join(self._rooms)
@@ -137,7 +170,14 @@ class RoomKeeper:
 
     def _order(self, room: _Room) -> RoomOrder:
         sources = tuple(node.endpoint for node in room.plan.nodes)
-        return RoomOrder(room.plan.name, next(self._epochs), sources, room.plan.session_file)
+        plan, avoid = room.plan, frozenset(self._drained_hosts)
+        return RoomOrder(plan.name, next(self._epochs), sources, plan.session_file, plan.labels, avoid)
+
+    def _release(self, room: _Room) -> None:
+        for placement in (room.placement, room.successor):
+            if placement is not None:
+                self._placer.release(placement)
+        room.successor = None
 
     def _note(self, event: PlacementEvent) -> None:
         for room in self._rooms.values():
@@ -183,6 +223,35 @@ class RoomKeeper:
             self._hear(room, event)
             self._placer.release(before)
 
+    def _empty_drained_hosts(self) -> None:
+        """Move the rooms of drained hosts, a single one at a time."""
+        if not self._drained_hosts:
+            return
+        of_slot = {slot.name: slot.host for slot in self._placer.slots()}
+        for room in self._rooms.values():
+            if room.successor is not None and of_slot.get(room.successor.slot) in self._drained_hosts:
+                self._placer.release(room.successor)
+                room.successor = None
+        if any(room.successor is not None for room in self._rooms.values()):
+            return
+        for room in self._rooms.values():
+            host = None if room.placement is None else of_slot.get(room.placement.slot)
+            if host is not None and host in self._drained_hosts:
+                self._leave(room, host)
+                return
+
+    def _leave(self, room: _Room, host: str) -> None:
+        """Start a room's next render server on another host; without a slot there, it ends and waits."""
+        assert room.placement is not None
+        try:
+            room.successor = self._placer.place(self._order(room))
+        except NoSlotError:
+            self._release(room)
+            room.wait(f"Its host {host} is drained.")
+            room.queued = min(each.queued for each in self._rooms.values()) - 1
+        where = "waits" if room.successor is None else f"moves to {room.successor.slot}"
+        self._notice(f"room {room.plan.name}: leaves {host} and {where}.")
+
     def _place_waiting(self) -> None:
         waiting = [room for room in self._rooms.values() if room.state == "waiting" and not room.drained]
         for room in sorted(waiting, key=lambda each: each.queued):
@@ -193,6 +262,15 @@ class RoomKeeper:
             else:
                 room.run_as(placement)
                 self._notice(f"room {room.plan.name}: starts in {placement.slot}.")
+
+    def _described_slot(self, slot: Slot) -> SlotStatus:
+        return SlotStatus(
+            name=slot.name,
+            device=slot.device,
+            room=slot.room,
+            host=slot.host,
+            drained=slot.host in self._drained_hosts,
+        )
 
     def _described(self, room: _Room) -> RoomStatus:
         placement = room.placement

@@ -4,34 +4,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
 
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import StatsMessage
 from deltalight.services import ports
-from deltalight.services.child import SPARE_AFTER_S, STOP_TIMEOUT_S, Child, ChildSpec, end_all, open_spare
-from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, RoomOrder, Slot
-from deltalight.services.supervisor import WRONG_INPUT_EXIT_CODE
+from deltalight.services.child import SPARE_AFTER_S, ChildSpec, end_all, open_spare
+from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
+from deltalight.services.rooms.render_process import RenderProcess
 from deltalight.services.warm_spare import use_spare
-from deltalight.services.watchdog import Watchdog
 
 # The command line of a placement's render server on a device (None = the driver's first).
 Command = Callable[[RoomOrder, Placement, int | None], ChildSpec]
-
-
-@dataclass
-class _Placed:
-    placement: Placement
-    child: Child
-    watchdog: Watchdog | None = None
-    reported: StatsMessage | None = None
-    ends_s: float | None = None  # it was told to end, and is killed then
-
-    @property
-    def process(self) -> subprocess.Popen[str]:
-        assert self.child.process is not None
-        return self.child.process
 
 
 class LocalPlacer:
@@ -56,7 +38,7 @@ class LocalPlacer:
         self._spare: subprocess.Popen[str] | None = None
         self._spare_due_s = 0.0
         self._forward = forward
-        self._placed: dict[str, _Placed] = {}  # by slot
+        self._placed: dict[str, RenderProcess] = {}  # by slot
         self._used_ports: set[int] = set()
 
     def slots(self) -> list[Slot]:
@@ -68,26 +50,23 @@ class LocalPlacer:
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
         """Start the render server of a room (`Placer.place`)."""
-        chosen = self._free_slot(slot)
+        chosen = choose_slot(self.slots(), order, slot).name
         publish, control = self._fresh_ports()
         placement = Placement(
             order.room, order.epoch, chosen, ports.endpoint(publish), ports.endpoint(control)
         )
-        placed = _Placed(
-            placement, Child(self._command(order, placement, self._devices[chosen]), self._forward)
+        spec = self._command(order, placement, self._devices[chosen])
+        self._placed[chosen] = RenderProcess(
+            placement, spec, self._keys, self._forward, self._take_spare(spec)
         )
-        placed.child.spec = replace(placed.child.spec, watch=partial(self._watched, placed))
-        placed.child.start(self._take_spare(placed.child.spec))
-        self._placed[chosen] = placed
         self._spare_due_s = time.monotonic() + SPARE_AFTER_S
         return placement
 
     def release(self, placement: Placement) -> None:
         """End a render server; its slot is free once it is gone."""
         placed = self._placed.get(placement.slot)
-        if placed is not None and placed.placement == placement and placed.ends_s is None:
-            placed.ends_s = time.monotonic() + STOP_TIMEOUT_S
-            placed.process.terminate()
+        if placed is not None and placed.placement == placement:
+            placed.end()
 
     def watch(self) -> list[PlacementEvent]:
         """Return what happened since the last call; start a spare if it is time."""
@@ -109,25 +88,12 @@ class LocalPlacer:
         processes = [placed.process for placed in self._placed.values()]
         end_all([*processes, *([] if self._spare is None else [self._spare])])
         for placed in self._placed.values():
-            placed.child.end_watching()
-            placed.child.end_reading()
+            placed.close()
         self._placed, self._spare = {}, None
 
     def _room_in(self, slot: str) -> str | None:
         placed = self._placed.get(slot)
         return None if placed is None else placed.placement.room
-
-    def _free_slot(self, wanted: str | None) -> str:
-        free = [name for name in self._devices if name not in self._placed]
-        if wanted is None:
-            if not free:
-                raise NoSlotError(f"all {len(self._devices)} slots are in use; free one or add slots.")
-            return free[0]
-        if wanted not in self._devices:
-            raise NoSlotError(f"there is no slot {wanted}; the slots are {', '.join(self._devices)}.")
-        if wanted not in free:
-            raise NoSlotError(f"{wanted} is in use by {self._room_in(wanted)}; choose a free one.")
-        return wanted
 
     def _fresh_ports(self) -> list[int]:
         """Choose ports that no placement has had, so that who still talks to a lost one reaches nobody else."""
@@ -137,38 +103,12 @@ class LocalPlacer:
                 self._used_ports.update(found)
                 return found
 
-    def _watched(self, placed: _Placed, process_id: int) -> Watchdog:
-        """Watch a process; its reports tell how the room is doing."""
-        endpoints = placed.placement.publish, placed.placement.control
-        placed.watchdog = Watchdog(process_id, *endpoints, self._keys)
-        return placed.watchdog
-
     def _look_at(self, slot: str) -> list[PlacementEvent]:
         placed = self._placed[slot]
-        placed.child.end_if_hanging()
-        if placed.ends_s is not None and time.monotonic() >= placed.ends_s:
-            placed.process.kill()
-        code = placed.process.poll()
-        if code is not None:
-            return self._ended(slot, placed, code)
-        newest = None if placed.watchdog is None else placed.watchdog.newest
-        if placed.ends_s is not None or newest is None or newest is placed.reported:
-            return []
-        placed.reported = newest
-        shows = newest.state in ("running", "degraded")
-        return [PlacementEvent(placed.placement.epoch, "reported", newest.detail, shows)]
-
-    def _ended(self, slot: str, placed: _Placed, code: int) -> list[PlacementEvent]:
-        del self._placed[slot]
-        placed.child.end_watching()
-        if placed.ends_s is not None:
-            return []
-        said = placed.child.last_sentence()
-        refused = code == WRONG_INPUT_EXIT_CODE
-        detail = (
-            said if refused else f"Its render server died with exit code {code}; its last line was: {said}"
-        )
-        return [PlacementEvent(placed.placement.epoch, "lost", detail, refused=refused)]
+        found = placed.news()
+        if placed.is_gone:
+            del self._placed[slot]
+        return found
 
     def _take_spare(self, spec: ChildSpec) -> subprocess.Popen[str] | None:
         spare, self._spare = self._spare, None

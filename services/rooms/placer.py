@@ -4,12 +4,15 @@ A placer starts the render server of a room in a free slot and says what becomes
 is placed when, and what follows a loss, is the keeper's (`keeper.RoomKeeper`).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
 from deltalight.protocol.errors import DeltalightError
+
+HERE = "local"  # the host of placers that know one
 
 
 class NoSlotError(DeltalightError):
@@ -21,12 +24,15 @@ class RoomOrder:
     """What a render server needs to know: its room, whose frames it reads, and the file that keeps the scene.
 
     `epoch` counts the placements of all rooms: endpoints of a newer one replace those of an older one of the room.
+    Its host has all `labels`, and is none of those to `avoid`, which are drained.
     """
 
     room: str
     epoch: int
     sources: tuple[str, ...]
     session_file: Path
+    labels: Mapping[str, str] = field(default_factory=dict)
+    avoid: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -42,11 +48,13 @@ class Placement:
 
 @dataclass(frozen=True)
 class Slot:
-    """Room for one render server: on which device, and who is in it (the room's name, None = free)."""
+    """Room for one render server: on which device of which host, and who is in it (the room's name, None = free)."""
 
     name: str
     device: str
     room: str | None
+    host: str = HERE
+    labels: Mapping[str, str] = field(default_factory=dict)  # of the host
 
 
 @dataclass(frozen=True)
@@ -86,3 +94,47 @@ class Placer(Protocol):
 
     def close(self) -> None:
         """End all render servers."""
+
+
+def choose_slot(slots: Sequence[Slot], order: RoomOrder, wanted: str | None = None) -> Slot:
+    """Return the slot that is wanted, or a free one of the host that has most of them.
+
+    Raises:
+        NoSlotError: there is none; says why.
+    """
+    if wanted is not None:
+        return _wanted_slot(slots, order, wanted)
+    fitting = [slot for slot in slots if order.labels.items() <= slot.labels.items()]
+    usable = [slot for slot in fitting if slot.host not in order.avoid]
+    free = [slot for slot in usable if slot.room is None]
+    if not free:
+        raise NoSlotError(_why_none(order, fitting, usable))
+    of_host = Counter(slot.host for slot in free)
+    return max(free, key=lambda slot: of_host[slot.host])
+
+
+def _wanted_slot(slots: Sequence[Slot], order: RoomOrder, wanted: str) -> Slot:
+    named = {slot.name: slot for slot in slots}
+    if wanted not in named:
+        raise NoSlotError(f"there is no slot {wanted}; the slots are {', '.join(named) or 'none'}.")
+    slot = named[wanted]
+    if slot.room is not None:
+        raise NoSlotError(f"{wanted} is in use by {slot.room}; choose a free one.")
+    if slot.host in order.avoid:
+        raise NoSlotError(f"the host of {wanted} is drained; choose a slot of another.")
+    if not order.labels.items() <= slot.labels.items():
+        raise NoSlotError(f"the host of {wanted} lacks {_written(order.labels)}; choose a slot of another.")
+    return slot
+
+
+def _why_none(order: RoomOrder, fitting: Sequence[Slot], usable: Sequence[Slot]) -> str:
+    where = f" with {_written(order.labels)}" if order.labels else ""
+    if not fitting:
+        return f"no host{where} offers a slot; start one."
+    if not usable:
+        return f"the hosts{where} are drained; end that for one of them, or add slots."
+    return f"all {len(usable)} slots{where} are in use; free one or add slots."
+
+
+def _written(labels: Mapping[str, str]) -> str:
+    return ", ".join(f"{key}={value}" for key, value in labels.items())

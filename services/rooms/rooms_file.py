@@ -49,6 +49,9 @@ class RoomEntry(StrictModel):
         description="Scene document to import and show; null = the last one shown, else the recording's.",
     )
     title: str = Field(default="", max_length=200, description="For people; empty = its name.")
+    labels: dict[str, str] = Field(
+        default={}, description="Labels that its host on a cluster must have, such as the camera's network."
+    )
 
 
 class RoomsFile(StrictModel):
@@ -93,6 +96,31 @@ def load_rooms(path: Path) -> RoomsFile:
     nodes = {name: _placed(node, folder) for name, node in rooms.nodes.items()}
     entries = {name: _with_scene(name, room, folder) for name, room in rooms.rooms.items()}
     return rooms.replaced(nodes=nodes, rooms=entries)
+
+
+def require_cluster_form(rooms: RoomsFile) -> None:
+    """Check a file whose rooms run on a cluster.
+
+    Raises:
+        DeltalightError: it names devices, which hosts of a cluster choose themselves.
+    """
+    if not isinstance(rooms.slots, int):
+        raise DeltalightError(
+            "hosts of a cluster choose the EGL devices of their slots themselves; give `slots` as a number."
+        )
+
+
+def require_local_form(rooms: RoomsFile) -> None:
+    """Check a file whose rooms run on this host.
+
+    Raises:
+        DeltalightError: a room asks for labels, which only hosts of a cluster have.
+    """
+    labelled = next((name for name, room in rooms.rooms.items() if room.labels), None)
+    if labelled is not None:
+        raise DeltalightError(
+            f"the room {labelled} asks for labels, which hosts of a cluster have: add --placer ray."
+        )
 
 
 def _placed(node: NodeEntry, folder: Path) -> NodeEntry:

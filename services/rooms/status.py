@@ -47,6 +47,8 @@ class SlotStatus(StrictModel):
     name: str
     device: str = Field(description="On which it renders.")
     room: str | None = Field(description="Which room is in it; null = free.")
+    host: str = Field(description="Whose device it is.")
+    drained: bool = Field(False, description="Whether its host is drained, so that no room starts in it.")
 
 
 class RoomList(StrictModel):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from deltalight.services import ports
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
-from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, RoomOrder, Slot
+from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
 from deltalight.services.rooms.status import RoomNode
 from tests.services.render_server_samples import Recorder
 
@@ -19,7 +19,10 @@ def plans(folder: Path, *names: str) -> list[RoomPlan]:
 
 @dataclass
 class StandInPlacer:
-    """Places nothing, or (with `answers`) control sockets that answer as a render server of the epoch does."""
+    """Places nothing in slots whose names begin with their host's.
+
+    With `answers`, control sockets answer as a render server of the epoch does.
+    """
 
     slot_names: Sequence[str] = ("slot-1", "slot-2")
     answers: bool = False
@@ -30,14 +33,11 @@ class StandInPlacer:
 
     def slots(self) -> list[Slot]:
         rooms = {name: placement.room for name, placement in self.placed.items()}
-        return [Slot(name, "default", rooms.get(name)) for name in self.slot_names]
+        return [Slot(name, "default", rooms.get(name), name.partition("/")[0]) for name in self.slot_names]
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
-        free = [name for name in self.slot_names if name not in self.placed]
-        if not free or slot not in (None, *free):
-            raise NoSlotError("no slot is free.")
+        chosen = choose_slot(self.slots(), order, slot).name
         publish, control = ports.private_ports(2)
-        chosen = slot or free[0]
         if self.answers:
             self.servers[order.epoch] = Recorder(control, epoch=order.epoch)
         placement = Placement(

@@ -71,7 +71,7 @@ def test_rooms_are_listed_with_scene_method_and_why_they_wait(house: House) -> N
     hall, attic = answer["rooms"][0], house.get("/rooms/attic")
     assert (hall["title"], hall["nodes"], hall["slot"]) == ("The hall", ["desk"], "slot-1")
     assert (hall["scene"]["name"], hall["scene"]["method"]) == ("The hall", "dvct")
-    assert "no slot is free" in attic["why"]
+    assert "all 2 slots are in use" in attic["why"]
     assert [slot["room"] for slot in answer["slots"]] == ["hall", "door"]
     assert answer["can_move"]
 
@@ -160,7 +160,7 @@ def test_drain_start_and_move_by_rest(house: House) -> None:
     house.keeper.poll()
     wait_for(lambda: house.get("/rooms/attic")["state"] == "starting")
     full = client.post("/rooms/door/move", json={"slot": "slot-1"})
-    assert "no slot is free" in sentence(full, 409)
+    assert "slot-1 is in use by attic" in sentence(full, 409)
     client.post("/rooms/attic/drain").raise_for_status()
     moving = client.post("/rooms/door/move", json={"slot": "slot-1"}).json()
     assert (moving["slot"], moving["moving_to"]) == ("slot-2", "slot-1")

@@ -31,6 +31,8 @@ COMMANDS = {
     "rooms drain",
     "rooms start",
     "rooms move",
+    "rooms drain-host",
+    "rooms undrain-host",
     "recordings info",
     "recordings recover",
     "recordings import",
@@ -241,6 +243,13 @@ def test_keys_allow_limits_what_a_trusted_machine_may_send(cli: RunCli, tmp_path
     }
     assert cli("keys", "allow", "desk", "--everything", *here).returncode == 0
     assert "may send only" not in cli("keys", "list", *here).stdout
+
+
+def test_the_web_process_of_rooms_needs_keys_for_nodes_of_other_hosts(cli: RunCli, tmp_path: Path) -> None:
+    directory, node = "tcp://127.0.0.1:1", "tcp://10.0.0.5:5601"
+    refused = cli("api", "--data", tmp_path / "data", "--rooms", directory, "--subscribe", node)
+    assert refused.returncode == 2
+    assert f"{node} needs keys" in " ".join(refused.stderr.split())
 
 
 def test_live_processes_have_one_thread_of_blas(monkeypatch: pytest.MonkeyPatch) -> None:

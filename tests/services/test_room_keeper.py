@@ -42,7 +42,7 @@ def test_a_room_without_a_slot_waits_and_says_so_until_one_is_free(
     assert states(keeper) == ["starting", "starting", "waiting"]
     running(keeper, placer, "hall", "door")
     assert states(keeper) == ["running", "running", "waiting"]
-    assert "no slot is free" in rooms(keeper)["attic"].why
+    assert "all 2 slots are in use" in rooms(keeper)["attic"].why
     assert [slot.room for slot in keeper.status().slots] == ["hall", "door"]
     keeper.drain("hall")
     keeper.poll()
@@ -143,7 +143,7 @@ def test_what_cannot_be_done_is_one_sentence(keeper: RoomKeeper, placer: StandIn
     with pytest.raises(DeltalightError, match="the room attic is waiting; move it when it runs"):
         keeper.move("attic")
     running(keeper, placer, "hall", "door")
-    with pytest.raises(DeltalightError, match="no slot is free"):
+    with pytest.raises(DeltalightError, match="all 2 slots are in use"):
         keeper.move("hall")
     assert states(keeper) == ["running", "running", "waiting"]
 
@@ -154,3 +154,44 @@ def test_a_room_says_which_node_is_away(keeper: RoomKeeper, placer: StandInPlace
     keeper.note_nodes({"desk": "The camera is gone; plug it in."})
     keeper.poll()
     assert rooms(keeper)["hall"].why == "No frames come from desk. desk: The camera is gone; plug it in."
+
+
+def test_a_drained_host_is_emptied_one_room_at_a_time_and_what_has_no_slot_waits(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    placer.slot_names = ("east/1", "east/2", "west/1")
+    keeper.drain("attic")
+    running(keeper, placer, "hall", "door")
+    keeper.drain_host("east")
+    keeper.poll()
+    moving = [(room.moving_to, room.state) for room in keeper.status().rooms]
+    assert moving[:2] == [("west/1", "running"), (None, "running")]
+    placer.report("hall", slot="west/1")
+    keeper.poll()
+    keeper.poll()
+    hall, door = rooms(keeper)["hall"], rooms(keeper)["door"]
+    assert (hall.slot, hall.restarts, door.state) == ("west/1", 0, "waiting")
+    assert "all 1 slots are in use" in door.why
+    assert [slot.drained for slot in keeper.status().slots] == [True, True, False]
+    keeper.undrain_host("east")
+    keeper.poll()
+    assert rooms(keeper)["door"].slot == "east/1"
+
+
+def test_a_room_does_not_move_to_a_host_that_is_drained_meanwhile(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    placer.slot_names = ("east/1", "west/1")
+    keeper.drain("door")
+    keeper.drain("attic")
+    running(keeper, placer, "hall")
+    keeper.move("hall", "west/1")
+    keeper.drain_host("west")
+    keeper.poll()
+    assert (rooms(keeper)["hall"].slot, rooms(keeper)["hall"].moving_to) == ("east/1", None)
+    with pytest.raises(DeltalightError, match="there is no host wset with a slot; did you mean west"):
+        keeper.drain_host("wset")
+    with pytest.raises(DeltalightError, match="the host east is not drained"):
+        keeper.undrain_host("east")
+    with pytest.raises(DeltalightError, match="the host of west/1 is drained"):
+        keeper.move("hall", "west/1")

@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.ports import private_ports
 from deltalight.services.rooms.rooms_file import RoomsFile, load_rooms
+from tests.services.conftest import RunCli
 
 GOOD = """
 slots: [0, null]
@@ -81,3 +83,30 @@ def test_doubled_keys_of_json_are_refused_too(tmp_path: Path) -> None:
     )
     with pytest.raises(DeltalightError, match="`h` comes twice"):
         load_rooms(path)
+
+
+ROOM = "nodes: {a: {source: synthetic}}\nrooms: {hall: {nodes: [a]%s}}\n%s"
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "sentence"),
+    [
+        (ROOM % ("", "slots: [0, 1]"), ("--placer", "ray"), "give `slots` as a number"),
+        (ROOM % (", labels: {network: east}", ""), (), "the room hall asks for labels"),
+        (ROOM % ("", ""), ("--ray-address", "auto"), "--ray-address names the cluster of --placer ray"),
+        (None, ("--placer", "ray"), "--placer ray runs the rooms of a rooms file"),
+        (None, ("--source", "synthetic", "--ray-address", "auto"), "--ray-address names the cluster"),
+        (ROOM % ("", ""), ("--placer", "ray", "--ray-address", "127.0.0.1:1"), "nobody answers"),
+        (ROOM % ("", ""), ("--placer", "ray", "--ray-address", "here"), "nobody answers"),
+    ],
+)
+def test_up_refuses_what_placers_cannot_do(
+    cli: RunCli, tmp_path: Path, text: str | None, options: tuple[str, ...], sentence: str
+) -> None:
+    rooms = () if text is None else ("--rooms", str(tmp_path / "rooms.yaml"))
+    (tmp_path / "rooms.yaml").write_text(text or "")
+    page_port, rooms_port = map(str, private_ports(2))
+    more = ("--port", page_port, "--rooms-port", rooms_port, "--data", str(tmp_path / "data"))
+    refused = cli("up", *rooms, *options, *more)
+    assert refused.returncode == 2
+    assert sentence in " ".join(refused.stderr.split())

@@ -3664,6 +3664,17 @@ export interface components {
              * @description On which it renders.
              */
             readonly device: string;
+            /**
+             * Drained
+             * @description Whether its host is drained, so that no room starts in it.
+             * @default false
+             */
+            readonly drained: boolean;
+            /**
+             * Host
+             * @description Whose device it is.
+             */
+            readonly host: string;
             /** Name */
             readonly name: string;
             /**

@@ -33,7 +33,7 @@ export function openRoom(name: string): void {
 
 /** Slots that a room could move to. */
 export function freeSlots(): readonly string[] {
-  return (rooms.value?.slots ?? []).filter((slot) => slot.room == null).map((slot) => slot.name);
+  return (rooms.value?.slots ?? []).filter((slot) => slot.room == null && !slot.drained).map((slot) => slot.name);
 }
 
 export const drainRoom = ({ name }: RoomAnswer): Promise<void> => order(name, "drain");

@@ -1,0 +1,181 @@
+"""Places rooms on the hosts of a Ray cluster: each is a detached actor, which holds a slot and its render server."""
+
+import random
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from deltalight.services import ports
+from deltalight.services.host import HostCommands
+from deltalight.services.rooms.local_placer import Command
+from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
+from deltalight.services.rooms.ray_cluster import SLOT_RESOURCE, ClusterHost, RayCluster
+from deltalight.services.rooms.render_actor import END_TIMEOUT_S, SESSION, News, RenderActor, RenderTask
+
+START_TIMEOUT_S = 60.0  # until an actor answers for the first time
+CALLS_AT_ONCE = 3  # of an actor: news, end and process_id
+
+
+@dataclass
+class _Placed:
+    placement: Placement
+    host: ClusterHost
+    actor: Any
+    news: Any  # the answer that is awaited
+    late_s: float | None  # when an actor that has not answered yet is given up
+    ending: Any = None  # the answer of `end`
+
+
+class RayPlacer:
+    """Places each render server by an actor on a host of the cluster (a `Placer`), in a slot that the host offers.
+
+    A slot is a whole `render_slot`, never a part of a GPU: the actor chooses the EGL device itself. With `commands`
+    the actor finds the keys of its host; all hosts of a fleet have the same.
+    """
+
+    def __init__(
+        self,
+        cluster: RayCluster,
+        command: Command,
+        commands: HostCommands,
+        *,
+        forward: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
+    ) -> None:
+        self._cluster = cluster
+        self._command = command
+        self._commands = commands
+        self._forward = forward
+        self._placed: dict[str, _Placed] = {}  # by slot
+        self._used: set[tuple[str, int]] = set()  # addresses and ports
+
+    def slots(self) -> list[Slot]:
+        """Return the slots of all hosts that live."""
+        return [slot for host in self._cluster.hosts() for slot in self._slots_of(host)]
+
+    def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
+        """Start the render server of a room (`Placer.place`)."""
+        hosts = self._cluster.hosts()
+        chosen = choose_slot([each for host in hosts for each in self._slots_of(host)], order, slot)
+        host = next(host for host in hosts if host.name == chosen.host)
+        placement = Placement(
+            order.room, order.epoch, chosen.name, self._fresh_endpoint(host), self._fresh_endpoint(host)
+        )
+        spec = self._command(replace(order, session_file=SESSION), placement, None)
+        rank = int(chosen.name.rpartition("/")[2]) - 1
+        task = RenderTask(placement, spec, _text(order), self._commands, rank)
+        actor = self._actor_class(host, f"{order.room}-{order.epoch}").remote(task)
+        late_s = time.monotonic() + START_TIMEOUT_S
+        self._placed[chosen.name] = _Placed(placement, host, actor, actor.news.remote(), late_s)
+        return placement
+
+    def release(self, placement: Placement) -> None:
+        """End a render server; its slot is free once it is gone."""
+        placed = self._placed.get(placement.slot)
+        if placed is not None and placed.placement == placement and placed.ending is None:
+            placed.ending = placed.actor.end.remote()
+            placed.late_s = time.monotonic() + END_TIMEOUT_S
+
+    def watch(self) -> list[PlacementEvent]:
+        """Return what happened since the last call."""
+        ray = self._cluster.ray
+        awaited = [placed.ending or placed.news for placed in self._placed.values()]
+        if not awaited:
+            return []
+        ready = set(ray.wait(awaited, num_returns=len(awaited), timeout=0)[0])
+        return [event for slot in list(self._placed) for event in self._look_at(slot, ready)]
+
+    def process_ids(self) -> dict[str, int]:
+        """Return the process id, on its host, of the render server in each slot that has one."""
+        ray = self._cluster.ray
+        return {slot: ray.get(placed.actor.process_id.remote()) for slot, placed in self._placed.items()}
+
+    def close(self) -> None:
+        """End all render servers; the cluster stays."""
+        for placed in list(self._placed.values()):
+            self.release(placed.placement)
+        endings = [placed.ending for placed in self._placed.values()]
+        if endings:
+            self._cluster.ray.wait(endings, num_returns=len(endings), timeout=END_TIMEOUT_S)
+        for slot in list(self._placed):
+            self._forget(slot)
+
+    def _slots_of(self, host: ClusterHost) -> list[Slot]:
+        names = [f"{host.name}/{number}" for number in range(1, host.slots + 1)]
+        return [Slot(name, "chosen there", self._room_in(name), host.name, host.labels) for name in names]
+
+    def _room_in(self, slot: str) -> str | None:
+        placed = self._placed.get(slot)
+        return None if placed is None else placed.placement.room
+
+    def _actor_class(self, host: ClusterHost, name: str) -> Any:  # noqa: ANN401 (Ray's)
+        ray = self._cluster.ray
+        there = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(host.node_id, soft=False)
+        return ray.remote(RenderActor).options(
+            name=name,
+            lifetime="detached",
+            num_cpus=0,
+            resources={SLOT_RESOURCE: 1},
+            max_restarts=0,  # who runs where is the keeper's: a new placement has a new epoch
+            max_concurrency=CALLS_AT_ONCE,
+            scheduling_strategy=there,
+        )
+
+    def _fresh_endpoint(self, host: ClusterHost) -> str:
+        """Choose a port that no placement on the host has had; its actor sees whether it is free there."""
+        while (found := (host.address, random.choice(ports.PRIVATE_PORTS))) in self._used:
+            pass
+        self._used.add(found)
+        return reachable_endpoint(self._commands, *found)
+
+    def _look_at(self, slot: str, ready: set[Any]) -> list[PlacementEvent]:
+        placed = self._placed[slot]
+        is_late = placed.late_s is not None and time.monotonic() >= placed.late_s
+        if placed.ending is not None:
+            if placed.ending in ready or is_late:
+                self._forget(slot)
+            return []
+        if placed.news not in ready:
+            return self._lost(slot, f"Its host {placed.host.name} does not start it.") if is_late else []
+        return self._hear(slot)
+
+    def _hear(self, slot: str) -> list[PlacementEvent]:
+        placed, ray = self._placed[slot], self._cluster.ray
+        try:
+            news: News = ray.get(placed.news)
+        except ray.exceptions.RayError as fault:
+            lives = placed.host.node_id in {host.node_id for host in self._cluster.hosts()}
+            what = f"its actor there ended ({type(fault).__name__})" if lives else "that is gone"
+            return self._lost(slot, f"It ran on {placed.host.name}, and {what}.")
+        for line in news.lines:
+            self._forward(line)
+        if any(event.kind == "lost" for event in news.events):
+            self._forget(slot)
+        else:
+            placed.news, placed.late_s = placed.actor.news.remote(), None
+        return list(news.events)
+
+    def _lost(self, slot: str, why: str) -> list[PlacementEvent]:
+        epoch = self._placed[slot].placement.epoch
+        self._forget(slot)
+        return [PlacementEvent(epoch, "lost", why)]
+
+    def _forget(self, slot: str) -> None:
+        """End the actor, which takes its render server with it, and free its slot."""
+        self._cluster.ray.kill(self._placed.pop(slot).actor)
+
+
+def reachable_endpoint(commands: HostCommands, address: str, port: int) -> str:
+    """Return the endpoint of a port, with the name of the key that the fleet's hosts share where it leaves the host.
+
+    Raises:
+        DeltalightError: it leaves the host, and there is no key.
+    """
+    endpoint = f"tcp://{address}:{port}"
+    keys = commands.keys([endpoint])
+    return endpoint if keys is None else f"tcp://{keys.name}@{address}:{port}"
+
+
+def _text(order: RoomOrder) -> str:
+    return order.session_file.read_text() if order.session_file.exists() else ""

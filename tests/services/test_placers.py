@@ -1,0 +1,188 @@
+"""What every placer promises, kept with real processes, by Ray's too: slots, losses, endpoints, no orphans."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import psutil
+import pytest
+
+from deltalight.services.child import ChildSpec
+from deltalight.services.host import HostCommands
+from deltalight.services.rooms.local_placer import Command, LocalPlacer
+from deltalight.services.rooms.placer import (
+    NoSlotError,
+    Placement,
+    PlacementEvent,
+    RoomOrder,
+    Slot,
+    choose_slot,
+)
+from deltalight.services.rooms.ray_cluster import RayCluster
+from deltalight.services.rooms.ray_placer import RayPlacer
+
+# Reports as a render server does, until it is ended.
+REPORTING = """
+import sys, time
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.messages import StatsMessage
+from deltalight.protocol.publisher import Publisher
+publisher = Publisher(sys.argv[1])
+while True:
+    publisher.send(encode(StatsMessage(node="room", capture_ns=time.time_ns(), state="running", detail="fine")))
+    time.sleep(0.05)
+"""
+REFUSING = "import sys; print('deltalight: The scene is wrong; mend it.', file=sys.stderr); sys.exit(2)"
+PATIENCE_S = 20.0
+
+
+KINDS = (
+    "local",
+    pytest.param(
+        "ray",
+        marks=[
+            pytest.mark.slow,
+            pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
+        ],
+    ),
+)
+AnyPlacer = LocalPlacer | RayPlacer
+Make = Callable[[Command], AnyPlacer]
+
+
+def reporting(order: RoomOrder, placement: Placement, device: int | None) -> ChildSpec:
+    del device
+    return ChildSpec(f"room {order.room}", ("-c", REPORTING, placement.publish))
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def cluster(request: pytest.FixtureRequest) -> Iterator[RayCluster | None]:
+    """Ray with two slots, for the tests of its placer."""
+    found = RayCluster(None, 2) if request.param == "ray" else None
+    yield found
+    if found is not None:
+        found.close()
+
+
+@pytest.fixture
+def make(cluster: RayCluster | None) -> Iterator[Make]:
+    made: list[AnyPlacer] = []
+
+    def make_placer(command: Command) -> AnyPlacer:
+        placer: AnyPlacer
+        if cluster is None:
+            placer = LocalPlacer((None, 3), command, forward=lambda _line: None)
+        else:
+            placer = RayPlacer(cluster, command, HostCommands(), forward=lambda _line: None)
+        made.append(placer)
+        return placer
+
+    yield make_placer
+    for placer in made:
+        placer.close()
+
+
+@pytest.fixture
+def placer(make: Make) -> AnyPlacer:
+    return make(reporting)
+
+
+def order(room: str, epoch: int) -> RoomOrder:
+    return RoomOrder(room, epoch, (), Path("unused.json"))
+
+
+def until(placer: AnyPlacer, wanted: Callable[[PlacementEvent], bool]) -> PlacementEvent:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline_s:
+        for event in placer.watch():
+            if wanted(event):
+                return event
+        time.sleep(0.02)
+    pytest.fail("it never came")
+
+
+def first_slot(placer: AnyPlacer) -> str:
+    return placer.slots()[0].name
+
+
+def rooms_in(placer: AnyPlacer) -> list[str | None]:
+    return [slot.room for slot in placer.slots()]
+
+
+def test_rooms_take_slots_report_and_are_lost_by_name(placer: AnyPlacer) -> None:
+    first, second = placer.place(order("hall", 1)), placer.place(order("door", 2))
+    assert rooms_in(placer) == ["hall", "door"]
+    if isinstance(placer, LocalPlacer):
+        assert [slot.device for slot in placer.slots()] == ["default", "EGL 3"]
+    with pytest.raises(NoSlotError, match="all 2 slots are in use"):
+        placer.place(order("attic", 3))
+    assert until(placer, lambda event: event.epoch == 2).shows
+    os.kill(placer.process_ids()[first_slot(placer)], signal.SIGKILL)
+    lost = until(placer, lambda event: event.kind == "lost")
+    assert (lost.epoch, lost.refused) == (first.epoch, False)
+    assert "exit code -9" in lost.detail
+    assert rooms_in(placer) == [None, "door"]
+    again = placer.place(order("hall", 4), first_slot(placer))
+    endpoints = {each for place in (first, second, again) for each in (place.publish, place.control)}
+    assert len(endpoints) == 6
+
+
+def test_a_released_slot_is_free_once_the_process_is_gone_and_that_is_no_loss(placer: AnyPlacer) -> None:
+    placement = placer.place(order("hall", 1))
+    until(placer, lambda event: event.kind == "reported")
+    process = psutil.Process(placer.process_ids()[first_slot(placer)])
+    placer.release(placement)
+    deadline_s = time.monotonic() + PATIENCE_S
+    events: list[PlacementEvent] = []
+    while rooms_in(placer) != [None, None] and time.monotonic() < deadline_s:
+        events += placer.watch()
+        time.sleep(0.02)
+    assert not process.is_running()
+    assert events == []
+    placer.release(placement)  # it is gone already
+    with pytest.raises(NoSlotError, match=f"there is no slot slot-9; the slots are {first_slot(placer)}, "):
+        placer.place(order("hall", 2), "slot-9")
+
+
+def test_a_server_that_refuses_its_input_says_why(make: Make) -> None:
+    placer = make(lambda *_: ChildSpec("room", ("-c", REFUSING)))
+    placer.place(order("hall", 1))
+    lost = until(placer, lambda event: event.kind == "lost")
+    assert (lost.refused, lost.detail) == (True, "The scene is wrong; mend it.")
+
+
+def test_closing_leaves_no_process(placer: AnyPlacer) -> None:
+    placer.place(order("hall", 1))
+    placer.place(order("door", 2))
+    processes = [psutil.Process(each) for each in placer.process_ids().values()]
+    placer.close()
+    assert not any(process.is_running() for process in processes)
+
+
+def test_a_room_takes_a_host_with_its_labels_that_is_not_drained() -> None:
+    slots = [
+        Slot("a/1", "", "hall", "a", {"network": "east"}),
+        Slot("b/1", "", None, "b"),
+        Slot("c/1", "", None, "c"),
+        Slot("c/2", "", None, "c"),
+    ]
+    east = {"network": "east"}
+
+    def wants(labels: dict[str, str], *avoid: str) -> RoomOrder:
+        return RoomOrder("attic", 1, (), Path("unused.json"), labels, frozenset(avoid))
+
+    assert choose_slot(slots, wants({})).name == "c/1"  # the emptier host
+    assert choose_slot(slots, wants({}, "c")).name == "b/1"
+    for order, slot, sentence in (
+        (wants(east), None, "all 1 slots with network=east are in use"),
+        (wants(east, "a"), None, "the hosts with network=east are drained"),
+        (wants({"network": "west"}), None, "no host with network=west offers a slot"),
+        (wants({}), "a/1", "a/1 is in use by hall"),
+        (wants({}, "b"), "b/1", "the host of b/1 is drained"),
+        (wants(east), "b/1", "the host of b/1 lacks network=east"),
+    ):
+        with pytest.raises(NoSlotError, match=sentence):
+            choose_slot(slots, order, slot)
