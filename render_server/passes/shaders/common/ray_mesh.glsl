@@ -57,13 +57,13 @@ void meet_triangle(int at, Ray ray, inout MeshHit hit) {
     hit = MeshHit(t, at, vec2(u, v));
 }
 
-// The hit nearest to the origin, or with `any` the first that is found, before `limit`.
-MeshHit hit_before(Ray ray, float limit, bool any) {
+// The hit nearest to the origin, or with `any_hit` the first that is found, before `limit`.
+MeshHit hit_before(Ray ray, float limit, bool any_hit) {
     vec3 safe = mix(ray.direction, vec3(1e-12), lessThan(abs(ray.direction), vec3(1e-12)));
     vec3 inverse = 1.0 / safe;
     MeshHit hit = MeshHit(limit, -1, vec2(0.0));
     int count = nodes[0].skip;
-    for (int i = 0; i < count && !(any && hit.triangle >= 0);) {
+    for (int i = 0; i < count && !(any_hit && hit.triangle >= 0);) {
         Node node = nodes[i];
         bool met = meets_box(node.low, node.high, ray.from, inverse, hit.distance);
         int last = met && node.leaf >= 0 ? (node.leaf >> 3) + (node.leaf & 7) : 0;
