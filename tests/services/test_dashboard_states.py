@@ -88,6 +88,7 @@ def test_a_slow_frame_is_told_as_work_and_not_as_a_fault(live: LiveApi, stack: S
     says(page, "Live")
 
 
+NO_H264 = "delete globalThis.VideoDecoder"  # pictures come as JPEG
 SLOW_DECODER = """
     const decode = window.createImageBitmap;
     window.createImageBitmap = async (...picture) => {
@@ -99,7 +100,7 @@ SLOW_DECODER = """
 
 def test_the_delay_is_from_the_capture_to_the_page(live: LiveApi, page: Desk) -> None:
     live.stream.ages_s = (60.0, *[10.0] * 6)
-    page.page.add_init_script("delete globalThis.VideoDecoder")  # pictures come as JPEG
+    page.page.add_init_script(NO_H264)
     page.page.add_init_script(SLOW_DECODER)
     page.open()
     page.named("tab", "Performance").click()
@@ -193,6 +194,7 @@ HELD_DECODER = """
 @pytest.mark.skipif(not POSTER.is_file(), reason="the demo's files are not in this checkout")
 def test_a_still_is_shown_until_the_first_live_picture(live: LiveApi, stack: Stack, page: Desk) -> None:
     still = page.named("img", "Still picture")
+    page.page.add_init_script(NO_H264)
     page.page.add_init_script(HELD_DECODER)
     shutil.copyfile(POSTER, live.api.store.poster)
     try:
