@@ -1,7 +1,7 @@
 // Beams of light that smooth virtual surfaces reflect: the flux of each block of a light's map of the objects is
 // split over a few rays, each traced to the first surface that it hits. WIDE: they sample the GGX lobe; otherwise all
-// go in the mirror direction. REFRACTED: they go through transparent objects, each
-// along the strongest of the paths into which surfaces divide it.
+// go in the mirror direction. REFRACTED: they go through transparent objects, along the strongest of the paths into
+// which surfaces divide each ray.
 #include "common/light_rays.glsl"
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"
