@@ -97,11 +97,12 @@ class CompositeCollector:
         except DeltalightError:
             return None
 
-    def frames_per_s(self) -> float | None:
-        """Rate of arrival, None below two composites."""
-        if self.count < 2:
+    def frames_per_s(self, first: int = 0) -> float | None:
+        """Rate of arrival from composite number `first` on, None below two of them."""
+        arrivals_s = self.arrivals_s[first:]
+        if len(arrivals_s) < 2:
             return None
-        return (self.count - 1) / max(self.arrivals_s[-1] - self.arrivals_s[0], 1e-3)
+        return (len(arrivals_s) - 1) / max(arrivals_s[-1] - arrivals_s[0], 1e-3)
 
     def write_overview(self) -> None:
         """Write contact_sheet.png and the video from the pictures in the folder."""
@@ -176,7 +177,11 @@ def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarra
 
 
 def summarize(collector: CompositeCollector, restarts: dict[str, int]) -> dict[str, Any]:
-    """Return the figures of a finished run; a render server that does not answer only lacks its name."""
+    """Return the figures of a finished run; a render server that does not answer only lacks its name.
+
+    `settled_...` are those of the later half, without the start and the first choice of size by a frame budget.
+    """
+    half = collector.count // 2
     passes: dict[str, list[float]] = {}
     for message in collector.messages:
         for name, milliseconds in message.pass_times_ms.items():
@@ -186,7 +191,9 @@ def summarize(collector: CompositeCollector, restarts: dict[str, int]) -> dict[s
         "composites": collector.count,
         "without_pose": sum(message.status == "no_pose" for message in collector.messages),
         "frames_per_s": collector.frames_per_s(),
+        "settled_frames_per_s": collector.frames_per_s(half),
         "age_median_ms": statistics.median(collector.ages_ms),
+        "settled_age_median_ms": statistics.median(collector.ages_ms[half:]),
         "age_p95_ms": float(np.percentile(collector.ages_ms, 95)),
         "drops": collector.messages[-1].drops,
         "restarts": restarts,

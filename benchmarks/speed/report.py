@@ -63,10 +63,12 @@ class MotionFigures(StrictModel):
 
 
 class EndToEnd(StrictModel):
-    """Camera to viewer through all processes."""
+    """Camera to viewer through all processes; `settled_...`: the later half of the pictures (`summarize`)."""
 
     frames_per_s: float
+    settled_frames_per_s: float | None = None
     age_median_ms: float
+    settled_age_median_ms: float | None = None
     age_p95_ms: float
     drops: dict[str, int]
 

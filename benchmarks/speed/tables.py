@@ -80,3 +80,8 @@ def _print_rest(console: Console, method: str, figures: MethodFigures) -> None:
             f"{method}, camera to viewer through all processes: {through.frames_per_s:.1f} frames/s,"
             f" age {through.age_median_ms:.0f} ms (p95 {through.age_p95_ms:.0f} ms)"
         )
+        if through.settled_frames_per_s is not None:
+            console.print(
+                f"{method}, the later half of these pictures: {through.settled_frames_per_s:.1f} frames/s,"
+                f" age {through.settled_age_median_ms:.0f} ms"
+            )
