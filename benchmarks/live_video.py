@@ -1,20 +1,22 @@
-"""Bandwidth, delay and processor time of live pictures as H.264 beside JPEG, for one viewer and for twenty.
+"""Bandwidth, delay and processor time of live pictures: JPEG, H.264, and WHEP, for one viewer and for twenty.
 
 python -m deltalight.benchmarks.live_video
 
 The demo's recording is relit once (a minute in software); its pictures then go to a web process of their own at the
-recording's rate, and from there to viewers on loopback, each by `WS /live`.
+recording's rate, and from there to viewers on loopback, each by `WS /live` or `POST /whep`.
 """
 
 import argparse
 import asyncio
 import itertools
+import os
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import cast
@@ -40,8 +42,9 @@ from deltalight.services.live_message import LiveHeader, Row, unpack
 
 SIZES = ((640, 480), (320, 240))
 MOTIONS = ("moving", "still", "paused")
-CODECS = ("jpeg", "h264")
+WAYS = ("jpeg", "h264", "whep")
 CROWDS = (1, 20)
+THUMBNAIL = (80, 60)
 RATE_PER_S = 15.0  # of the demo's recording
 NOISE_CODES = 1.5  # of a still camera's pictures, r.m.s.; those of a paused replay are equal
 SETTLING_S = 2.0  # before each measurement, for keys and refinement
@@ -60,7 +63,10 @@ class Relit:
 
 @dataclass
 class Seen:
-    """What viewers got; delays are those of the one that decodes, from sending to its decoded picture."""
+    """What viewers got; delays are those of the one that decodes, from sending to its decoded picture.
+
+    By WHEP no header says which picture it is: it is found among those sent, where they move.
+    """
 
     bytes: int = 0
     messages: int = 0
@@ -120,10 +126,39 @@ def coded(relit: Sequence[Relit], size: tuple[int, int], motion: str) -> list[tu
     return made
 
 
+class Published:
+    """The pictures that were published of late, to find one again by how it looks."""
+
+    def __init__(self, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> None:
+        self._thumbnails = [
+            _thumbnail(decode_color(memoryview(jpeg), "jpeg", m.shape)) for m, jpeg in pictures
+        ]
+        self.size = pictures[0][0].shape[1], pictures[0][0].shape[0]
+        self._sent: deque[tuple[int, int]] = deque(maxlen=round(RATE_PER_S))
+
+    def note(self, index: int, now_ns: int) -> None:
+        """Note that a picture is published."""
+        self._sent.append((index, now_ns))
+
+    def delay_ms(self, picture: Picture) -> float | None:
+        """Return the time since a picture was published; None where several of the last second look so."""
+        now_ns, seen = time.time_ns(), _thumbnail(picture)
+        sent = list(self._sent)
+        differences = [np.abs(self._thumbnails[index] - seen).mean() for index, _ in sent]
+        best, *others = np.argsort(differences)
+        if others and differences[others[0]] < 1.5 * differences[best]:
+            return None
+        return (now_ns - sent[best][1]) / 1e6
+
+
+def _thumbnail(picture: Picture) -> Float64[np.ndarray, "h w 3"]:
+    return np.asarray(cv2.resize(picture, THUMBNAIL, interpolation=cv2.INTER_AREA), np.float64)
+
+
 @contextmanager
-def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> Iterator[None]:
+def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> Iterator[Published]:
     """Publish pictures in turn, at the recording's rate, as captured at that moment."""
-    stop = threading.Event()
+    stop, published = threading.Event(), Published(pictures)
 
     def run() -> None:
         publisher = Publisher(ports.endpoint(port))
@@ -134,13 +169,14 @@ def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) ->
             message, jpeg = pictures[number % len(pictures)]
             now_ns = time.time_ns()
             times = {"capture_ns": now_ns, "received_ns": now_ns, "rendered_ns": now_ns, "frame_id": number}
+            published.note(number % len(pictures), now_ns)
             publisher.send(encode(message.model_copy(update=times), [jpeg]))
         publisher.close()
 
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        yield
+        yield published
     finally:
         stop.set()
         thread.join()
@@ -166,7 +202,8 @@ def web_process(stream_port: int) -> Iterator[httpx.Client]:
             data,
         ]
         command += ["--control", ports.endpoint(control_port), "--subscribe", ports.endpoint(stream_port)]
-        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        env = {**os.environ, "DELTALIGHT_API__WHEP_SESSIONS": str(max(CROWDS))}
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=env)
         try:
             deadline_s = time.monotonic() + START_TIMEOUT_S
             while not ports.answers(port):
@@ -208,14 +245,41 @@ def _decode(h264: H264Decoder, header: LiveHeader, content: bytes) -> None:
         h264.decode(content, width, height)
 
 
-async def _crowd(client: httpx.Client, codec: str, viewers: int, seconds: float) -> tuple[Seen, float]:
+async def _watch(address: str, seen: Seen, measures: asyncio.Event, published: Published | None) -> None:
+    """Watch by WHEP; the one that knows what was `published` decodes."""
+    from deltalight.benchmarks.whep_viewer import WhepViewer
+
+    h264 = H264Decoder()
+
+    def take(data: bytes) -> None:
+        delay_ms = None if published is None else published.delay_ms(h264.decode(data, *published.size))
+        if measures.is_set():
+            seen.messages += 1
+            seen.delays_ms += [] if delay_ms is None else [delay_ms]
+
+    async with WhepViewer(address, take) as viewer:
+        await measures.wait()
+        before = await viewer.received_bytes()
+        try:
+            await asyncio.Future()
+        finally:
+            seen.bytes += await viewer.received_bytes() - before
+
+
+async def _crowd(
+    client: httpx.Client, way: str, viewers: int, seconds: float, published: Published
+) -> tuple[Seen, float]:
     """Return what viewers got together, and the web process's share of a core."""
-    address = str(client.base_url).rstrip("/").replace("http", "ws", 1) + "/live"
+    base = str(client.base_url).rstrip("/")
     seen, measures = Seen(), asyncio.Event()
-    tasks = [
-        asyncio.create_task(_view(address, codec, seen, measures, decoder=number == 0))
-        for number in range(viewers)
-    ]
+
+    def viewer(number: int) -> Coroutine[None, None, None]:
+        if way == "whep":
+            return _watch(f"{base}/whep", seen, measures, published if number == 0 else None)
+        socket = base.replace("http", "ws", 1) + "/live"
+        return _view(socket, way, seen, measures, decoder=number == 0)
+
+    tasks = [asyncio.create_task(viewer(number)) for number in range(viewers)]
     await asyncio.sleep(SETTLING_S)
     before = sample(client)
     measures.set()
@@ -237,7 +301,7 @@ def main() -> None:
     for head in (
         "size",
         "camera",
-        "codec",
+        "as",
         "viewers",
         "kbit/s each",
         "pictures/s",
@@ -250,13 +314,13 @@ def main() -> None:
     (stream_port,) = ports.private_ports(1)
     with web_process(stream_port) as client:
         for size, motion in itertools.product(SIZES, MOTIONS):
-            with publishing(stream_port, coded(relit, size, motion)):
-                for codec, viewers in itertools.product(CODECS, CROWDS):
-                    seen, cores = asyncio.run(_crowd(client, codec, viewers, seconds))
+            with publishing(stream_port, coded(relit, size, motion)) as published:
+                for way, viewers in itertools.product(WAYS, CROWDS):
+                    seen, cores = asyncio.run(_crowd(client, way, viewers, seconds, published))
                     table.add_row(
                         f"{size[0]}x{size[1]}",
                         motion,
-                        codec,
+                        way,
                         str(viewers),
                         f"{8e-3 * seen.bytes / seconds / viewers:.0f}",
                         f"{seen.messages / seconds / viewers:.1f}",

@@ -27,7 +27,7 @@ from aiortc.mediastreams import MediaStreamError
 from aiortc.rtcrtpparameters import ParametersDict
 from aiortc.rtp import DYNAMIC_PAYLOAD_TYPES
 from aiortc.sdp import SessionDescription
-from av.video.stream import VideoStream
+from av.stream import Stream
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.api.live_hub import Viewer
@@ -155,14 +155,14 @@ class _LiveTrack(MediaStreamTrack):
         self._viewer = viewer
         self._sent = 0  # ticks
 
-    async def recv(self) -> "av.Packet[VideoStream]":
+    async def recv(self) -> "av.Packet[Stream]":
         while (picture := await self._viewer.next_video()) is not None:
             if picture.data:
                 return self._packet(picture.data)
         raise MediaStreamError
 
-    def _packet(self, data: bytes) -> "av.Packet[VideoStream]":
-        packet: av.Packet[VideoStream] = av.Packet(data)
+    def _packet(self, data: bytes) -> "av.Packet[Stream]":
+        packet: av.Packet[Stream] = av.Packet(data)
         self._sent = max(self._sent + 1, round(time.monotonic() * TICKS_PER_S))
         packet.pts, packet.time_base = self._sent, Fraction(1, TICKS_PER_S)
         return packet
@@ -201,7 +201,9 @@ def _restrict(offer: SessionDescription) -> None:
     if not wanted or any(media.kind not in ("audio", "video") for media in offer.media):
         raise DeltalightError(NO_VIDEO if offer.media else BAD_OFFER)
     for media in offer.media:
-        if not (media.ice.usernameFragment and media.ice.password and media.dtls and media.dtls.fingerprints):
+        ice, dtls = media.ice, media.dtls
+        has_keys = ice is not None and ice.usernameFragment and ice.password
+        if not has_keys or dtls is None or not dtls.fingerprints:
             raise DeltalightError(BAD_OFFER)
         media.ice_candidates, media.ice_candidates_complete = [], False
     parameters = videos[0].rtp  # aiortc answers other numbers than these with one of its own

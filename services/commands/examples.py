@@ -28,7 +28,7 @@ EXAMPLES = {
     "virtual_camera": ("deltalight virtual-camera --device /dev/video10",),
     "stream": (
         "deltalight stream --to rtsp://media.example:8554/room",
-        "DELTALIGHT_STREAM_TO=rtmp://media.example/live/KEY deltalight stream",
+        "deltalight stream --to rtmp://media.example/live/room",
     ),
     "ping": ("deltalight ping tcp://127.0.0.1:5603",),
 }

@@ -1,8 +1,8 @@
 """schemathesis over the whole OpenAPI description: no 5xx, and every answer keeps to what is described.
 
-Not covered, because no description holds them: the WebSockets and the endless `live.mjpg`; nor `POST /whep`, whose SDP
-schemathesis cannot make. Render server, node and the children that record and replay are stand-ins, so that no request
-waits for a frame.
+Not covered, because no description holds them: the WebSockets and the endless `live.mjpg`; nor `POST /whep`, whose
+SDP schemathesis cannot make. Render server, node and the children that record and replay are stand-ins, so that no
+request waits for a frame.
 """
 
 import copy

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import aioice.ice
 import httpx
 import numpy as np
 import pytest
@@ -161,11 +162,21 @@ def test_a_session_ends_with_its_peer_and_with_one_that_never_comes(
     live: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def watch() -> None:
-        async with watching(live.api.client) as (player, session):
+        async with watching(live.api.client) as (player, _):
             await player.picture()
-        wait_until(lambda: live.api.client.delete(session).status_code == 404)
+        wait_until(lambda: viewers(live) == 0)
+
+    async def fall_silent() -> None:
+        async with watching(live.api.client) as (player, _):
+            await player.picture()
+            ice = player.video.receiver.transport.transport
+            for protocol in ice._connection._protocols:
+                protocol.transport.abort()
+            wait_until(lambda: viewers(live) == 0)
 
     asyncio.run(watch())
+    monkeypatch.setattr(aioice.ice, "CONSENT_INTERVAL", 0.1)
+    asyncio.run(fall_silent())
     monkeypatch.setattr(webrtc, "CONNECT_TIMEOUT_S", 0.3)
     answer = live.api.client.post("/whep", content=made_offer("video"), headers=SDP)
     assert answer.status_code == 201
