@@ -44,7 +44,8 @@ SIZES = ((640, 480), (320, 240))
 MOTIONS = ("moving", "still", "paused")
 WAYS = ("jpeg", "h264", "whep")
 CROWDS = (1, 20)
-THUMBNAIL = (80, 60)
+THUMBNAIL = (160, 120)
+APART = 1.1  # how much more another picture must differ, for one to be told from it
 RATE_PER_S = 15.0  # of the demo's recording
 NOISE_CODES = 1.5  # of a still camera's pictures, r.m.s.; those of a paused replay are equal
 SETTLING_S = 2.0  # before each measurement, for keys and refinement
@@ -68,6 +69,7 @@ class Seen:
     By WHEP no header says which picture it is: it is found among those sent, where they move.
     """
 
+    joined: int = 0
     bytes: int = 0
     messages: int = 0
     delays_ms: list[float] = field(default_factory=list)
@@ -146,7 +148,7 @@ class Published:
         sent = list(self._sent)
         differences = [np.abs(self._thumbnails[index] - seen).mean() for index, _ in sent]
         best, *others = np.argsort(differences)
-        if others and differences[others[0]] < 1.5 * differences[best]:
+        if others and differences[others[0]] < APART * differences[best]:
             return None
         return (now_ns - sent[best][1]) / 1e6
 
@@ -220,12 +222,13 @@ def web_process(stream_port: int) -> Iterator[httpx.Client]:
 async def _view(address: str, codec: str, seen: Seen, measures: asyncio.Event, decoder: bool) -> None:
     from websockets.asyncio.client import connect
 
-    h264, header = H264Decoder(), None
+    h264, header, has_joined = H264Decoder(), None, False
     async with connect(f"{address}?codec={codec}", max_size=None, compression=None) as socket:
         while True:
             message = await socket.recv()
             assert isinstance(message, bytes)
             await socket.send("ack")
+            has_joined, seen.joined = True, seen.joined + (not has_joined)
             if decoder:
                 header, content = unpack(message, header)
                 _decode(h264, header, content)
@@ -249,9 +252,11 @@ async def _watch(address: str, seen: Seen, measures: asyncio.Event, published: P
     """Watch by WHEP; the one that knows what was `published` decodes."""
     from deltalight.benchmarks.whep_viewer import WhepViewer
 
-    h264 = H264Decoder()
+    h264, has_joined = H264Decoder(), False
 
     def take(data: bytes) -> None:
+        nonlocal has_joined
+        has_joined, seen.joined = True, seen.joined + (not has_joined)
         delay_ms = None if published is None else published.delay_ms(h264.decode(data, *published.size))
         if measures.is_set():
             seen.messages += 1
@@ -280,6 +285,9 @@ async def _crowd(
         return _view(socket, way, seen, measures, decoder=number == 0)
 
     tasks = [asyncio.create_task(viewer(number)) for number in range(viewers)]
+    async with asyncio.timeout(START_TIMEOUT_S):
+        while seen.joined < viewers:
+            await asyncio.sleep(0.05)
     await asyncio.sleep(SETTLING_S)
     before = sample(client)
     measures.set()
