@@ -15,7 +15,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -37,15 +36,14 @@ from deltalight.protocol.messages import CompositeMessage
 from deltalight.protocol.publisher import Publisher
 from deltalight.services import ports
 from deltalight.services.demo import RECORDING
-from deltalight.services.h264 import H264Decoder
+from deltalight.services.h264 import H264Decoder, rgb_picture
 from deltalight.services.live_message import LiveHeader, Row, unpack
 
 SIZES = ((640, 480), (320, 240))
 MOTIONS = ("moving", "still", "paused")
 WAYS = ("jpeg", "h264", "whep")
 CROWDS = (1, 20)
-THUMBNAIL = (160, 120)
-APART = 1.1  # how much more another picture must differ, for one to be told from it
+LONG_START_CODE = b"\0\0\0\1"
 RATE_PER_S = 15.0  # of the demo's recording
 NOISE_CODES = 1.5  # of a still camera's pictures, r.m.s.; those of a paused replay are equal
 SETTLING_S = 2.0  # before each measurement, for keys and refinement
@@ -66,7 +64,7 @@ class Relit:
 class Seen:
     """What viewers got; delays are those of the one that decodes, from sending to its decoded picture.
 
-    By WHEP no header says which picture it is: it is found among those sent, where they move.
+    By WHEP no header says when a picture was captured; a WebSocket beside it tells.
     """
 
     joined: int = 0
@@ -128,39 +126,30 @@ def coded(relit: Sequence[Relit], size: tuple[int, int], motion: str) -> list[tu
     return made
 
 
-class Published:
-    """The pictures that were published of late, to find one again by how it looks."""
+@dataclass
+class Matched:
+    """When pictures were captured, as a WebSocket's headers say, and when a peer had decoded them, by access unit.
 
-    def __init__(self, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> None:
-        self._thumbnails = [
-            _thumbnail(decode_color(memoryview(jpeg), "jpeg", m.shape)) for m, jpeg in pictures
-        ]
-        self.size = pictures[0][0].shape[1], pictures[0][0].shape[0]
-        self._sent: deque[tuple[int, int]] = deque(maxlen=round(RATE_PER_S))
+    Both get the same access units, but for the length of start codes.
+    """
 
-    def note(self, index: int, now_ns: int) -> None:
-        """Note that a picture is published."""
-        self._sent.append((index, now_ns))
+    captured_ns: dict[bytes, int] = field(default_factory=dict)
+    decoded_ns: dict[bytes, int] = field(default_factory=dict)
 
-    def delay_ms(self, picture: Picture) -> float | None:
-        """Return the time since a picture was published; None where several of the last second look so."""
-        now_ns, seen = time.time_ns(), _thumbnail(picture)
-        sent = list(self._sent)
-        differences = [np.abs(self._thumbnails[index] - seen).mean() for index, _ in sent]
-        best, *others = np.argsort(differences)
-        if others and differences[others[0]] < APART * differences[best]:
-            return None
-        return (now_ns - sent[best][1]) / 1e6
+    def delays_ms(self) -> list[float]:
+        """Return the delays of the pictures that both got."""
+        both = self.captured_ns.keys() & self.decoded_ns.keys()
+        return [(self.decoded_ns[unit] - self.captured_ns[unit]) / 1e6 for unit in both]
 
 
-def _thumbnail(picture: Picture) -> Float64[np.ndarray, "h w 3"]:
-    return np.asarray(cv2.resize(picture, THUMBNAIL, interpolation=cv2.INTER_AREA), np.float64)
+def _unit(data: bytes) -> bytes:
+    return data.replace(LONG_START_CODE, LONG_START_CODE[1:])
 
 
 @contextmanager
-def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> Iterator[Published]:
+def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> Iterator[None]:
     """Publish pictures in turn, at the recording's rate, as captured at that moment."""
-    stop, published = threading.Event(), Published(pictures)
+    stop = threading.Event()
 
     def run() -> None:
         publisher = Publisher(ports.endpoint(port))
@@ -171,14 +160,13 @@ def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) ->
             message, jpeg = pictures[number % len(pictures)]
             now_ns = time.time_ns()
             times = {"capture_ns": now_ns, "received_ns": now_ns, "rendered_ns": now_ns, "frame_id": number}
-            published.note(number % len(pictures), now_ns)
             publisher.send(encode(message.model_copy(update=times), [jpeg]))
         publisher.close()
 
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        yield published
+        yield
     finally:
         stop.set()
         thread.join()
@@ -248,19 +236,24 @@ def _decode(h264: H264Decoder, header: LiveHeader, content: bytes) -> None:
         h264.decode(content, width, height)
 
 
-async def _watch(address: str, seen: Seen, measures: asyncio.Event, published: Published | None) -> None:
-    """Watch by WHEP; the one that knows what was `published` decodes."""
+async def _watch(address: str, seen: Seen, measures: asyncio.Event, matched: Matched | None) -> None:
+    """Watch by WHEP; the one with `matched` decodes, and notes there when."""
+    from av import CodecContext, Packet
+
     from deltalight.benchmarks.whep_viewer import WhepViewer
 
-    h264, has_joined = H264Decoder(), False
+    h264, has_joined = CodecContext.create("h264", "r"), False
 
     def take(data: bytes) -> None:
         nonlocal has_joined
         has_joined, seen.joined = True, seen.joined + (not has_joined)
-        delay_ms = None if published is None else published.delay_ms(h264.decode(data, *published.size))
+        if matched is not None:
+            for frame in h264.decode(Packet(data)):
+                rgb_picture(frame)
         if measures.is_set():
             seen.messages += 1
-            seen.delays_ms += [] if delay_ms is None else [delay_ms]
+            if matched is not None:
+                matched.decoded_ns[_unit(data)] = time.time_ns()
 
     async with WhepViewer(address, take) as viewer:
         await measures.wait()
@@ -271,20 +264,35 @@ async def _watch(address: str, seen: Seen, measures: asyncio.Event, published: P
             seen.bytes += await viewer.received_bytes() - before
 
 
-async def _crowd(
-    client: httpx.Client, way: str, viewers: int, seconds: float, published: Published
-) -> tuple[Seen, float]:
+async def _note_captures(address: str, matched: Matched) -> None:
+    """Note when each picture in H.264 was captured."""
+    from websockets.asyncio.client import connect
+
+    header = None
+    async with connect(f"{address}?codec=h264", max_size=None, compression=None) as socket:
+        while True:
+            message = await socket.recv()
+            assert isinstance(message, bytes)
+            await socket.send("ack")
+            header, content = unpack(message, header)
+            if content:
+                matched.captured_ns[_unit(content)] = header.capture_ns
+
+
+async def _crowd(client: httpx.Client, way: str, viewers: int, seconds: float) -> tuple[Seen, float]:
     """Return what viewers got together, and the web process's share of a core."""
     base = str(client.base_url).rstrip("/")
-    seen, measures = Seen(), asyncio.Event()
+    socket, whep = base.replace("http", "ws", 1) + "/live", f"{base}/whep"
+    seen, measures, matched = Seen(), asyncio.Event(), Matched()
 
     def viewer(number: int) -> Coroutine[None, None, None]:
         if way == "whep":
-            return _watch(f"{base}/whep", seen, measures, published if number == 0 else None)
-        socket = base.replace("http", "ws", 1) + "/live"
+            return _watch(whep, seen, measures, matched if number == 0 else None)
         return _view(socket, way, seen, measures, decoder=number == 0)
 
     tasks = [asyncio.create_task(viewer(number)) for number in range(viewers)]
+    if way == "whep":
+        tasks.append(asyncio.create_task(_note_captures(socket, matched)))
     async with asyncio.timeout(START_TIMEOUT_S):
         while seen.joined < viewers:
             await asyncio.sleep(0.05)
@@ -297,6 +305,7 @@ async def _crowd(
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+    seen.delays_ms += matched.delays_ms()
     return seen, (after.cpu_s[WEB] - before.cpu_s[WEB]) / (after.at_s - before.at_s)
 
 
@@ -322,9 +331,9 @@ def main() -> None:
     (stream_port,) = ports.private_ports(1)
     with web_process(stream_port) as client:
         for size, motion in itertools.product(SIZES, MOTIONS):
-            with publishing(stream_port, coded(relit, size, motion)) as published:
+            with publishing(stream_port, coded(relit, size, motion)):
                 for way, viewers in itertools.product(WAYS, CROWDS):
-                    seen, cores = asyncio.run(_crowd(client, way, viewers, seconds, published))
+                    seen, cores = asyncio.run(_crowd(client, way, viewers, seconds))
                     table.add_row(
                         f"{size[0]}x{size[1]}",
                         motion,
