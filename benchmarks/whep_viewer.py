@@ -6,7 +6,7 @@ from typing import Self
 
 import httpx
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription, RTCTransportStats
-from aiortc.codecs import h264_depayload
+from aiortc.codecs.h264 import h264_depayload
 from aiortc.rtp import RtpPacket
 
 from deltalight.services.api.webrtc import listen_at
