@@ -31,6 +31,7 @@ from av.stream import Stream
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.api.live_hub import Viewer
+from deltalight.services.api.problems import ProblemError
 from deltalight.services.h264 import TICKS_PER_S
 
 CONNECT_TIMEOUT_S = 15.0  # from the answer to the first packet
@@ -102,6 +103,7 @@ class Peer:
 
         Raises:
             DeltalightError: it is no offer, or wants what is not there.
+            ProblemError: no port opens.
         """
         await self._take(offer)
         for transceiver in self._connection.getTransceivers():
@@ -110,9 +112,9 @@ class Peer:
             listen_at(transceiver, self._addresses)
         await self._connection.setLocalDescription()
         if not self._transceiver.sender.transport.transport.iceGatherer.getLocalCandidates():
-            raise DeltalightError(
-                f"No UDP port opens at {', '.join(self._addresses)}; set `whep_host` to an address of this host."
-            )
+            places = ", ".join(self._addresses)
+            sentence = f"No UDP port opens at {places}; set `whep_host` to an address of this host."
+            raise ProblemError(503, "no-whep", sentence)
         asyncio.get_running_loop().call_later(CONNECT_TIMEOUT_S, self._give_up)
         return self._connection.localDescription.sdp
 

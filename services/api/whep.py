@@ -5,8 +5,8 @@ A session outlives the request that opened it; it counts as one of its client's 
 
 import asyncio
 import secrets
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from deltalight.protocol.errors import DeltalightError, install_command
+from deltalight.protocol.errors import install_command
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.services.api.limits import StreamLimits, run_while
 from deltalight.services.api.live_hub import LiveHub
@@ -52,6 +52,7 @@ class WhepSessions:
     def __init__(self, settings: ApiSettings, tokens: TokenStore, streams: StreamLimits) -> None:
         self._settings, self._tokens, self._streams = settings, tokens, streams
         self._running: dict[str, asyncio.Task[None]] = {}
+        self._taken = 0  # also by those that are being opened
 
     @cached_property
     def why_not(self) -> str | None:
@@ -66,15 +67,14 @@ class WhepSessions:
         """Begin a session; return its id and the answer to the offer.
 
         Raises:
-            ProblemError: there is no WHEP here, or there are too many sessions.
+            ProblemError: there is no WHEP here, no port opens, or there are too many sessions.
             DeltalightError: the offer is wrong.
         """
         if self.why_not is not None:
             raise ProblemError(503, "no-whep", self.why_not)
-        if len(self._running) >= self._settings.whep_sessions:
-            raise ProblemError(429, "too-many-streams", ALL_TAKEN, {"Retry-After": "5"})
         peer_of = await run_in_threadpool(_peer_class)
         with ExitStack() as held:
+            held.enter_context(self._place())
             held.enter_context(self._streams.slot(watcher.client))
             peer = peer_of(held.enter_context(hub.viewer(view, "h264")), self._addresses())
             try:
@@ -110,7 +110,7 @@ class WhepSessions:
         async def is_allowed() -> bool:
             return token_id is None or await run_in_threadpool(self._tokens.knows, token_id)
 
-        log.info("a session of WHEP begins", sessions=len(self._running))
+        log.info("a session of WHEP begins", sessions=self._taken)
         try:
             with held:
                 try:
@@ -118,7 +118,17 @@ class WhepSessions:
                 finally:
                     await peer.close()
         finally:
-            log.info("a session of WHEP ended", sessions=len(self._running) - 1)
+            log.info("a session of WHEP ended", sessions=self._taken)
+
+    @contextmanager
+    def _place(self) -> Iterator[None]:
+        if self._taken >= self._settings.whep_sessions:
+            raise ProblemError(429, "too-many-streams", ALL_TAKEN, {"Retry-After": "5"})
+        self._taken += 1
+        try:
+            yield
+        finally:
+            self._taken -= 1
 
     def _addresses(self) -> Sequence[str]:
         chosen = self._settings.whep_host or self._settings.host
@@ -137,7 +147,7 @@ def _addresses_of_host(version: int) -> Sequence[str]:
     """Return this host's addresses, without loopback and those of one link alone.
 
     Raises:
-        DeltalightError: it has none.
+        ProblemError: it has none.
     """
     import ifaddr
 
@@ -151,5 +161,5 @@ def _addresses_of_host(version: int) -> Sequence[str]:
         if each.version == version and not each.is_loopback and not each.is_link_local
     ]
     if not usable:
-        raise DeltalightError("This host has no address for WHEP; set `whep_host` to one.")
+        raise ProblemError(503, "no-whep", "This host has no address for WHEP; set `whep_host` to one.")
     return usable

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpTransceiver, RTCSessionDescription
 from av import VideoFrame
-from playwright.sync_api import Browser
 
 from deltalight.services import ports
 from deltalight.services.api import limits, webrtc, whep
@@ -286,11 +285,13 @@ def test_an_encoder_that_fails_ends_the_session(live: Running, monkeypatch: pyte
     asyncio.run(watch())
 
 
-def test_without_aiortc_or_with_no_sessions_a_sentence_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_there_is_no_whep_a_sentence_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with moving_api(tmp_path / "off", whep_sessions=0) as running:
         assert "switched off" in running.api.client.get("/settings").json()["no_whep"]
+    with moving_api(tmp_path / "elsewhere", whep_host="192.0.2.1") as running:  # RFC 5737: nobody's
+        answer = running.api.client.post("/whep", content=made_offer("video"), headers=SDP)
+        assert "No UDP port opens at 192.0.2.1" in sentence(answer, 503)
+        assert viewers(running) == 0
     monkeypatch.setattr(whep, "find_spec", lambda _name: None)
     with moving_api(tmp_path / "without") as running:
         answer = running.api.client.post("/whep", content="v=0", headers=SDP)
@@ -320,22 +321,18 @@ WATCH = """async () => {
 }"""
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as started:
-        yield started
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)")
-def test_chromium_shows_what_the_jpeg_shows(live: Running, browser: Browser) -> None:
+def test_chromium_shows_what_the_jpeg_shows(live: Running) -> None:
     before = max(live.stream.jpegs)
-    page = browser.new_page()
-    page.goto(f"http://{live.address}/openapi.json")
-    shown = page.evaluate(WATCH)
-    seen = np.array(shown["pixels"], np.uint8).reshape(shown["height"], shown["width"], 4)[..., :3]
-    agreement_db, frame_id = live.closest(seen)
+    with (
+        chromium() as browser
+    ):  # no fixture of the module: while it runs, this thread runs no other event loop
+        page = browser.new_page()
+        page.goto(f"http://{live.address}/openapi.json")
+        shown = page.evaluate(WATCH)
+        seen = np.array(shown["pixels"], np.uint8).reshape(shown["height"], shown["width"], 4)[..., :3]
+        agreement_db, frame_id = live.closest(seen)
     assert agreement_db > LEAST_PSNR_DB
     assert psnr_db(seen, np.roll(seen, 2, axis=1)) < agreement_db, "a shift by two pixels would show"
     assert frame_id > before
-    page.close()
