@@ -325,9 +325,7 @@ WATCH = """async () => {
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)")
 def test_chromium_shows_what_the_jpeg_shows(live: Running) -> None:
     before = max(live.stream.jpegs)
-    with (
-        chromium() as browser
-    ):  # no fixture of the module: while it runs, this thread runs no other event loop
+    with chromium() as browser:  # no fixture: while it runs, this thread runs no other event loop
         page = browser.new_page()
         page.goto(f"http://{live.address}/openapi.json")
         shown = page.evaluate(WATCH)
