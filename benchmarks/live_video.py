@@ -1,20 +1,21 @@
-"""Bandwidth, delay and processor time of live pictures as H.264 beside JPEG, for one viewer and for twenty.
+"""Bandwidth, delay and processor time of live pictures: JPEG, H.264, and WHEP, for one viewer and for twenty.
 
 python -m deltalight.benchmarks.live_video
 
 The demo's recording is relit once (a minute in software); its pictures then go to a web process of their own at the
-recording's rate, and from there to viewers on loopback, each by `WS /live`.
+recording's rate, and from there to viewers on loopback, each by `WS /live` or `POST /whep`.
 """
 
 import argparse
 import asyncio
 import itertools
+import os
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import cast
@@ -35,13 +36,14 @@ from deltalight.protocol.messages import CompositeMessage
 from deltalight.protocol.publisher import Publisher
 from deltalight.services import ports
 from deltalight.services.demo import RECORDING
-from deltalight.services.h264 import H264Decoder
+from deltalight.services.h264 import H264Decoder, rgb_picture
 from deltalight.services.live_message import LiveHeader, Row, unpack
 
 SIZES = ((640, 480), (320, 240))
 MOTIONS = ("moving", "still", "paused")
-CODECS = ("jpeg", "h264")
+WAYS = ("jpeg", "h264", "whep")
 CROWDS = (1, 20)
+LONG_START_CODE = b"\0\0\0\1"
 RATE_PER_S = 15.0  # of the demo's recording
 NOISE_CODES = 1.5  # of a still camera's pictures, r.m.s.; those of a paused replay are equal
 SETTLING_S = 2.0  # before each measurement, for keys and refinement
@@ -60,8 +62,12 @@ class Relit:
 
 @dataclass
 class Seen:
-    """What viewers got; delays are those of the one that decodes, from sending to its decoded picture."""
+    """What viewers got; delays are those of the one that decodes, from sending to its decoded picture.
 
+    By WHEP no header says when a picture was captured; a WebSocket beside it tells.
+    """
+
+    joined: int = 0
     bytes: int = 0
     messages: int = 0
     delays_ms: list[float] = field(default_factory=list)
@@ -120,6 +126,26 @@ def coded(relit: Sequence[Relit], size: tuple[int, int], motion: str) -> list[tu
     return made
 
 
+@dataclass
+class Matched:
+    """When pictures were captured, as a WebSocket's headers say, and when a peer had decoded them, by access unit.
+
+    Both get the same access units, but for the length of start codes.
+    """
+
+    captured_ns: dict[bytes, int] = field(default_factory=dict)
+    decoded_ns: dict[bytes, int] = field(default_factory=dict)
+
+    def delays_ms(self) -> list[float]:
+        """Return the delays of the pictures that both got."""
+        both = self.captured_ns.keys() & self.decoded_ns.keys()
+        return [(self.decoded_ns[unit] - self.captured_ns[unit]) / 1e6 for unit in both]
+
+
+def _unit(data: bytes) -> bytes:
+    return data.replace(LONG_START_CODE, LONG_START_CODE[1:])
+
+
 @contextmanager
 def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> Iterator[None]:
     """Publish pictures in turn, at the recording's rate, as captured at that moment."""
@@ -166,7 +192,8 @@ def web_process(stream_port: int) -> Iterator[httpx.Client]:
             data,
         ]
         command += ["--control", ports.endpoint(control_port), "--subscribe", ports.endpoint(stream_port)]
-        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        env = {**os.environ, "DELTALIGHT_API__WHEP_SESSIONS": str(max(CROWDS))}
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=env)
         try:
             deadline_s = time.monotonic() + START_TIMEOUT_S
             while not ports.answers(port):
@@ -183,12 +210,13 @@ def web_process(stream_port: int) -> Iterator[httpx.Client]:
 async def _view(address: str, codec: str, seen: Seen, measures: asyncio.Event, decoder: bool) -> None:
     from websockets.asyncio.client import connect
 
-    h264, header = H264Decoder(), None
+    h264, header, has_joined = H264Decoder(), None, False
     async with connect(f"{address}?codec={codec}", max_size=None, compression=None) as socket:
         while True:
             message = await socket.recv()
             assert isinstance(message, bytes)
             await socket.send("ack")
+            has_joined, seen.joined = True, seen.joined + (not has_joined)
             if decoder:
                 header, content = unpack(message, header)
                 _decode(h264, header, content)
@@ -208,14 +236,66 @@ def _decode(h264: H264Decoder, header: LiveHeader, content: bytes) -> None:
         h264.decode(content, width, height)
 
 
-async def _crowd(client: httpx.Client, codec: str, viewers: int, seconds: float) -> tuple[Seen, float]:
+async def _watch(address: str, seen: Seen, measures: asyncio.Event, matched: Matched | None) -> None:
+    """Watch by WHEP; the one with `matched` decodes, and notes there when."""
+    from av import CodecContext, Packet
+
+    from deltalight.benchmarks.whep_viewer import WhepViewer
+
+    h264, has_joined = CodecContext.create("h264", "r"), False
+
+    def take(data: bytes) -> None:
+        nonlocal has_joined
+        has_joined, seen.joined = True, seen.joined + (not has_joined)
+        if matched is not None:
+            for frame in h264.decode(Packet(data)):
+                rgb_picture(frame)
+        if measures.is_set():
+            seen.messages += 1
+            if matched is not None:
+                matched.decoded_ns[_unit(data)] = time.time_ns()
+
+    async with WhepViewer(address, take) as viewer:
+        await measures.wait()
+        before = await viewer.received_bytes()
+        try:
+            await asyncio.Future()
+        finally:
+            seen.bytes += await viewer.received_bytes() - before
+
+
+async def _note_captures(address: str, matched: Matched) -> None:
+    """Note when each picture in H.264 was captured."""
+    from websockets.asyncio.client import connect
+
+    header = None
+    async with connect(f"{address}?codec=h264", max_size=None, compression=None) as socket:
+        while True:
+            message = await socket.recv()
+            assert isinstance(message, bytes)
+            await socket.send("ack")
+            header, content = unpack(message, header)
+            if content:
+                matched.captured_ns[_unit(content)] = header.capture_ns
+
+
+async def _crowd(client: httpx.Client, way: str, viewers: int, seconds: float) -> tuple[Seen, float]:
     """Return what viewers got together, and the web process's share of a core."""
-    address = str(client.base_url).rstrip("/").replace("http", "ws", 1) + "/live"
-    seen, measures = Seen(), asyncio.Event()
-    tasks = [
-        asyncio.create_task(_view(address, codec, seen, measures, decoder=number == 0))
-        for number in range(viewers)
-    ]
+    base = str(client.base_url).rstrip("/")
+    socket, whep = base.replace("http", "ws", 1) + "/live", f"{base}/whep"
+    seen, measures, matched = Seen(), asyncio.Event(), Matched()
+
+    def viewer(number: int) -> Coroutine[None, None, None]:
+        if way == "whep":
+            return _watch(whep, seen, measures, matched if number == 0 else None)
+        return _view(socket, way, seen, measures, decoder=number == 0)
+
+    tasks = [asyncio.create_task(viewer(number)) for number in range(viewers)]
+    if way == "whep":
+        tasks.append(asyncio.create_task(_note_captures(socket, matched)))
+    async with asyncio.timeout(START_TIMEOUT_S):
+        while seen.joined < viewers:
+            await asyncio.sleep(0.05)
     await asyncio.sleep(SETTLING_S)
     before = sample(client)
     measures.set()
@@ -225,6 +305,7 @@ async def _crowd(client: httpx.Client, codec: str, viewers: int, seconds: float)
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+    seen.delays_ms += matched.delays_ms()
     return seen, (after.cpu_s[WEB] - before.cpu_s[WEB]) / (after.at_s - before.at_s)
 
 
@@ -237,7 +318,7 @@ def main() -> None:
     for head in (
         "size",
         "camera",
-        "codec",
+        "as",
         "viewers",
         "kbit/s each",
         "pictures/s",
@@ -251,12 +332,12 @@ def main() -> None:
     with web_process(stream_port) as client:
         for size, motion in itertools.product(SIZES, MOTIONS):
             with publishing(stream_port, coded(relit, size, motion)):
-                for codec, viewers in itertools.product(CODECS, CROWDS):
-                    seen, cores = asyncio.run(_crowd(client, codec, viewers, seconds))
+                for way, viewers in itertools.product(WAYS, CROWDS):
+                    seen, cores = asyncio.run(_crowd(client, way, viewers, seconds))
                     table.add_row(
                         f"{size[0]}x{size[1]}",
                         motion,
-                        codec,
+                        way,
                         str(viewers),
                         f"{8e-3 * seen.bytes / seconds / viewers:.0f}",
                         f"{seen.messages / seconds / viewers:.1f}",

@@ -38,6 +38,7 @@ from deltalight.services.commands.replay import replay
 from deltalight.services.commands.rooms import rooms
 from deltalight.services.commands.schema import schema
 from deltalight.services.commands.server import server
+from deltalight.services.commands.stream import stream
 from deltalight.services.commands.up import up
 from deltalight.services.commands.virtual_camera import virtual_camera
 from deltalight.services.logs import configure_logging
@@ -90,6 +91,7 @@ for command in (
     board,
     ping,
     virtual_camera,
+    stream,
 ):
     app.command(epilog=examples_of(command.__name__))(command)
 app.add_typer(api, name="api")

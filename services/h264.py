@@ -15,6 +15,7 @@ from deltalight.protocol.errors import DeltalightError, install_command
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
+    from av.video.frame import VideoFrame
 
 SOFTWARE, NVENC = "libx264", "h264_nvenc"
 NO_AV = f"H.264 needs the package av (PyAV): {install_command('av')}."
@@ -131,7 +132,6 @@ class H264Decoder:
             DeltalightError: it is damaged, or builds on one that did not come.
         """
         import av
-        from av.video.reformatter import ColorRange, Colorspace
 
         try:
             frames = self._context.decode(av.Packet(data))
@@ -141,13 +141,20 @@ class H264Decoder:
             raise DeltalightError(
                 "An H.264 picture cannot be decoded: it has not the size that its header says."
             )
-        picture = frames[0].reformat(
-            format="rgb24",
-            src_colorspace=Colorspace.ITU709,
-            src_color_range=ColorRange.MPEG,
-            dst_color_range=ColorRange.JPEG,
-        )
-        return picture.to_ndarray()[:height, :width].astype(np.uint8, copy=False)
+        return rgb_picture(frames[0])[:height, :width]
+
+
+def rgb_picture(frame: "VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
+    """Return a decoded picture of this encoder's streams, sRGB."""
+    from av.video.reformatter import ColorRange, Colorspace
+
+    picture = frame.reformat(
+        format="rgb24",
+        src_colorspace=Colorspace.ITU709,
+        src_color_range=ColorRange.MPEG,
+        dst_color_range=ColorRange.JPEG,
+    )
+    return picture.to_ndarray().astype(np.uint8, copy=False)
 
 
 def even_sized(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:

@@ -30,6 +30,7 @@ from deltalight.services.api.routes import (
     shelf,
     snapshots,
     state,
+    whep,
 )
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.static_page import StaticPage
@@ -44,6 +45,7 @@ ROUTERS = (
     *room.ROUTERS,
     *shelf.ROUTERS,
     *live.ROUTERS,
+    *whep.ROUTERS,
     *recordings.ROUTERS,
     *recording_videos.ROUTERS,
     *snapshots.ROUTERS,
@@ -119,6 +121,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
             each.live.attach(asyncio.get_running_loop())
         all_rooms.start()
         yield
+        await context.whep.close()
         await run_in_threadpool(all_rooms.close)
 
     rules = AuthRules(
@@ -146,6 +149,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
                 tokens=store.tokens,
                 tickets=context.tickets,
                 problems=context.problems,
+                streams=context.streams,
                 secrets=_secret_tokens(settings),
             ),
         ],

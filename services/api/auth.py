@@ -27,6 +27,7 @@ OPEN_PATHS = frozenset({"/api/v1/health", "/api/v1/ready"})  # they reveal nothi
 STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # endless responses that are no WebSockets
 # POST requests without side effects.
 READ_ONLY_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
+WHEP_PATH = "/api/v1/whep"  # its sessions, below it, show pictures and change nothing
 WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE = 1 / 6, 10
 LOOPBACK_NAMES = frozenset({LOOPBACK, "localhost", "::1"})
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -58,6 +59,7 @@ class AuthMiddleware:
         tokens: TokenStore,
         tickets: Tickets,
         problems: Problems,
+        streams: StreamLimits,
         secrets: Sequence[SecretToken] = (),
     ) -> None:
         self._app = app
@@ -68,7 +70,7 @@ class AuthMiddleware:
         self._problems = problems
         self._rate = RateLimit(rules.requests_per_s, 2 * rules.requests_per_s)
         self._wrong_tokens = RateLimit(WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE)
-        self._streams = StreamLimits()
+        self._streams = streams
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer it here."""
@@ -199,7 +201,12 @@ class _BodyLimit:
 
 
 def _takes_tickets(scope: Scope) -> bool:
-    return scope["type"] == "websocket" or scope["method"] in SAFE_METHODS
+    return scope["type"] == "websocket" or scope["method"] in SAFE_METHODS or _is_whep(scope)
+
+
+def _is_whep(scope: Scope) -> bool:
+    path: str = scope["path"]
+    return path == WHEP_PATH or path.startswith(f"{WHEP_PATH}/")
 
 
 def _is_read_only(scope: Scope) -> bool:

@@ -13,6 +13,7 @@ from deltalight.services.api.camera_finder import CameraFinder
 from deltalight.services.api.credentials import Tickets
 from deltalight.services.api.events import EventHub
 from deltalight.services.api.fisheye import FisheyeView
+from deltalight.services.api.limits import StreamLimits
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.metrics import Metrics
 from deltalight.services.api.models import SceneAnswer
@@ -26,6 +27,7 @@ from deltalight.services.api.replay_control import ReplayControl
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.streams import ProcessWatch
+from deltalight.services.api.whep import WhepSessions
 from deltalight.services.storage.documents import Edit
 from deltalight.services.storage.faults import NotFoundError
 from deltalight.services.storage.scenes import StoredScene
@@ -70,6 +72,8 @@ class Context:
     problems: Problems
     metrics: Metrics
     pools: Mapping[PoolName, Pool]
+    streams: StreamLimits
+    whep: WhepSessions
     room: str
     server_name: str  # in its render server's messages, until there is one
     others: list["Context"] = field(default_factory=list)

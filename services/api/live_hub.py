@@ -78,6 +78,24 @@ class Viewer:
             await arrived.wait()
         return None
 
+    async def next_video(self) -> VideoPicture | None:
+        """Wait for the next picture in H.264; None = the stream has ended, or there is no H.264 (any more)."""
+        while not self._hub.has_ended and self._hub.video.why_not is None:
+            arrived = self._hub.arrived
+            picture = self._next_coded()
+            if picture is not None:
+                self._take(picture.frame)
+                return picture
+            if self._track is not None and self._track.has_failed:
+                return None
+            await arrived.wait()
+        return None
+
+    def want_key(self) -> None:
+        """Go on with a key: what came before was lost."""
+        self._coded = None
+        self._hub.wake()
+
     @property
     def _is_coded(self) -> bool:
         return self._track is not None and not self._track.has_failed

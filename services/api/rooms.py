@@ -13,6 +13,7 @@ from deltalight.services.api.credentials import Tickets
 from deltalight.services.api.event_relay import EventRelay
 from deltalight.services.api.events import EventHub
 from deltalight.services.api.fisheye import FisheyeView
+from deltalight.services.api.limits import StreamLimits
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.metrics import Metrics
 from deltalight.services.api.models import ProcessAnswer
@@ -27,6 +28,7 @@ from deltalight.services.api.routes import recordings
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.streams import ProcessWatch, Sink, Streams
+from deltalight.services.api.whep import WhepSessions
 from deltalight.services.host_store import activate_first
 from deltalight.services.rooms.directory import DirectoryClient
 from deltalight.services.rooms.follower import RoomFollower
@@ -138,6 +140,8 @@ class _Builder:
         self._videos = RecordingVideos(self._recordings)
         self._snapshots = SnapshotStore(store.folder / "snapshots")
         self._pools = make_pools()
+        self._streams = StreamLimits()
+        self._whep = WhepSessions(settings, store.tokens, self._streams)
 
     def close(self) -> None:
         """End what the rooms share."""
@@ -211,6 +215,8 @@ class _Builder:
             problems=self._problems,
             metrics=Metrics(self._problems, watch, link, live_hub, events),
             pools=self._pools,
+            streams=self._streams,
+            whep=self._whep,
             room=room,
             server_name=RENDER_SERVER if control is not None else room,
         )

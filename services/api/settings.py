@@ -57,6 +57,14 @@ class ApiSettings(StrictModel):
         description="Endpoint of the directory of rooms, which says where their render servers and nodes are; null = "
         "one room, at `control` and `subscribe`.",
     )
+    whep_host: str | None = Field(
+        default=None,
+        description="Address of this host at which viewers by WHEP (WebRTC) are sent pictures, on UDP ports that the "
+        "system chooses; null = `host`. 0.0.0.0 = all.",
+    )
+    whep_sessions: int = Field(
+        default=16, ge=0, le=192, description="Viewers by WHEP at a time; 0 switches it off."
+    )
     upload_limit_mb: int = Field(default=256, ge=1, le=512, description="Greatest size of an upload, MB.")
     recording_limit_mb: int = Field(
         default=4096, ge=1, le=65_536, description="Greatest size of an uploaded recording, MB."
@@ -69,10 +77,10 @@ class ApiSettings(StrictModel):
         description="Requests a second that one client may send for long; twice as many at once.",
     )
 
-    @field_validator("host")
+    @field_validator("host", "whep_host")
     @classmethod
-    def _check_host(cls, host: str) -> str:
-        if host != "localhost":
+    def _check_host(cls, host: str | None) -> str | None:
+        if host not in (None, "localhost"):
             ip_address(host)  # a name would be resolved, and could change its meaning
         return host
 

@@ -26,6 +26,10 @@ EXAMPLES = {
     "schema": ("deltalight schema scene",),
     "board": ("deltalight board -o board.pdf",),
     "virtual_camera": ("deltalight virtual-camera --device /dev/video10",),
+    "stream": (
+        "deltalight stream --to rtsp://media.example:8554/room",
+        "deltalight stream --to rtmp://media.example/live/room",
+    ),
     "ping": ("deltalight ping tcp://127.0.0.1:5603",),
 }
 

@@ -2,17 +2,12 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from deltalight.services.commands.options import ConfigFile, parse_size
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from deltalight.protocol.receiver import Receiver
 
 PERIOD_S = 1 / 25  # programs take a camera for frozen that gives less
 
@@ -34,6 +29,7 @@ def virtual_camera(
     """Show relit pictures as a webcam, for OBS and calls, until Ctrl-C."""
     from deltalight.protocol.keys import KeySettings
     from deltalight.protocol.receiver import Receiver
+    from deltalight.services.relit_pictures import newest_picture
     from deltalight.services.settings import load_configuration
     from deltalight.services.virtual_camera import VirtualCamera
 
@@ -44,25 +40,11 @@ def virtual_camera(
         closing(Receiver([composites], ["composite"], keys=keys)) as receiver,
     ):
         typer.echo(f"Waiting for the first picture of {composites}.", err=True)
-        while (picture := _newest(receiver)) is None:
+        while (picture := newest_picture(receiver, PERIOD_S)) is None:
             pass
         camera.begin(size_px or (picture.shape[1], picture.shape[0]))
         typer.echo(f"{device} shows the relit picture, {camera.size[0]}x{camera.size[1]}; Ctrl-C ends it.")
         while True:
             camera.show(picture)
-            newer = _newest(receiver)
+            newer = newest_picture(receiver, PERIOD_S)
             picture = picture if newer is None else newer
-
-
-def _newest(receiver: "Receiver") -> "np.ndarray | None":
-    """Return the newest relit picture that comes within the camera's period."""
-    from deltalight.protocol.envelope import decode
-    from deltalight.protocol.messages import CompositeMessage
-    from deltalight.protocol.pictures import decode_rgb
-    from deltalight.services.relit_pictures import relit_picture
-
-    for multipart in (receiver.latest(PERIOD_S) or {}).values():
-        message, parts = decode(multipart)
-        if isinstance(message, CompositeMessage) and (coded := relit_picture(message, parts)) is not None:
-            return decode_rgb(coded, "of the render server")
-    return None

@@ -1,7 +1,8 @@
 """schemathesis over the whole OpenAPI description: no 5xx, and every answer keeps to what is described.
 
-Not covered, because no description holds them: the WebSockets and the endless `live.mjpg`. Render server, node
-and the children that record and replay are stand-ins, so that no request waits for a frame.
+Not covered, because no description holds them: the WebSockets and the endless `live.mjpg`; nor `POST /whep`, whose
+SDP schemathesis cannot make. Render server, node and the children that record and replay are stand-ins, so that no
+request waits for a frame.
 """
 
 import copy
@@ -129,6 +130,7 @@ def configuration(known: dict[str, Sequence[str | int]]) -> str:
 @pytest.mark.slow
 def test_answers_keep_to_the_description(full_api: RunningApi, tmp_path: Path) -> None:
     description = copy.deepcopy(full_api.app.openapi())  # type: ignore[attr-defined]
+    del description["paths"]["/api/v1/whep"]
     (tmp_path / "openapi.json").write_text(json.dumps(with_plain_tuples(description)))
     (tmp_path / "schemathesis.toml").write_text(configuration(fill(full_api)))
     options = ("--checks", ",".join(CHECKS), "--max-examples", "8", "--generation-deterministic")
@@ -163,8 +165,9 @@ def test_the_description_tells_what_clients_need(api: RunningApi) -> None:
     for _, method, operation in operations(description):
         assert operation["tags"]
         assert operation["summary"]
-        if "requestBody" in operation and "octet-stream" not in str(operation["requestBody"]):
-            body = operation["requestBody"]["content"]["application/json"]
+        content = operation.get("requestBody", {}).get("content", {})
+        if content and not content.keys() & {"application/octet-stream", "application/sdp"}:
+            body = content["application/json"]
             assert body["schema"].get("examples"), (method, operation["operationId"])
         for status, response in operation["responses"].items():
             assert status < "400" or list(response["content"]) == [PROBLEM]

@@ -68,6 +68,7 @@ COMMANDS = {
     "bench sweep",
     "gpu-check",
     "virtual-camera",
+    "stream",
 }
 
 

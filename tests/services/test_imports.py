@@ -4,6 +4,7 @@ server starts without what it may never need."""
 import ast
 from functools import cache
 from graphlib import TopologicalSorter
+from pathlib import Path
 
 from tests.services.conftest import ROOT
 
@@ -52,7 +53,19 @@ def test_benchmarks_are_imported_through_their_entry_alone() -> None:
 
 def test_render_servers_import_slow_libraries_where_they_use_them() -> None:
     for path in (ROOT / "render_server").rglob("*.py"):
-        lines = ast.parse(path.read_text()).body
-        when_loaded = [line for line in lines if isinstance(line, ast.Import | ast.ImportFrom)]
-        found = {name.split(".")[0] for line in when_loaded for name in imported(ast.unparse(line))}
+        found = {name.split(".")[0] for name in imported_when_loaded(path)}
         assert not found & SLOW_TO_IMPORT, path
+
+
+def test_aiortc_is_imported_when_somebody_watches_by_whep() -> None:
+    webrtc = ROOT / "services" / "api" / "webrtc.py"
+    assert "aiortc" in imported_when_loaded(webrtc)
+    for path in {*(ROOT / "services").rglob("*.py")} - {webrtc}:
+        found = imported_when_loaded(path)
+        assert not {name for name in found if name.startswith("aiortc") or name.endswith(".webrtc")}, path
+
+
+def imported_when_loaded(path: Path) -> set[str]:
+    lines = ast.parse(path.read_text()).body
+    when_loaded = [line for line in lines if isinstance(line, ast.Import | ast.ImportFrom)]
+    return {name for line in when_loaded for name in imported(ast.unparse(line))}

@@ -10,65 +10,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 import websockets
-from jaxtyping import UInt8
 from playwright.sync_api import Browser
 from websockets.sync.client import ClientConnection
 
-from deltalight.protocol.codecs import decode_color, encode_color
-from deltalight.protocol.envelope import encode
+from deltalight.protocol.codecs import decode_color
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.publisher import Publisher
 from deltalight.services import ports
 from deltalight.services.api.live_video import KEY_INTERVAL_S
 from deltalight.services.h264 import H264Decoder, H264Encoder
 from deltalight.services.live_message import LiveHeader, unpack
-from tests.services.api_samples import RenderServer, running_api
+from tests.services.api_samples import running_api
 from tests.services.dashboard_samples import NEEDS_BROWSER, complaints_of
-from tests.services.live_samples import composite, event_socket, live_socket, next_event, wait_for_frames
+from tests.services.live_samples import event_socket, live_socket, next_event
+from tests.services.moving_samples import (
+    HEIGHT,
+    WIDTH,
+    MovingStream,
+    Picture,
+    Running,
+    moving_api,
+    psnr_db,
+)
 
-Picture = UInt8[np.ndarray, "h w 3"]
-WIDTH, HEIGHT = 160, 120
 LEAST_PSNR_DB = 36.0  # of a picture from its JPEG; the encoder's constant quality gives 38 to 42
-PERIOD_S = 0.04
 PATIENCE_S = 30.0
-
-
-class MovingStream:
-    """Publishes a moving picture of smooth shapes and some texture; none while it `is_paused`."""
-
-    def __init__(self, port: int, width: int = WIDTH, height: int = HEIGHT) -> None:
-        self.size, self.is_paused, self.is_still = (width, height), False, False
-        self.jpegs: dict[int, bytes] = {}  # by frame id
-        self._publisher = Publisher(ports.endpoint(port))
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._publisher.close()
-
-    def _run(self) -> None:
-        number, phase = 0, 0
-        while not self._stop.wait(PERIOD_S):
-            if self.is_paused:
-                continue
-            number, phase = number + 1, phase + (not self.is_still)
-            width, height = self.size
-            self.jpegs[number] = encode_color(picture(width, height, phase))
-            camera = composite(1).camera | {"width": width, "height": height}
-            message = composite(number).model_copy(
-                update={"shape": (height, width, 3), "camera": camera, "reused_pass_times_ms": {}}
-            )
-            self._publisher.send(encode(message, [self.jpegs[number]]))
-
-
-def picture(width: int, height: int, phase: int) -> Picture:
-    """Coloured shapes with soft edges that move by two pixels a phase."""
-    rows, columns = np.mgrid[:height, :width]
-    waves = [np.sin((columns + 2 * phase) / 17.0), np.cos(rows / 13.0), np.sin((rows + columns) / 23.0)]
-    return np.stack([127 + 100 * wave for wave in waves], axis=-1).astype(np.uint8)
 
 
 class Viewer:
@@ -102,41 +67,12 @@ class Viewer:
         pytest.fail(f"no picture came as {codec}")
 
 
-def psnr_db(one: Picture, other: Picture) -> float:
-    return float(10 * np.log10(255**2 / max(1e-6, np.mean((one.astype(float) - other) ** 2))))
-
-
-class Running:
-    """A web process over a moving stream."""
-
-    def __init__(self, address: str, stream: MovingStream) -> None:
-        self.address, self.stream = address, stream
-
-    def agrees(self, header: LiveHeader, seen: Picture | None) -> float:
-        """PSNR of a picture from the JPEG of its frame, dB."""
-        assert seen is not None
-        jpeg = memoryview(self.stream.jpegs[header.frame_id])
-        return psnr_db(seen, decode_color(jpeg, "jpeg", seen.shape))
-
-
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    control, published = ports.private_ports(2)
-    stream, server = MovingStream(published), RenderServer(control)
-    try:
-        with running_api(
-            tmp_path_factory.mktemp("data"),
-            control=ports.endpoint(control),
-            subscribe=[ports.endpoint(published)],
-        ) as api:
-            address = f"{ports.LOOPBACK}:{api.client.base_url.port}"
-            wait_for_frames(address)
-            scene = api.client.post("/scenes", json={"name": "live"}).json()["id"]
-            api.client.post(f"/scenes/{scene}/activate").raise_for_status()
-            yield Running(address, stream)
-    finally:
-        stream.close()
-        server.close()
+    with moving_api(tmp_path_factory.mktemp("data")) as running:
+        scene = running.api.client.post("/scenes", json={"name": "live"}).json()["id"]
+        running.api.client.post(f"/scenes/{scene}/activate").raise_for_status()
+        yield running
 
 
 @pytest.fixture

@@ -63,6 +63,7 @@ class Settings(BaseModel):
     has_poster: bool = Field(description="Whether `/poster.jpg` stands for the live picture until it comes.")
     live_codecs: list[LiveCodec] = Field(description="What `WS /live` sends pictures as, for the asking.")
     no_h264: str | None = Field(description="Why `h264` is not among them; null where it is.")
+    no_whep: str | None = Field(description="Why `POST /whep` gives no pictures; null where it does.")
 
 
 class NodeAnswer(ProcessAnswer):
@@ -136,6 +137,7 @@ def settings(shared: Shared) -> Settings:
         has_poster=shared.store.poster.is_file(),
         live_codecs=["jpeg", "h264"] if shared.live.video.why_not is None else ["jpeg"],
         no_h264=shared.live.video.why_not,
+        no_whep=shared.whep.why_not,
     )
 
 

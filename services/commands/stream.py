@@ -1,0 +1,86 @@
+"""`deltalight stream`: the relit picture to a media server."""
+
+import time
+from contextlib import closing
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.live import Live
+
+from deltalight.services.commands.options import ConfigFile
+from deltalight.services.ports import COMPOSITE_PORT, endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+
+    from deltalight.protocol.receiver import Receiver
+    from deltalight.services.stream_out import StreamOut, StreamStatus
+
+SHOW_PERIOD_S = 0.5
+
+
+def stream(
+    *,
+    to: Annotated[
+        str,
+        typer.Option(
+            envvar="DELTALIGHT_STREAM_TO",
+            show_envvar=True,
+            help="Address of the media server, such as rtsp://HOST:8554/NAME or rtmp://HOST/live/NAME.",
+        ),
+    ],
+    composites: Annotated[
+        str, typer.Option(help="Endpoint at which the render server publishes relit pictures.")
+    ] = endpoint(COMPOSITE_PORT),
+    config_file: ConfigFile = None,
+) -> None:
+    """Send the relit picture to a media server (H.264), for many viewers, until Ctrl-C."""
+    from deltalight.protocol.errors import DeltalightError
+    from deltalight.protocol.keys import KeySettings
+    from deltalight.protocol.receiver import Receiver
+    from deltalight.services.h264 import why_unavailable
+    from deltalight.services.settings import load_configuration
+    from deltalight.services.stream_out import StreamOut, Target
+
+    target = Target.parse(to)
+    reason = why_unavailable()
+    if reason is not None:
+        raise DeltalightError(reason)
+    keys = load_configuration(config_file).section("keys", KeySettings).load([composites])
+    console = Console(stderr=True, soft_wrap=True)
+
+    def tell(sentence: str) -> None:
+        console.print(sentence, markup=False, highlight=False)
+
+    with (
+        closing(Receiver([composites], ["composite"], keys=keys)) as receiver,
+        StreamOut(target, tell) as out,
+    ):
+        tell(f"Waiting for the first picture of {composites}.")
+        with Live(console=console, transient=True, auto_refresh=False) as live:
+            _send_all(receiver, out, lambda status: live.update(_line(status), refresh=True))
+
+
+def _send_all(receiver: "Receiver", out: "StreamOut", show: "Callable[[StreamStatus], None]") -> None:
+    """Send each picture, and the last one again while none comes."""
+    from deltalight.services.relit_pictures import newest_picture
+    from deltalight.services.stream_out import REPEAT_AFTER_S
+
+    picture: np.ndarray | None = None
+    shown_s = 0.0
+    while True:
+        newer = newest_picture(receiver, REPEAT_AFTER_S)
+        picture = picture if newer is None else newer
+        if picture is not None:
+            out.show(picture)
+        if time.monotonic() - shown_s >= SHOW_PERIOD_S:
+            shown_s = time.monotonic()
+            show(out.status)
+
+
+def _line(status: "StreamStatus") -> str:
+    state = "connected" if status.is_connected else "not connected"
+    return f"{state}: {status.pictures} pictures, {status.bytes / 1e6:.1f} MB sent"

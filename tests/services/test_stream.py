@@ -1,0 +1,183 @@
+"""The way out to a media server: real receivers (FFmpeg, listening by RTSP and RTMP) in processes of their own."""
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services import h264, ports, stream_out
+from deltalight.services.stream_out import NO_SRT, StreamOut, Target
+from tests.services.conftest import ROOT, RunCli
+from tests.services.moving_samples import HEIGHT, WIDTH, MovingStream, picture, psnr_db
+
+LEAST_PSNR_DB = 35.0
+PATIENCE_S = 60.0
+PHASES = 40
+# Decodes what comes, and keeps each picture in a folder.
+RECEIVER = """
+import sys
+from pathlib import Path
+import av
+import numpy as np
+from deltalight.services.h264 import rgb_picture
+url, folder, options = sys.argv[1], Path(sys.argv[2]), dict(each.split("=") for each in sys.argv[3:])
+with av.open(url, options=options) as container:
+    for number, frame in enumerate(container.decode(video=0)):
+        np.save(folder / "part.npy", rgb_picture(frame))
+        (folder / "part.npy").rename(folder / f"{number:06d}.npy")
+"""
+LISTENING = {
+    "rtsp": {"rtsp_flags": "listen", "listen_timeout": "60"},
+    "rtmp": {"listen": "1", "analyzeduration": "100000"},
+}
+
+
+class Receiver:
+    """A process that listens at an address until it is killed."""
+
+    def __init__(self, url: str, folder: Path) -> None:
+        folder.mkdir()
+        options = [f"{key}={value}" for key, value in LISTENING[url.partition(":")[0]].items()]
+        command = [sys.executable, "-c", RECEIVER, url, str(folder), *options]
+        self._process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+        self._folder = folder
+
+    @property
+    def pictures(self) -> list[np.ndarray]:
+        return [np.load(path) for path in sorted(self._folder.glob("0*.npy"))]
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+
+@contextmanager
+def receiving(url: str, folder: Path) -> Iterator[Receiver]:
+    receiver = Receiver(url, folder)
+    try:
+        yield receiver
+    finally:
+        receiver.close()
+
+
+def show_until(out: StreamOut, is_enough: Callable[[], object]) -> None:
+    """Show pictures that move, ten a second, until there is enough."""
+    deadline_s, phase = time.monotonic() + PATIENCE_S, 0
+    while not is_enough():
+        assert time.monotonic() < deadline_s
+        out.show(picture(WIDTH, HEIGHT, phase % PHASES))
+        phase += 1
+        time.sleep(0.1)
+
+
+def agreements_db(pictures: list[np.ndarray]) -> list[float]:
+    """PSNR of each from the shown picture that agrees most."""
+    shown = [picture(WIDTH, HEIGHT, phase) for phase in range(PHASES)]
+    return [max(psnr_db(seen, each) for each in shown) for seen in pictures]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["rtsp", "rtmp"])
+def test_pictures_arrive_and_resume_when_the_receiver_comes_back(
+    scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream_out, "FIRST_WAIT_S", 0.3)
+    monkeypatch.setattr(stream_out, "LONGEST_WAIT_S", 0.6)
+    (port,) = ports.private_ports(1)
+    url, told = f"{scheme}://{ports.LOOPBACK}:{port}/live/room", list[str]()
+    with StreamOut(Target.parse(url), told.append) as out:
+        for part in ("before", "after"):
+            with receiving(url, tmp_path / part) as receiver:
+                show_until(out, lambda receiver=receiver: len(receiver.pictures) > 5)  # type: ignore[misc]
+                assert min(agreements_db(receiver.pictures)) > LEAST_PSNR_DB
+            show_until(out, lambda: not out.status.is_connected)
+    place = f"{scheme}://{ports.LOOPBACK}:{port}"
+    takes = f"{place} takes the relit picture, 160x120; Ctrl-C ends it."
+    assert [each for each in told if "takes no" not in each] == [takes, takes]
+    assert all(
+        each.startswith(place) and each.endswith("trying again until it does.")
+        for each in told
+        if each != takes
+    )
+    assert len(told) == len([each for n, each in enumerate(told) if n == 0 or each != told[n - 1]])
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_command_and_no_line_holds_a_secret(tmp_path: Path) -> None:
+    port, published = ports.private_ports(2)
+    url = f"rtsp://{ports.LOOPBACK}:{port}/stream-key"
+    stream = MovingStream(published)
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.services.cli",
+        "stream",
+        "--composites",
+        ports.endpoint(published),
+    ]
+    secret = url.replace("//", "//me:secret@")
+    with receiving(url, tmp_path / "got") as receiver:
+        sending = subprocess.Popen([*command, "--to", secret], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while len(receiver.pictures) < 3:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.1)
+        sending.send_signal(signal.SIGINT)
+        _, printed = sending.communicate(timeout=PATIENCE_S)
+    stream.close()
+    assert sending.returncode == 130, printed
+    assert "takes the relit picture, 160x120" in printed
+    assert "secret" not in printed
+    assert "stream-key" not in printed
+    assert "Traceback" not in printed
+
+
+@pytest.mark.slow
+def test_a_server_that_refuses_or_never_answers_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream_out, "FIRST_WAIT_S", 0.0)
+    monkeypatch.setattr(stream_out, "CLOSE_TIMEOUT_S", 0.0)
+    (port,) = ports.private_ports(1)
+    told = list[str]()
+    target = Target.parse(f"rtsp://{ports.LOOPBACK}:{port}/a")
+    with StreamOut(target, told.append) as out:
+        for _ in range(2):
+            out.show(picture(WIDTH, HEIGHT, 0))
+        assert told == [f"{target.shown} takes no pictures (Connection refused); trying again until it does."]
+        assert out.status.pictures == 0
+        with socket.create_server((ports.LOOPBACK, port)):
+            monkeypatch.setattr(stream_out, "ANSWER_TIMEOUT_S", 3.0)
+            out.show(picture(WIDTH, HEIGHT, 0))
+        assert "(no answer for 3 s)" in told[-1]
+
+
+def test_wrong_addresses_are_one_sentence(cli: RunCli) -> None:
+    for url in (
+        "",
+        "media.example",
+        "http://media.example/a",
+        "rtsp://",
+        "rtsp://h:x/a",
+        "rtsp://h/a b",
+        "rtsp://[/",
+    ):
+        done = cli("stream", "--to", url)
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
+        assert "rtsp://HOST:8554/NAME" in done.stderr
+    with pytest.raises(DeltalightError, match=NO_SRT.split(";", maxsplit=1)[0]):
+        Target.parse("srt://media.example:8890?streamid=publish:room")
+    target = Target.parse("rtmp://me:secret@[::1]:1935/live/key?token=x")
+    assert target.shown == "rtmp://[::1]:1935"
+
+
+def test_without_pyav_a_sentence_says_so(cli: RunCli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(h264, "why_unavailable", lambda: h264.NO_AV)
+    done = cli("stream", "--to", "rtsp://media.example/a")
+    assert (done.returncode, done.stderr.strip()) == (2, f"deltalight: {h264.NO_AV}")
