@@ -14,7 +14,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
-from deltalight.render_server.scene.materials import map_table
+from deltalight.render_server.scene.materials import map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
 from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from deltalight.render_server.view import CameraView, Rectangle
@@ -276,6 +276,7 @@ class MaterialTable:
             table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
         self._buffer = gpu.ctx.buffer(np.ascontiguousarray(table, np.float32).tobytes())
         self._transmittances = gpu.ctx.buffer(_transmittances(mesh).tobytes()) if self.transmits else None
+        self._measured = _measured_texture(gpu, mesh)
 
     def _layer(self, each: TextureMap) -> int:
         array = self._colors if each.is_color else self._data
@@ -293,11 +294,13 @@ class MaterialTable:
             "CUTOUTS": self._has_cutouts,
             "TRANSMISSION": self.transmits,
             "Transmittances": self._transmittances,
+            "MEASURED": self._measured is not None,
+            "measured_brdfs": self._measured,
         }
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._buffer, self._transmittances, self._colors, self._data)
+        release_all(self._buffer, self._transmittances, self._measured, self._colors, self._data)
 
 
 class MapArray:
@@ -330,6 +333,16 @@ class MapArray:
     def release(self) -> None:
         """Frees the texture."""
         self.texture.release()
+
+
+def _measured_texture(gpu: GpuContext, mesh: GpuMesh) -> moderngl.Texture | None:
+    """Returns the table of measured materials; None if there are none."""
+    table = measured_table(mesh.materials)
+    if not len(table):
+        return None
+    texture = texture_2d(gpu, (table.shape[1], len(table)), 4, "f4")
+    texture.write(table.tobytes())
+    return texture
 
 
 def _transmittances(mesh: GpuMesh) -> Float32[np.ndarray, "k 4"]:

@@ -1,0 +1,80 @@
+"""Files of precomputed materials: written once by `deltalight precompute`, named by `material: {precomputed: FILE}`.
+
+A line `deltalight material VERSION SHA256`, then a .npz archive of arrays, of which that is the hash.
+"""
+
+import hashlib
+from io import BytesIO
+from pathlib import Path
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import write_bytes
+from deltalight.render_server.scene.gaussian_brdf import MOST_LOBES, RISE_TERMS, GaussianBrdf
+
+MATERIAL_SUFFIX = ".dlmat"
+VERSION = 1
+_MAGIC = b"deltalight material "
+_LARGEST_BYTES = 1 << 20  # of the arrays
+_ADVICE = "make it with `deltalight precompute SOURCE --out FILE.dlmat`"
+
+
+def write_material(path: Path, brdf: GaussianBrdf) -> None:
+    """Writes a measured material, atomically.
+
+    Raises:
+        DeltalightError: the disk refuses.
+    """
+    stream = BytesIO()
+    np.savez_compressed(stream, diffuse=brdf.diffuse, sigmas=brdf.sigmas, weights=brdf.weights)
+    content = stream.getvalue()
+    head = _MAGIC + f"{VERSION} {hashlib.sha256(content).hexdigest()}\n".encode()
+    write_bytes(path, head + content)
+
+
+def read_material(path: Path) -> GaussianBrdf:
+    """Reads a file of `write_material`.
+
+    Raises:
+        DeltalightError: it cannot be read, is of another kind or version, damaged, or holds what is no such material.
+    """
+    try:
+        with path.open("rb") as file:
+            head, content = file.readline(200), file.read(_LARGEST_BYTES + 1)
+    except OSError as error:
+        raise DeltalightError(f"{path} cannot be read ({error.strerror}); {_ADVICE}.") from error
+    if not head.startswith(_MAGIC) or len(head.split()) != 4:
+        raise DeltalightError(f"{path.name} is no precomputed material; {_ADVICE}.")
+    version, digest = head.split()[2:]
+    if version != str(VERSION).encode():
+        raise DeltalightError(
+            f"{path.name} is a precomputed material of version {version.decode(errors='replace'):.20}, and this release reads "
+            f"version {VERSION}; {_ADVICE}."
+        )
+    if hashlib.sha256(content).hexdigest().encode() != digest:
+        raise DeltalightError(f"{path.name} is damaged or cut short; {_ADVICE} again.")
+    brdf = _unpacked(content)
+    if brdf is None:
+        raise DeltalightError(f"{path.name} holds no sum of Gaussians; {_ADVICE} again.")
+    return brdf
+
+
+def _unpacked(content: bytes) -> GaussianBrdf | None:
+    """The material of an archive; None if it is none."""
+    try:
+        with ZipFile(BytesIO(content)) as archive:
+            if sum(item.file_size for item in archive.infolist()) > _LARGEST_BYTES:
+                return None
+        with np.load(BytesIO(content), allow_pickle=False) as file:
+            arrays = [np.asarray(file[name], np.float64) for name in ("diffuse", "sigmas", "weights")]
+    except (OSError, ValueError, TypeError, KeyError, BadZipFile, EOFError, NotImplementedError):
+        return None
+    diffuse, sigmas, weights = arrays
+    count = len(sigmas) if sigmas.ndim == 1 else 0
+    shapes = diffuse.shape == (3,) and weights.shape == (count, RISE_TERMS, 3) and count <= MOST_LOBES
+    finite = all(np.isfinite(each).all() and (each >= 0).all() for each in arrays)
+    if not (shapes and finite and (sigmas > 1e-3).all() and (sigmas <= np.pi / 2).all()):
+        return None
+    return GaussianBrdf(diffuse, sigmas, weights)
