@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,8 +14,8 @@ from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrd
 BROAD_LOBES = 3
 MIRROR_RANGE_DEG = 3.0  # of the half-vector from the normal: `FitError.off_mirror` leaves these samples out
 _HALVES = 3
-# Widths that are tried first, rad of the half-vector. Of narrow lobes a gonioreflectometer meets a handful of samples: too few
-# to tell how the weight rises with the angle, so a narrow one is a dielectric coat of F0 = 0.04.
+# Widths that are tried first, rad of the half-vector. Of narrow lobes a gonioreflectometer meets a few samples, too
+# few to tell how the weight rises with the angle, so a narrow one is a dielectric coat of F0 = 0.04.
 _COATS = np.geomspace(0.01, 0.06, 10)  # a gonioreflectometer's aperture hides what is narrower
 _BROAD = np.geomspace(0.06, 0.7, 12)
 _COAT_RISE = np.array([0.04] * 5 + [1.0])  # Schlick's term
@@ -58,7 +59,7 @@ class _Fit:
 
     def coat(self, sigma: float) -> Float64[np.ndarray, "n 1"]:
         """Returns the column of a coat."""
-        return self.broad(sigma) @ _COAT_RISE[:, None]
+        return np.asarray(self.broad(sigma) @ _COAT_RISE[:, None])
 
     def broad(self, sigma: float) -> Float64[np.ndarray, "n 6"]:
         """Returns the columns of a lobe whose weight rises as it likes."""
@@ -88,29 +89,34 @@ class _Fit:
         for _ in range(BROAD_LOBES):
             broad.append(min(_BROAD, key=lambda sigma: self.residual(None, [*broad, sigma])))
         coat = float(_COATS[0])
-        for _ in range(_ROUNDS):
-            coat = min(_COATS, key=lambda sigma: self.residual(sigma, broad))
-            for k in range(BROAD_LOBES):
-                broad[k] = min(_BROAD, key=lambda sigma: self.residual(coat, _with(broad, k, sigma)))
-        for _ in range(_ROUNDS):
-            coat = _refined(lambda sigma: self.residual(sigma, broad), coat, _COATS)
-            for k in range(BROAD_LOBES):
-                broad[k] = _refined(
-                    lambda sigma: self.residual(coat, _with(broad, k, sigma)), broad[k], _BROAD
-                )
+        for search in (_best, _refined):
+            for _ in range(_ROUNDS):
+                coat = search(partial(self.residual, broad=broad), coat, _COATS)
+                for k in range(BROAD_LOBES):
+                    broad[k] = search(partial(self._residual_with, coat, broad, k), broad[k], _BROAD)
         return coat, broad
 
+    def _residual_with(self, coat: float, broad: Sequence[float], k: int, sigma: float) -> float:
+        """Returns the residual with another width of lobe `k`."""
+        return self.residual(coat, [*broad[:k], sigma, *broad[k + 1 :]])
 
-def _with(widths: Sequence[float], k: int, sigma: float) -> list[float]:
-    return [*widths[:k], sigma, *widths[k + 1 :]]
+
+Residual = Callable[[float], float]
 
 
-def _refined(residual: Callable[[float], float], sigma: float, tried: Float64[np.ndarray, " n"]) -> float:
+def _best(residual: Residual, _sigma: float, tried: Float64[np.ndarray, " n"]) -> float:
+    return float(min(tried, key=residual))
+
+
+def _refined(residual: Residual, sigma: float, tried: Float64[np.ndarray, " n"]) -> float:
     """Returns the best width within a step of what was tried."""
     step = np.log(tried[1] / tried[0])
     low, high = (np.clip(np.log(sigma) + sign * step, *np.log(tried[[0, -1]])) for sign in (-1, 1))
     found = minimize_scalar(
-        lambda log: residual(float(np.exp(log))), bounds=(low, high), method="bounded", options={"xatol": 1e-3}
+        lambda log: residual(float(np.exp(log))),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 1e-3},
     )
     return float(np.exp(found.x))
 

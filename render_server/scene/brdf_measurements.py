@@ -13,10 +13,11 @@ _LARGEST_BYTES = 64 << 20
 _LEAST_SAMPLES = 100
 _WAVELENGTHS = np.arange(400.0, 701.0, 10.0)  # nm
 # CIE standard illuminant D65, relative power at these wavelengths (ISO/CIE 11664-2).
-_D65 = np.array(
-    [82.75, 91.49, 93.43, 86.68, 104.87, 117.01, 117.81, 114.86, 115.92, 108.81, 109.35, 107.80, 104.79, 107.69]
-    + [104.41, 104.05, 100.00, 96.33, 95.79, 88.69, 90.01, 89.60, 87.70, 83.29, 83.70, 80.03, 80.21, 82.28]
-    + [78.28, 69.72, 71.61]
+_D65 = np.loadtxt(
+    [
+        "82.75 91.49 93.43 86.68 104.87 117.01 117.81 114.86 115.92 108.81 109.35 107.80 104.79 107.69 104.41 104.05"
+        " 100.00 96.33 95.79 88.69 90.01 89.60 87.70 83.29 83.70 80.03 80.21 82.28 78.28 69.72 71.61"
+    ]
 )
 _SRGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 # Terms of the CIE 1931 observer (Wyman et al. 2013, table 1): factor, peak (nm), slopes below and above it (1/nm).
@@ -29,7 +30,7 @@ _OBSERVER = (
 
 @dataclass(frozen=True, eq=False)
 class BrdfMeasurements:
-    """Samples of an isotropic BRDF: unit directions about the normal z, and values (1/sr, linear R G B, at least 0)."""
+    """Samples of an isotropic BRDF: unit directions about the normal z; values, 1/sr, linear R G B, at least 0."""
 
     light: Float64[np.ndarray, "n 3"]
     view: Float64[np.ndarray, "n 3"]
@@ -44,7 +45,7 @@ class BrdfMeasurements:
 
 
 def read_brdf(path: Path) -> BrdfMeasurements:
-    """Reads a `.brdf` file: lines of `#` are comments; then the number of wavelengths, the wavelengths (nm), and rows.
+    """Reads a `.brdf` file: comments behind `#`, the number of wavelengths, the wavelengths (nm), and rows.
 
     A row is theta and phi of the light, theta and phi of the viewer (rad), and the BRDF at each wavelength, 1/sr.
 
@@ -61,8 +62,8 @@ def read_brdf(path: Path) -> BrdfMeasurements:
         )
     if wavelengths[0] > 450 or wavelengths[-1] < 650:
         raise DeltalightError(
-            f"{path.name} was measured from {wavelengths[0]:g} to {wavelengths[-1]:g} nm, which tells no colour; it needs 450 to "
-            "650 nm."
+            f"{path.name} was measured from {wavelengths[0]:g} to {wavelengths[-1]:g} nm, which tells no colour; "
+            "it needs 450 to 650 nm."
         )
     table = rows.reshape(-1, 4 + count)
     light, view = _direction(table[:, :2]), _direction(table[:, 2:4])
@@ -78,7 +79,9 @@ def read_brdf(path: Path) -> BrdfMeasurements:
 def _numbers(path: Path) -> Float64[np.ndarray, " n"]:
     try:
         if path.stat().st_size > _LARGEST_BYTES:
-            raise DeltalightError(f"{path.name} is larger than {_LARGEST_BYTES >> 20} MB; that is no .brdf file.")
+            raise DeltalightError(
+                f"{path.name} is larger than {_LARGEST_BYTES >> 20} MB; that is no .brdf file."
+            )
         lines = path.read_text(encoding="latin-1").splitlines()
     except OSError as error:
         raise DeltalightError(f"{path} cannot be read ({error.strerror}); give a .brdf file.") from error
@@ -86,7 +89,9 @@ def _numbers(path: Path) -> Float64[np.ndarray, " n"]:
         words = " ".join(line for line in lines if not line.lstrip().startswith("#")).split()
         numbers = np.array(words, np.float64)
     except ValueError as error:
-        raise DeltalightError(f"{path.name} holds something else than numbers; it is no .brdf file.") from error
+        raise DeltalightError(
+            f"{path.name} holds something else than numbers; it is no .brdf file."
+        ) from error
     if not np.isfinite(numbers).all():
         raise DeltalightError(f"{path.name} has a value that is not finite; measure or export it again.")
     return numbers

@@ -1,4 +1,4 @@
-"""Measured materials as sums of Gaussians: the model, its integrals and its table for shaders (docs/method.md 6.7)."""
+"""Measured materials as sums of Gaussians: model, integrals and table for shaders (docs/method.md 6.7)."""
 
 import math
 from dataclasses import dataclass
@@ -38,8 +38,8 @@ def lobe_density(
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Returns a lobe of weight 1, 1/sr, and v.h, for unit directions about the normal z.
 
-    The half-vector's Gaussian exp((n.h - 1) / sigma^2) has integral 1; it is divided by 4 (v.h) max(n.l, n.v) (Ashikhmin and
-    Shirley 2000), so that the lobe reflects at most its weight.
+    The half-vector's Gaussian exp((n.h - 1) / sigma^2) has integral 1; it is divided by 4 (v.h) max(n.l, n.v)
+    (Ashikhmin and Shirley 2000), so that the lobe reflects at most its weight.
     """
     half = light + view
     half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
@@ -54,8 +54,8 @@ def lobe_density(
 class GaussianBrdf:
     """An isotropic reciprocal BRDF: a diffuse base and Gaussians of the half-vector; linear R G B.
 
-    `sigmas` are the Gaussians' widths (rad of the half-vector), `weights` the coefficients of `rise_basis`: how much each
-    reflects at which angle between view and half-vector. All are at least 0.
+    `sigmas` are the Gaussians' widths (rad of the half-vector), `weights` the coefficients of `rise_basis`: how much
+    each reflects at which angle between view and half-vector. All are at least 0.
     """
 
     diffuse: Float64[np.ndarray, "3"]  # albedo of the base
@@ -122,8 +122,8 @@ class GaussianBrdf:
     def table_row(self) -> Float32[np.ndarray, "93 4"]:
         """Returns its row of the shaders' table (common/measured.glsl).
 
-        (diffuse albedo, number of lobes); of each lobe (sigma, half-angle, 0, 0), the coefficients of powers of 1 - v.h,
-        and its albedo at even steps of n.v.
+        (diffuse albedo, number of lobes); of each lobe (sigma, half-angle, 0, 0), the coefficients of powers of
+        1 - v.h, and its albedo at even steps of n.v.
         """
         row = np.zeros((TABLE_TEXELS, 4), np.float32)
         row[0] = *self.diffuse, len(self.sigmas)

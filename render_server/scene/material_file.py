@@ -50,8 +50,8 @@ def read_material(path: Path) -> GaussianBrdf:
     version, digest = head.split()[2:]
     if version != str(VERSION).encode():
         raise DeltalightError(
-            f"{path.name} is a precomputed material of version {version.decode(errors='replace'):.20}, and this release reads "
-            f"version {VERSION}; {_ADVICE}."
+            f"{path.name} is a precomputed material of version {version.decode(errors='replace'):.20}, and this "
+            f"release reads version {VERSION}; {_ADVICE}."
         )
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise DeltalightError(f"{path.name} is damaged or cut short; {_ADVICE} again.")

@@ -39,7 +39,7 @@ class Material:
     `transmission` is the fraction of the light entering the surface that goes on through it, the rest is diffuse. The
     solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
 
-    `measured` replaces the rest wherever the camera sees the surface; elsewhere a Lambertian of its albedo stands for it.
+    `measured` replaces the rest where the camera sees the surface; elsewhere a Lambertian of its albedo does.
     """
 
     base_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, 0.8, np.float32))

@@ -10,7 +10,8 @@ from deltalight.protocol.errors import DeltalightError
 
 def precompute(
     source: Annotated[
-        Path, typer.Argument(help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf).")
+        Path,
+        typer.Argument(help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf)."),
     ],
     out: Annotated[
         Path | None, typer.Option(help="File that a measured BRDF becomes, NAME.dlmat.", show_default=False)
@@ -63,5 +64,5 @@ def _precompute_material(source: Path, out: Path | None) -> None:
     typer.echo(f"{out}: lobes of {widths} rad, reflects {albedo} of light from everywhere")
     typer.echo(
         f"{len(samples)} samples; fitted to half of them, it misses the others by {error.whole:.0%} r.m.s., and by "
-        f"{error.off_mirror:.0%} without those within {MIRROR_RANGE_DEG:g} degrees (half-vector) of the mirror direction"
+        f"{error.off_mirror:.0%} without those whose half-vector is within {MIRROR_RANGE_DEG:g} degrees of the normal"
     )

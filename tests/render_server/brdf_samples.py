@@ -29,7 +29,9 @@ def directions(angles: np.ndarray) -> np.ndarray:
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
 
 
-def brdf_text(brdf: GaussianBrdf, spectrum: np.ndarray | float = 1.0, angles: np.ndarray | None = None) -> str:
+def brdf_text(
+    brdf: GaussianBrdf, spectrum: np.ndarray | float = 1.0, angles: np.ndarray | None = None
+) -> str:
     """`spectrum`: what its grey values are multiplied by at each wavelength."""
     angles = gonioreflectometer() if angles is None else angles
     values = brdf.evaluate(directions(angles[:, :2]), directions(angles[:, 2:]))[:, :1]

@@ -49,7 +49,7 @@ def test_it_is_reciprocal(tmp_path: Path) -> None:
 
 def reflected(brdf: GaussianBrdf, cosine: float) -> float:
     """Of light from everywhere, by a sum over even directions."""
-    side = 1200
+    side = 500
     z = (np.arange(side) + 0.5) / side
     turn = 2 * np.pi * (np.arange(side) + 0.5) / side
     grid = np.stack(np.meshgrid(np.arccos(z), turn), axis=-1).reshape(-1, 2)
@@ -68,7 +68,7 @@ def test_no_fit_reflects_more_than_arrives(tmp_path: Path) -> None:
     """Of samples that do, five times too bright."""
     bright = GaussianBrdf(5 * PAINT.diffuse, PAINT.sigmas, 5 * PAINT.weights)
     fitted = fit_brdf(read_brdf(brdf_file(tmp_path, bright)))
-    found = [reflected(fitted, cosine) for cosine in (0.05, 0.1, 0.3, 0.6, 1.0)]
+    found = [reflected(fitted, cosine) for cosine in (0.05, 0.3, 1.0)]
     assert max(found) < 1.005
     assert fitted.greatest_albedo == pytest.approx(1.0, abs=1e-6)
 
@@ -78,7 +78,9 @@ def test_spectra_become_colours(tmp_path: Path) -> None:
     assert grey == pytest.approx(0.5 / np.pi, rel=1e-4)
     nm = np.arange(400, 701, 10)
     for channel, (low, high) in enumerate([(600, 700), (510, 570), (400, 480)]):
-        values = read_brdf(brdf_file(tmp_path, grey_brdf(0.5), ((nm >= low) & (nm <= high)).astype(float))).values
+        values = read_brdf(
+            brdf_file(tmp_path, grey_brdf(0.5), ((nm >= low) & (nm <= high)).astype(float))
+        ).values
         assert np.argmax(values.mean(axis=0)) == channel
 
 
@@ -146,7 +148,10 @@ WHOLE = brdf_text(PAINT)
         (WHOLE.replace("0.", "nan ", 1), "not finite"),
         (WHOLE.replace("400 410", "410 400"), "is no whole .brdf file"),
         ("2\n400 500\n" + "0.1 0 0.2 0 1 1\n" * 200, "from 400 to 500 nm, which tells no colour"),
-        ("2\n400 700\n" + "0.1 0 0.2 0 1 1\n" * 9, "has 9 samples above the surface; a fit needs at least 100"),
+        (
+            "2\n400 700\n" + "0.1 0 0.2 0 1 1\n" * 9,
+            "has 9 samples above the surface; a fit needs at least 100",
+        ),
     ],
 )
 def test_bad_measurements(tmp_path: Path, text: str, sentence: str) -> None:
@@ -157,5 +162,5 @@ def test_bad_measurements(tmp_path: Path, text: str, sentence: str) -> None:
 
 
 def test_no_measurements(tmp_path: Path) -> None:
-    with pytest.raises(DeltalightError, match="none.brdf cannot be read"):
+    with pytest.raises(DeltalightError, match=r"none\.brdf cannot be read"):
         read_brdf(tmp_path / "none.brdf")
