@@ -7,6 +7,8 @@ import typer
 
 from deltalight.protocol.errors import DeltalightError
 
+_OTHER_MATERIALS = (".ptm", ".rti", ".btf")
+
 
 def precompute(
     source: Annotated[
@@ -25,6 +27,11 @@ def precompute(
     """
     from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX
 
+    if source.is_dir() or source.suffix.lower() in _OTHER_MATERIALS:
+        raise DeltalightError(
+            f"{source} is no scene document and no measured BRDF; "
+            f"polynomial texture maps and ABTF are not supported: give a {BRDF_SUFFIX} file."
+        )
     if source.suffix.lower() == BRDF_SUFFIX:
         _precompute_material(source, out)
     elif out is not None:

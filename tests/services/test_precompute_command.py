@@ -82,5 +82,7 @@ def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None
         assert sentence in refused.stderr
         assert len(refused.stderr.splitlines()) == 1
     assert out.read_bytes() == before
+    refused = cli("precompute", str(tmp_path / "coin.ptm"))
+    assert "polynomial texture maps and ABTF are not supported: give a .brdf file" in refused.stderr
     refused = cli("precompute", str(scene_with(tmp_path)), "--out", str(out))
     assert "is taken for a scene document, and --out is for a measured BRDF" in refused.stderr
