@@ -14,6 +14,7 @@ from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
+from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip
 from deltalight.render_server.scene.gltf_meshes import GltfAsset, Pose
 from deltalight.render_server.scene.material_file import read_material
@@ -102,7 +103,17 @@ class VirtualObjects:
                 moving = self._animated(item)
                 if moving is not None:
                     _ = moving.bounds
-                self._given_material(item)
+                self._check_material(item)
+
+    def _check_material(self, item: SceneObject) -> None:
+        material = self._given_material(item)
+        if material is None or material.polynomial is None:
+            return
+        if any(mesh.uv is None for mesh in self._assets[item.asset].meshes):
+            raise DeltalightError(
+                f"object `{item.id}`: a polynomial texture map needs texture coordinates, and {item.asset} has none; "
+                "unwrap the mesh, or take another material."
+            )
 
     def left_out(self, objects: Sequence[SceneObject]) -> list[str]:
         """Returns a sentence for each loaded asset of which something is not shown."""
@@ -236,7 +247,8 @@ def given_material(document: AnyMaterial) -> Material:
     """
     if isinstance(document, MaterialDocument):
         return Material.from_document(document)
-    return Material.from_measured(read_material(Path(document.precomputed)))
+    read = read_material(Path(document.precomputed))
+    return Material.from_measured(read) if isinstance(read, GaussianBrdf) else Material.from_polynomial(read)
 
 
 def _materials(objects: Sequence[SceneObject]) -> set[AnyMaterial]:

@@ -22,10 +22,11 @@ from deltalight.render_server.view import CameraView, Rectangle
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
 SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
-METALLIC, REFLECTANCE, ROUGHNESS = (
+METALLIC, REFLECTANCE, ROUGHNESS, POLYNOMIAL = (
     3,
     slice(4, 7),
     7,
+    14,
 )  # columns of the material table, as materials.glsl has them
 
 # Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
@@ -263,7 +264,12 @@ class MaterialTable:
     """
 
     def __init__(self, gpu: GpuContext, mesh: GpuMesh, *, draws_maps: bool = True) -> None:
-        maps = [each for material in mesh.materials for each in material.maps if each is not None]
+        maps = [
+            each
+            for material in mesh.materials
+            for each in (*material.maps, *material.polynomial_maps)
+            if each is not None
+        ]
         self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
         self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
         self.smoothest = _smoothest(mesh)
@@ -274,6 +280,9 @@ class MaterialTable:
             self._colors = MapArray(gpu, [each for each in maps if each.is_color], "f2")
             self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
             table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
+            for row, material in zip(table, mesh.materials, strict=True):
+                if material.polynomial is not None:
+                    row[POLYNOMIAL] = 1 + self._layer(material.polynomial_maps[0])
         self._buffer = gpu.ctx.buffer(np.ascontiguousarray(table, np.float32).tobytes())
         self._transmittances = gpu.ctx.buffer(_transmittances(mesh).tobytes()) if self.transmits else None
         self._measured = _measured_texture(gpu, mesh)
@@ -338,6 +347,8 @@ class MapArray:
 def _measured_texture(gpu: GpuContext, mesh: GpuMesh) -> moderngl.Texture | None:
     """Returns the table of measured materials; None if there are none."""
     table = measured_table(mesh.materials)
+    if any(material.polynomial is not None for material in mesh.materials) and not len(table):
+        table = np.zeros((1, *table.shape[1:]), np.float32)  # an image cannot be without texels
     if not len(table):
         return None
     texture = texture_2d(gpu, (table.shape[1], len(table)), 4, "f4")

@@ -13,28 +13,38 @@ import numpy as np
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_bytes
 from deltalight.render_server.scene.gaussian_brdf import MOST_LOBES, RISE_TERMS, GaussianBrdf
+from deltalight.render_server.scene.polynomial_texture import (
+    MOST_TEXELS_EDGE,
+    TERMS,
+    PolynomialTexture,
+)
 
 MATERIAL_SUFFIX = ".dlmat"
 VERSION = 1
 _MAGIC = b"deltalight material "
-_LARGEST_BYTES = 1 << 20  # of the arrays
+_LARGEST_BYTES = 16 << 20  # of the arrays
 _ADVICE = "make it with `deltalight precompute SOURCE --out FILE.dlmat`"
 
 
-def write_material(path: Path, brdf: GaussianBrdf) -> None:
-    """Writes a measured material, atomically.
+def write_material(path: Path, material: GaussianBrdf | PolynomialTexture) -> None:
+    """Writes a precomputed material, atomically.
 
     Raises:
         DeltalightError: the disk refuses.
     """
     stream = BytesIO()
-    np.savez_compressed(stream, diffuse=brdf.diffuse, sigmas=brdf.sigmas, weights=brdf.weights)
+    if isinstance(material, PolynomialTexture):
+        np.savez_compressed(stream, coefficients=material.coefficients)
+    else:
+        np.savez_compressed(
+            stream, diffuse=material.diffuse, sigmas=material.sigmas, weights=material.weights
+        )
     content = stream.getvalue()
     head = _MAGIC + f"{VERSION} {hashlib.sha256(content).hexdigest()}\n".encode()
     write_bytes(path, head + content)
 
 
-def read_material(path: Path) -> GaussianBrdf:
+def read_material(path: Path) -> GaussianBrdf | PolynomialTexture:
     """Reads a file of `write_material`.
 
     Raises:
@@ -55,26 +65,49 @@ def read_material(path: Path) -> GaussianBrdf:
         )
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise DeltalightError(f"{path.name} is damaged or cut short; {_ADVICE} again.")
-    brdf = _unpacked(content)
-    if brdf is None:
-        raise DeltalightError(f"{path.name} holds no sum of Gaussians; {_ADVICE} again.")
-    return brdf
+    made = _made(_unpacked(content))
+    if made is None:
+        raise DeltalightError(f"{path.name} holds no material that can be drawn; {_ADVICE} again.")
+    return made
 
 
-def _unpacked(content: bytes) -> GaussianBrdf | None:
-    """The material of an archive; None if it is none."""
+def _unpacked(content: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an archive; none if it is none."""
     try:
         with ZipFile(BytesIO(content)) as archive:
             if sum(item.file_size for item in archive.infolist()) > _LARGEST_BYTES:
-                return None
+                return {}
         with np.load(BytesIO(content), allow_pickle=False) as file:
-            arrays = [np.asarray(file[name], np.float64) for name in ("diffuse", "sigmas", "weights")]
+            return {name: file[name] for name in file.files}
     except (OSError, ValueError, TypeError, KeyError, BadZipFile, EOFError, NotImplementedError):
+        return {}
+
+
+def _made(arrays: dict[str, np.ndarray]) -> GaussianBrdf | PolynomialTexture | None:
+    """The material of these arrays; None if they are none."""
+    if any(each.dtype.kind != "f" for each in arrays.values()):
         return None
-    diffuse, sigmas, weights = arrays
+    if arrays.keys() == {"coefficients"}:
+        return _polynomial(arrays["coefficients"])
+    if arrays.keys() == {"diffuse", "sigmas", "weights"}:
+        return _gaussians(
+            *(np.asarray(arrays[name], np.float64) for name in ("diffuse", "sigmas", "weights"))
+        )
+    return None
+
+
+def _polynomial(coefficients: np.ndarray) -> PolynomialTexture | None:
+    shape = coefficients.shape
+    fits = len(shape) == 4 and shape[0] == TERMS and shape[3] == 3 and 0 < max(shape[1:3]) <= MOST_TEXELS_EDGE
+    if not fits or not coefficients.size or not np.isfinite(coefficients).all():
+        return None
+    return PolynomialTexture(coefficients.astype(np.float16))
+
+
+def _gaussians(diffuse: np.ndarray, sigmas: np.ndarray, weights: np.ndarray) -> GaussianBrdf | None:
     count = len(sigmas) if sigmas.ndim == 1 else 0
     shapes = diffuse.shape == (3,) and weights.shape == (count, RISE_TERMS, 3) and count <= MOST_LOBES
-    finite = all(np.isfinite(each).all() and (each >= 0).all() for each in arrays)
+    finite = all(np.isfinite(each).all() and (each >= 0).all() for each in (diffuse, sigmas, weights))
     if not (shapes and finite and (sigmas > 1e-3).all() and (sigmas <= np.pi / 2).all()):
         return None
     return GaussianBrdf(diffuse, sigmas, weights)

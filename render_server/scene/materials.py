@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.scene.gaussian_brdf import TABLE_TEXELS, GaussianBrdf
+from deltalight.render_server.scene.polynomial_texture import PolynomialTexture
 from deltalight.render_server.scene.texture_maps import TextureMap, TextureReader, linear_texture
 
 MATERIAL_FLOATS = 20
@@ -40,6 +42,7 @@ class Material:
     solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
 
     `measured` replaces the rest where the camera sees the surface; elsewhere a Lambertian of its albedo does.
+    `polynomial` replaces the light of lamps there alone.
     """
 
     base_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, 0.8, np.float32))
@@ -62,6 +65,7 @@ class Material:
     occlusion_map: TextureMap | None = None
     emissive_map: TextureMap | None = None
     measured: GaussianBrdf | None = None
+    polynomial: PolynomialTexture | None = None
     name: str = ""
 
     @property
@@ -151,6 +155,22 @@ class Material:
             roughness=brdf.roughness,
             measured=brdf,
         )
+
+    @classmethod
+    def from_polynomial(cls, texture: PolynomialTexture) -> Self:
+        """Makes a material from a polynomial texture map: its albedo for all light but that of lamps."""
+        return cls(
+            base_color=np.ones(3, np.float32),
+            specular=0.0,
+            roughness=1.0,
+            base_color_map=TextureMap(texture.albedo),
+            polynomial=texture,
+        )
+
+    @cached_property
+    def polynomial_maps(self) -> tuple[TextureMap, ...]:
+        """The coefficients of `polynomial` as textures that follow each other."""
+        return () if self.polynomial is None else tuple(map(TextureMap, self.polynomial.coefficients))
 
     @classmethod
     def from_gltf(cls, description: dict[str, Any], textures: TextureReader) -> Self:
@@ -286,7 +306,7 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]
     """Packs materials for a shader, five vectors each.
 
     (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, row + 1 of
-    `measured_table`, 0: not measured, 0, 0), (absorption 1/m, index of refraction; 0: thin).
+    `measured_table`, 0: not measured, a polynomial's place, 0), (absorption 1/m, index of refraction; 0: thin).
     """
     measured = 0
     table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)

@@ -7,36 +7,33 @@ import typer
 
 from deltalight.protocol.errors import DeltalightError
 
-_OTHER_MATERIALS = (".ptm", ".rti", ".btf")
-
 
 def precompute(
     source: Annotated[
         Path,
-        typer.Argument(help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf)."),
+        typer.Argument(
+            help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf), or the folder of a "
+            "polynomial texture map (info.json)."
+        ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="File that a measured BRDF becomes, NAME.dlmat.", show_default=False)
+        Path | None, typer.Option(help="File that a material becomes, NAME.dlmat.", show_default=False)
     ] = None,
 ) -> None:
     """Compute the light transfer and the occlusion fields of a scene's objects, so that no picture waits for them.
 
     What is in the cache already is not computed again; Ctrl-C keeps the objects that are done.
 
-    A measured BRDF becomes a file for `material: {precomputed: FILE}` of scene documents.
+    A measured BRDF or a polynomial texture map becomes a file for `material: {precomputed: FILE}` of scene documents.
     """
     from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX
 
-    if source.is_dir() or source.suffix.lower() in _OTHER_MATERIALS:
-        raise DeltalightError(
-            f"{source} is no scene document and no measured BRDF; "
-            f"polynomial texture maps and ABTF are not supported: give a {BRDF_SUFFIX} file."
-        )
-    if source.suffix.lower() == BRDF_SUFFIX:
+    if source.is_dir() or source.suffix.lower() == BRDF_SUFFIX:
         _precompute_material(source, out)
     elif out is not None:
         raise DeltalightError(
-            f"{source} is taken for a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}); leave it out."
+            f"{source} is taken for a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the folder "
+            "of a polynomial texture map; leave it out."
         )
     else:
         _precompute_scene(source)
@@ -54,14 +51,34 @@ def _precompute_scene(path: Path) -> None:
 
 
 def _precompute_material(source: Path, out: Path | None) -> None:
-    from deltalight.render_server.scene.brdf_fit import MIRROR_RANGE_DEG, fit_brdf, held_out_error
-    from deltalight.render_server.scene.brdf_measurements import read_brdf
-    from deltalight.render_server.scene.material_file import MATERIAL_SUFFIX, write_material
+    from deltalight.render_server.scene.material_file import MATERIAL_SUFFIX
 
     if out is None or out.suffix != MATERIAL_SUFFIX:
         raise DeltalightError(
-            f"{source} is a measured BRDF; say where its material goes: --out {source.stem}{MATERIAL_SUFFIX}."
+            f"{source} is a measured material; say where it goes: --out {source.stem}{MATERIAL_SUFFIX}."
         )
+    if source.is_dir():
+        _convert_polynomials(source, out)
+    else:
+        _fit_brdf(source, out)
+
+
+def _convert_polynomials(folder: Path, out: Path) -> None:
+    from deltalight.render_server.scene.material_file import write_material
+    from deltalight.render_server.scene.polynomial_texture import read_polynomial_texture
+
+    texture = read_polynomial_texture(folder)
+    write_material(out, texture)
+    height, width = texture.albedo.shape[:2]
+    albedo = " ".join(f"{each:.3f}" for each in texture.albedo.mean(axis=(0, 1), dtype=float))
+    typer.echo(f"{out}: polynomials of {width}x{height} texels, reflects {albedo} of light from everywhere")
+
+
+def _fit_brdf(source: Path, out: Path) -> None:
+    from deltalight.render_server.scene.brdf_fit import MIRROR_RANGE_DEG, fit_brdf, held_out_error
+    from deltalight.render_server.scene.brdf_measurements import read_brdf
+    from deltalight.render_server.scene.material_file import write_material
+
     samples = read_brdf(source)
     fitted = fit_brdf(samples)
     write_material(out, fitted)

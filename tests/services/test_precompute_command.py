@@ -74,15 +74,15 @@ def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None
     source.write_text("1 2 3")
     for arguments, sentence in (
         (("--out", str(out)), "paint.brdf is no whole .brdf file"),
-        ((), "say where its material goes: --out paint.dlmat"),
-        (("--out", "paint.json"), "say where its material goes: --out paint.dlmat"),
+        ((), "say where it goes: --out paint.dlmat"),
+        (("--out", "paint.json"), "say where it goes: --out paint.dlmat"),
     ):
         refused = cli("precompute", str(source), *arguments)
         assert refused.returncode == 2
         assert sentence in refused.stderr
         assert len(refused.stderr.splitlines()) == 1
     assert out.read_bytes() == before
-    refused = cli("precompute", str(tmp_path / "coin.ptm"))
-    assert "polynomial texture maps and ABTF are not supported: give a .brdf file" in refused.stderr
+    refused = cli("precompute", str(tmp_path), "--out", str(out))
+    assert "info.json cannot be read" in refused.stderr
     refused = cli("precompute", str(scene_with(tmp_path)), "--out", str(out))
     assert "is taken for a scene document, and --out is for a measured BRDF" in refused.stderr

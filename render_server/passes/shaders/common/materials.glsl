@@ -12,7 +12,7 @@ struct MaterialEntry {
     vec4 base_color;   // rgb linear; metallic
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
-    vec4 flags;        // double-sided; row + 1 of the measured materials, 0: none
+    vec4 flags;        // double-sided; row + 1 of the measured materials, layer + 1 of a polynomial, 0: none
     vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
 #ifdef MATERIAL_MAPS
     vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
@@ -37,6 +37,10 @@ struct Material {
     vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; vec3 passing;
 #ifdef MEASURED
     int measured;   // row, -1: none
+    bool is_polynomial;
+    vec3 polynomial[6];   // of the light's direction along the next two
+    vec3 rightwards;
+    vec3 upwards;
 #endif
 };
 
@@ -53,6 +57,8 @@ Material mapped(MaterialEntry e, vec3 base, float metallic, float roughness, flo
     m.passing = entering * e.emission.a;
 #ifdef MEASURED
     m.measured = int(e.flags.y) - 1;
+    m.is_polynomial = false;
+    if (e.flags.z > 0.0) m.occlusion = 1.0;   // its place holds something else (polynomials.glsl)
 #endif
     return m;
 }
