@@ -59,7 +59,8 @@ class Interpolated:
         self, light: Float64[np.ndarray, "n 3"], view: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 3"]:
         """Returns the BRDF, 1/sr, for unit directions about the normal z."""
-        distance, nearest = self._tree.query(_place(light, view), k=_NEIGHBOURS)
+        found = self._tree.query(_place(light, view), k=_NEIGHBOURS)
+        distance, nearest = np.asarray(found[0]), np.asarray(found[1])
         weights = np.exp(-_SHARPNESS * (distance**2 - distance[:, :1] ** 2))
         total = (weights[..., None] * self._values[nearest]).sum(axis=1)
         return np.asarray(total / weights.sum(axis=1, keepdims=True))
@@ -151,7 +152,7 @@ def drawn_picture(asset: Path, material: Path, lamps: Sequence[Lamp]) -> Float64
 
 
 def _codes(linear: Float64[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    return np.searchsorted(decode_lut(None)[:, 0], np.clip(linear, 0, 1)).astype(np.uint8)
+    return np.asarray(np.searchsorted(decode_lut(None)[:, 0], np.clip(linear, 0, 1)), np.uint8)
 
 
 def _agreement(name: str, one: UInt8[np.ndarray, "..."], other: UInt8[np.ndarray, "..."]) -> str:
