@@ -4,8 +4,8 @@
 // `size`: of the pixel's footprint, m.
 void take_polynomial(inout Material m, int index, vec2 place_and_turn, vec3 normal, float size) {
     MaterialEntry e = materials[index];
-    float row = floor(place_and_turn.x / PLACES);
-    vec2 place = (vec2(place_and_turn.x - PLACES * row, row) + 0.5) / PLACES;
+    float row = floor(place_and_turn.x / MAP_STEPS);
+    vec2 place = (vec2(place_and_turn.x - MAP_STEPS * row, row) + 0.5) / MAP_STEPS;
     bool mirrored = place_and_turn.y > 0.5 * MIRRORED_TURN;
     float turn = place_and_turn.y - (mirrored ? MIRRORED_TURN : 0.0);
     vec3 n = normalize(normal);
