@@ -10,6 +10,7 @@ from deltalight.protocol.errors import DeltalightError
 
 BRDF_SUFFIX = ".brdf"
 _LARGEST_BYTES = 64 << 20
+_LARGEST = 1e6  # of a BRDF, 1/sr, and of all else in such a file
 _LEAST_SAMPLES = 100
 _WAVELENGTHS = np.arange(400.0, 701.0, 10.0)  # nm
 # CIE standard illuminant D65, relative power at these wavelengths (ISO/CIE 11664-2).
@@ -92,8 +93,10 @@ def _numbers(path: Path) -> Float64[np.ndarray, " n"]:
         raise DeltalightError(
             f"{path.name} holds something else than numbers; it is no .brdf file."
         ) from error
-    if not np.isfinite(numbers).all():
-        raise DeltalightError(f"{path.name} has a value that is not finite; measure or export it again.")
+    if not (np.abs(numbers) < _LARGEST).all():  # nor a number
+        raise DeltalightError(
+            f"{path.name} has a value that is not finite or beyond {_LARGEST:g}; measure or export it again."
+        )
     return numbers
 
 

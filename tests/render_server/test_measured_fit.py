@@ -145,7 +145,8 @@ WHOLE = brdf_text(PAINT)
         ("# only a comment\n", "is no whole .brdf file"),
         (WHOLE[: len(WHOLE) // 2 - 30], "is no whole .brdf file"),
         ("ply\nformat ascii 1.0\n", "holds something else than numbers"),
-        (WHOLE.replace("0.", "nan ", 1), "not finite"),
+        (WHOLE.replace(" 0.", " nan ", 1), "not finite"),
+        (WHOLE.replace(" 0.", " 1e300 ", 1), "beyond 1e"),
         (WHOLE.replace("400 410", "410 400"), "is no whole .brdf file"),
         ("2\n400 500\n" + "0.1 0 0.2 0 1 1\n" * 200, "from 400 to 500 nm, which tells no colour"),
         (
