@@ -9,7 +9,6 @@ import numpy as np
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import AroofMethod
-from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.occlusion_fields import OcclusionFields, field_settings, require_rigid
@@ -18,9 +17,9 @@ from deltalight.render_server.precomputed_transfers import (
     require_rigid_transfer,
     transfer_settings,
 )
-from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.virtual_objects import given_material
 
 
 class Precomputed:
@@ -72,5 +71,5 @@ def precompute_scene(scene: SceneDocument, notify: Callable[[str], None]) -> Ite
 
 def _unplaced(item: SceneObject, meshes: tuple[TriangleMesh, ...]) -> PlacedObject:
     """The object as precomputation needs it, wherever it stands."""
-    given = Material.from_document(item.material) if isinstance(item.material, MaterialDocument) else None
+    given = None if item.material is None else given_material(item.material)
     return PlacedObject(item.id, meshes, np.eye(4), given)

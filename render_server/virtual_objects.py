@@ -9,13 +9,15 @@ from jaxtyping import Float64
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.scene_objects import Animation, SceneObject
+from deltalight.protocol.scene_objects import Animation, AnyMaterial, SceneObject
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
+from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip
 from deltalight.render_server.scene.gltf_meshes import GltfAsset, Pose
+from deltalight.render_server.scene.material_file import read_material
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import Asset, load_asset
 from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of, merge_for_gpu
@@ -81,7 +83,7 @@ class VirtualObjects:
         self._assets: dict[str, Asset] = {}
         self._buffers = MeshBuffers(gpu)
         self._materials: tuple[tuple[Material, ...], MaterialTable] | None = None
-        self._given: dict[MaterialDocument, Material] = {}
+        self._given: dict[AnyMaterial, Material] = {}
         self._shown: tuple[SceneObject, ...] = ()
         self._board: BoardSpec | None = None
         self._moving: dict[str, AnimatedObject] = {}
@@ -92,8 +94,7 @@ class VirtualObjects:
         """Loads the assets of all visible objects, so that a bad file is reported before the first frame.
 
         Raises:
-            DeltalightError: an asset cannot be read, lacks the requested clip, or uses a material that this
-                release does not support.
+            DeltalightError: an asset or a precomputed material cannot be read, or an asset lacks the requested clip.
         """
         for item in objects:
             if item.visible:
@@ -102,10 +103,17 @@ class VirtualObjects:
                 moving = self._animated(item)
                 if moving is not None:
                     _ = moving.bounds
-            if item.material is not None and not isinstance(item.material, MaterialDocument):
-                raise DeltalightError(
-                    f"object `{item.id}`: precomputed materials arrive with a later release; give base_color instead."
-                )
+                self._check_material(item)
+
+    def _check_material(self, item: SceneObject) -> None:
+        material = self._given_material(item)
+        if material is None or material.polynomial is None:
+            return
+        if any(mesh.uv is None for mesh in self._assets[item.asset].meshes):
+            raise DeltalightError(
+                f"object `{item.id}`: a polynomial texture map needs texture coordinates, and {item.asset} has none; "
+                "unwrap the mesh, or take another material."
+            )
 
     def left_out(self, objects: Sequence[SceneObject]) -> list[str]:
         """Returns a sentence for each loaded asset of which something is not shown."""
@@ -184,10 +192,10 @@ class VirtualObjects:
 
     def _given_material(self, item: SceneObject) -> Material | None:
         """Returns the document's material, if it gives one; the same object for the same document."""
-        if not isinstance(item.material, MaterialDocument):
+        if item.material is None:
             return None
         if item.material not in self._given:
-            self._given[item.material] = Material.from_document(item.material)
+            self._given[item.material] = given_material(item.material)
         return self._given[item.material]
 
     def _placed(self, item: PlacedObject) -> list[TriangleMesh]:
@@ -231,9 +239,21 @@ class VirtualObjects:
             self._materials[1].release()
 
 
-def _materials(objects: Sequence[SceneObject]) -> set[MaterialDocument]:
+def given_material(document: AnyMaterial) -> Material:
+    """Returns the material that a scene document gives an object, if need be from its file.
+
+    Raises:
+        DeltalightError: the file cannot be used.
+    """
+    if isinstance(document, MaterialDocument):
+        return Material.from_document(document)
+    read = read_material(Path(document.precomputed))
+    return Material.from_measured(read) if isinstance(read, GaussianBrdf) else Material.from_polynomial(read)
+
+
+def _materials(objects: Sequence[SceneObject]) -> set[AnyMaterial]:
     """Returns the materials that the document gives its objects."""
-    return {item.material for item in objects if isinstance(item.material, MaterialDocument)}
+    return {item.material for item in objects if item.material is not None}
 
 
 def world_from_frame(item: SceneObject, board: BoardSpec | None) -> Float64[np.ndarray, "4 4"]:

@@ -14,7 +14,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
-from deltalight.render_server.scene.materials import map_table
+from deltalight.render_server.scene.materials import map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
 from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from deltalight.render_server.view import CameraView, Rectangle
@@ -22,10 +22,11 @@ from deltalight.render_server.view import CameraView, Rectangle
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
 SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
-METALLIC, REFLECTANCE, ROUGHNESS = (
+METALLIC, REFLECTANCE, ROUGHNESS, POLYNOMIAL = (
     3,
     slice(4, 7),
     7,
+    14,
 )  # columns of the material table, as materials.glsl has them
 
 # Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
@@ -263,7 +264,12 @@ class MaterialTable:
     """
 
     def __init__(self, gpu: GpuContext, mesh: GpuMesh, *, draws_maps: bool = True) -> None:
-        maps = [each for material in mesh.materials for each in material.maps if each is not None]
+        maps = [
+            each
+            for material in mesh.materials
+            for each in (*material.maps, *material.polynomial_maps)
+            if each is not None
+        ]
         self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
         self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
         self.smoothest = _smoothest(mesh)
@@ -274,8 +280,12 @@ class MaterialTable:
             self._colors = MapArray(gpu, [each for each in maps if each.is_color], "f2")
             self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
             table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
+            for row, material in zip(table, mesh.materials, strict=True):
+                if material.polynomial is not None:
+                    row[POLYNOMIAL] = 1 + self._layer(material.polynomial_maps[0])
         self._buffer = gpu.ctx.buffer(np.ascontiguousarray(table, np.float32).tobytes())
         self._transmittances = gpu.ctx.buffer(_transmittances(mesh).tobytes()) if self.transmits else None
+        self._measured = _measured_texture(gpu, mesh)
 
     def _layer(self, each: TextureMap) -> int:
         array = self._colors if each.is_color else self._data
@@ -293,11 +303,13 @@ class MaterialTable:
             "CUTOUTS": self._has_cutouts,
             "TRANSMISSION": self.transmits,
             "Transmittances": self._transmittances,
+            "MEASURED": self._measured is not None,
+            "measured_brdfs": self._measured,
         }
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._buffer, self._transmittances, self._colors, self._data)
+        release_all(self._buffer, self._transmittances, self._measured, self._colors, self._data)
 
 
 class MapArray:
@@ -330,6 +342,18 @@ class MapArray:
     def release(self) -> None:
         """Frees the texture."""
         self.texture.release()
+
+
+def _measured_texture(gpu: GpuContext, mesh: GpuMesh) -> moderngl.Texture | None:
+    """Returns the table of measured materials; None if there are none."""
+    table = measured_table(mesh.materials)
+    if any(material.polynomial is not None for material in mesh.materials) and not len(table):
+        table = np.zeros((1, *table.shape[1:]), np.float32)  # an image cannot be without texels
+    if not len(table):
+        return None
+    texture = texture_2d(gpu, (table.shape[1], len(table)), 4, "f4")
+    texture.write(table.tobytes())
+    return texture
 
 
 def _transmittances(mesh: GpuMesh) -> Float32[np.ndarray, "k 4"]:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +13,8 @@ from PIL import Image
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Material as MaterialDocument
+from deltalight.render_server.scene.gaussian_brdf import TABLE_TEXELS, GaussianBrdf
+from deltalight.render_server.scene.polynomial_texture import PolynomialTexture
 from deltalight.render_server.scene.texture_maps import TextureMap, TextureReader, linear_texture
 
 MATERIAL_FLOATS = 20
@@ -37,6 +40,9 @@ class Material:
 
     `transmission` is the fraction of the light entering the surface that goes on through it, the rest is diffuse. The
     solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
+
+    `measured` replaces the rest where the camera sees the surface; elsewhere a Lambertian of its albedo does.
+    `polynomial` replaces the light of lamps there alone.
     """
 
     base_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, 0.8, np.float32))
@@ -58,6 +64,8 @@ class Material:
     normal_map: TextureMap | None = None
     occlusion_map: TextureMap | None = None
     emissive_map: TextureMap | None = None
+    measured: GaussianBrdf | None = None
+    polynomial: PolynomialTexture | None = None
     name: str = ""
 
     @property
@@ -137,6 +145,32 @@ class Material:
             attenuation_color=np.array(document.attenuation_color, np.float32),
             attenuation_distance_m=document.attenuation_distance_m or math.inf,
         )
+
+    @classmethod
+    def from_measured(cls, brdf: GaussianBrdf) -> Self:
+        """Makes a material from a sum of Gaussians; its roughness is that of a lobe as wide as the mean of them."""
+        return cls(
+            base_color=brdf.hemispherical_albedo.astype(np.float32),
+            specular=0.0,
+            roughness=brdf.roughness,
+            measured=brdf,
+        )
+
+    @classmethod
+    def from_polynomial(cls, texture: PolynomialTexture) -> Self:
+        """Makes a material from a polynomial texture map: its albedo for all light but that of lamps."""
+        return cls(
+            base_color=np.ones(3, np.float32),
+            specular=0.0,
+            roughness=1.0,
+            base_color_map=TextureMap(texture.albedo),
+            polynomial=texture,
+        )
+
+    @cached_property
+    def polynomial_maps(self) -> tuple[TextureMap, ...]:
+        """The coefficients of `polynomial` as textures that follow each other."""
+        return () if self.polynomial is None else tuple(map(TextureMap, self.polynomial.coefficients))
 
     @classmethod
     def from_gltf(cls, description: dict[str, Any], textures: TextureReader) -> Self:
@@ -271,17 +305,27 @@ def _first(value: Any, default: float) -> float:  # noqa: ANN401 - as in the fil
 def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]:
     """Packs materials for a shader, five vectors each.
 
-    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, 0, 0, 0),
-    (absorption 1/m, index of refraction; 0: thin).
+    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, row + 1 of
+    `measured_table`, 0: not measured, a polynomial's place, 0), (absorption 1/m, index of refraction; 0: thin).
     """
+    measured = 0
     table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
     for row, material in zip(table, materials, strict=True):
         row[0:4] = *material.base_color, material.metallic
         row[4:8] = *material.dielectric_f0, material.roughness
         row[8:12] = *material.emission, material.transmission
         row[12] = material.double_sided
+        if material.measured is not None:
+            measured += 1
+            row[13] = measured
         row[16:20] = *material.absorption_per_m, 0.0 if material.is_thin else material.refraction_index
     return table
+
+
+def measured_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 93 4"]:
+    """Returns the rows of the measured ones among the materials (common/measured.glsl)."""
+    rows = [material.measured.table_row() for material in materials if material.measured is not None]
+    return np.array(rows, np.float32).reshape(-1, TABLE_TEXELS, 4)
 
 
 def map_table(

@@ -1,23 +1,92 @@
-"""`deltalight precompute`: what a scene wants precomputed of its objects, before it is shown."""
+"""`deltalight precompute`: what is computed before a scene is shown, of its objects or of a measured material."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from deltalight.protocol.errors import DeltalightError
+
 
 def precompute(
-    scene: Annotated[Path, typer.Argument(help="Scene document; its assets lie as it names them.")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf), or the folder of a "
+            "polynomial texture map (info.json)."
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="File that a material becomes, NAME.dlmat.", show_default=False)
+    ] = None,
 ) -> None:
     """Compute the light transfer and the occlusion fields of a scene's objects, so that no picture waits for them.
 
     What is in the cache already is not computed again; Ctrl-C keeps the objects that are done.
+
+    A measured BRDF or a polynomial texture map becomes a file for `material: {precomputed: FILE}` of scene documents.
     """
+    from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX
+
+    if source.is_dir() or source.suffix.lower() == BRDF_SUFFIX:
+        _precompute_material(source, out)
+    elif out is not None:
+        raise DeltalightError(
+            f"{source} is taken for a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the folder "
+            "of a polynomial texture map; leave it out."
+        )
+    else:
+        _precompute_scene(source)
+
+
+def _precompute_scene(path: Path) -> None:
     from deltalight.protocol.scene import load_scene
     from deltalight.render_server.precomputed import precompute_scene
 
     def notify(sentence: str) -> None:
         typer.echo(sentence, err=True)
 
-    for line in precompute_scene(load_scene(scene), notify):
+    for line in precompute_scene(load_scene(path), notify):
         typer.echo(line)
+
+
+def _precompute_material(source: Path, out: Path | None) -> None:
+    from deltalight.render_server.scene.material_file import MATERIAL_SUFFIX
+
+    if out is None or out.suffix != MATERIAL_SUFFIX:
+        raise DeltalightError(
+            f"{source} is a measured material; say where it goes: --out {source.stem}{MATERIAL_SUFFIX}."
+        )
+    if source.is_dir():
+        _convert_polynomials(source, out)
+    else:
+        _fit_brdf(source, out)
+
+
+def _convert_polynomials(folder: Path, out: Path) -> None:
+    from deltalight.render_server.scene.material_file import write_material
+    from deltalight.render_server.scene.polynomial_texture import read_polynomial_texture
+
+    texture = read_polynomial_texture(folder)
+    write_material(out, texture)
+    height, width = texture.albedo.shape[:2]
+    albedo = " ".join(f"{each:.3f}" for each in texture.albedo.mean(axis=(0, 1), dtype=float))
+    typer.echo(f"{out}: polynomials of {width}x{height} texels, reflects {albedo} of light from everywhere")
+
+
+def _fit_brdf(source: Path, out: Path) -> None:
+    from deltalight.render_server.scene.brdf_fit import MIRROR_RANGE_DEG, fit_brdf, held_out_error
+    from deltalight.render_server.scene.brdf_measurements import read_brdf
+    from deltalight.render_server.scene.material_file import write_material
+
+    samples = read_brdf(source)
+    fitted = fit_brdf(samples)
+    write_material(out, fitted)
+    error = held_out_error(samples)
+    widths = ", ".join(f"{sigma:.3f}" for sigma in fitted.sigmas)
+    albedo = " ".join(f"{each:.3f}" for each in fitted.hemispherical_albedo)
+    typer.echo(f"{out}: lobes of {widths} rad, reflects {albedo} of light from everywhere")
+    typer.echo(
+        f"{len(samples)} samples; fitted to half of them, it misses the others by {error.whole:.0%} r.m.s., and by "
+        f"{error.off_mirror:.0%} without those whose half-vector is within {MIRROR_RANGE_DEG:g} degrees of the normal"
+    )

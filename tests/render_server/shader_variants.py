@@ -17,6 +17,8 @@ from deltalight.render_server.passes.cones import reuse_define
 from deltalight.render_server.passes.lpv import LpvPropagate
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.material_file import write_material
+from tests.render_server.brdf_samples import grey_brdf
 from tests.render_server.gltf_samples import Plate, even
 from tests.render_server.protected_scenes import Case, frames_of, scene_of
 from tests.render_server.scenes import Stage
@@ -53,6 +55,12 @@ GLASS: dict[Case, dict[str, Any]] = {
     Case("dlpv", "model", "mirror"): {},
     Case("aroof", "depth", "mirror"): {},
 }
+MEASURED = (
+    Case("exact", "depth", "mirror"),
+    Case("exact", "depth", "antialiased"),
+    Case("paper", "depth", "mirror"),
+    Case("dlpv", "model", "mirror"),
+)
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume", "error"),
@@ -86,6 +94,20 @@ def render_glass(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: P
         render_with(plate, case, changes, gpu, folder)
 
 
+def render_measured(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame with a measured object more, beside a plain one and one of glass with maps."""
+    write_material(folder / "paint.dlmat", grey_brdf(0.2, (0.1, 0.1, 0.5)))
+    measured = {
+        "id": "measured",
+        "asset": str(Plate(0.1, 0.1).write(folder / "measured.glb")),
+        "material": {"precomputed": str(folder / "paint.dlmat")},
+    }
+    glass = maps_and_holes(0.1)
+    glass.material["extensions"] = {"KHR_materials_transmission": {"transmissionFactor": 1}}
+    for plate in (Plate(0.1, 0.1), glass):
+        render_with(plate, case, changes, gpu, folder, measured)
+
+
 def maps_and_holes(edge_m: float) -> Plate:
     plate = Plate(edge_m, edge_m)
     plate.material |= {
@@ -99,15 +121,17 @@ def maps_and_holes(edge_m: float) -> Plate:
     return plate
 
 
-def render_with(plate: Plate, case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
-    """Renders the case's first frame with the plate more."""
+def render_with(
+    plate: Plate, case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path, *more: dict[str, Any]
+) -> None:
+    """Renders the case's first frame with the plate more, and other objects."""
     asset = {
         "id": "plate",
         "asset": str(plate.write(folder / "plate.glb")),
         "pose": {"translation_m": [0, 0, 0.2]},
     }
     document = scene_of(case, Stage(folder)).model_dump(mode="json", exclude_unset=True)
-    document["objects"].append(asset)
+    document["objects"] += [asset, *more]
     renderer = SceneRenderer(gpu, changed(parse_scene(document), "method", changes))
     try:
         renderer.render(frames_of(case)[0])
@@ -139,15 +163,19 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
 
 
 def image_based(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
-    """Compiles image-based shading, without and with a lens that bends and materials that have maps."""
-    for name, switch in (("ambient_occlusion", "lens_bends"), ("image_based_surface", "MATERIAL_MAPS")):
+    """Compiles image-based shading, without and with a lens that bends, materials with maps and measured ones."""
+    for name, switch in (
+        ("ambient_occlusion", "lens_bends"),
+        ("image_based_surface", "MATERIAL_MAPS"),
+        ("image_based_surface", "MEASURED"),
+    ):
         for defines in ({}, {switch: 1}):
             Kernel(gpu, name, **defines).release()
 
 
 def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
-    """Compiles shading by precomputed transfer, without and with materials that have maps."""
-    for defines in ({}, {"MATERIAL_MAPS": 1}):
+    """Compiles shading by precomputed transfer, without and with materials that have maps or are measured."""
+    for defines in ({}, {"MATERIAL_MAPS": 1}, {"MEASURED": 1}):
         Kernel(gpu, "image_based_surface", PRECOMPUTED=1, **defines).release()
     Kernel(gpu, "transfer_light").release()
     RasterKernel(gpu, "transfer_raster").release()
@@ -156,6 +184,7 @@ def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
+    **{f"{case} measured": partial(render_measured, case, {}) for case in MEASURED},
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
     "by device": by_device,
     "image-based shading": image_based,

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from tests.render_server.brdf_samples import brdf_file, grey_brdf
 from tests.services.conftest import RunCli
 
 
@@ -61,3 +62,27 @@ def test_what_cannot_be_precomputed_is_said_in_one_sentence(cli: RunCli, tmp_pat
         assert sentence in done.stderr
         assert len(done.stderr.splitlines()) == 1
     assert not kept.exists()
+
+
+def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None:
+    source, out = brdf_file(tmp_path, grey_brdf(0.4, (0.2, 0.1, 0.5))), tmp_path / "paint.dlmat"
+    done = cli("precompute", str(source), "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    assert "fitted to half of them, it misses the others by" in done.stdout
+    assert out.read_bytes().startswith(b"deltalight material 1 ")
+    before = out.read_bytes()
+    source.write_text("1 2 3")
+    for arguments, sentence in (
+        (("--out", str(out)), "paint.brdf is no whole .brdf file"),
+        ((), "say where it goes: --out paint.dlmat"),
+        (("--out", "paint.json"), "say where it goes: --out paint.dlmat"),
+    ):
+        refused = cli("precompute", str(source), *arguments)
+        assert refused.returncode == 2
+        assert sentence in refused.stderr
+        assert len(refused.stderr.splitlines()) == 1
+    assert out.read_bytes() == before
+    refused = cli("precompute", str(tmp_path), "--out", str(out))
+    assert "info.json cannot be read" in refused.stderr
+    refused = cli("precompute", str(scene_with(tmp_path)), "--out", str(out))
+    assert "is taken for a scene document, and --out is for a measured BRDF" in refused.stderr

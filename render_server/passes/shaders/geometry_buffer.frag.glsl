@@ -1,8 +1,9 @@
 // World position + depth along the optical axis, normal + material, texture coordinate, vertex colour; with MATERIAL_MAPS
-// what the maps give in place of the last two. CUTOUTS: some materials have alpha.
+// what the maps give in place of the last two. CUTOUTS: some materials have alpha. MEASURED: some are polynomials.
 #include "common/shown_maps.glsl"
 #include "common/camera.glsl"
 #pragma switch CUTOUTS
+#pragma switch MEASURED
 in vec3 world;
 in vec3 normal;
 in vec2 uv;
@@ -16,6 +17,16 @@ layout(location = 3) out vec4 out_tint;
 #ifdef MATERIAL_MAPS
 in vec2 second_uv;
 #include "common/fragment_maps.glsl"
+#ifdef MEASURED
+#include "common/basis.glsl"
+#include "common/polynomials.glsl"
+
+vec2 place_of_polynomial(int index, vec3 n) {
+    vec3 rightwards, upwards;
+    map_axes(slopes_of(materials[index].maps[BASE_COLOR]), rightwards, upwards);
+    return pack_place(uv, n, rightwards, upwards);
+}
+#endif
 #endif
 #ifdef CUTOUTS
 uniform float blend_sample;   // 0..1: samples of one pixel show different parts of what is blended
@@ -41,6 +52,9 @@ void main() {
     find_slopes();
     n = bent_normal(materials[int(material)].maps[NORMAL], n, normalize(view));
     pack_maps(fragment_maps(int(material), tint), out_uv, out_tint);
+#ifdef MEASURED
+    if (is_polynomial(int(material))) out_uv = place_of_polynomial(int(material), n);
+#endif
 #else
     out_uv = uv;
     out_tint = vec4(tint, 1.0);

@@ -4,8 +4,8 @@
 #include "common/geometry.glsl"
 #include "common/brdf.glsl"
 #include "common/environment.glsl"
-#include "common/filtered_lobe.glsl"
 #include "common/gathered_light.glsl"
+#include "common/filtered_lobe.glsl"
 #include "common/harmonics.glsl"
 #include "common/interleaved.glsl"
 #include "common/shown_maps.glsl"
@@ -79,6 +79,14 @@ vec4 arriving_light(ivec2 pixel, vec4 position, vec3 normal) {
 }
 #endif
 
+// Mean radiance over what the surface mirrors.
+vec3 mirrored_radiance(vec3 n, vec3 v, Material m, float footprint, int count) {
+#ifdef MEASURED
+    if (m.measured >= 0) return measured_radiance(n, v, m.measured, footprint, sample_count);
+#endif
+    return lobe_radiance(n, v, m.f0, m.roughness, footprint, count);
+}
+
 vec3 shaded(ivec2 pixel, ivec2 raster, vec4 position) {
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
     vec3 n = normalize(normal.xyz), v = normalize(camera_position - position.xyz);
@@ -88,7 +96,7 @@ vec3 shaded(ivec2 pixel, ivec2 raster, vec4 position) {
     vec3 down = change_along(pixel, ivec2(0, 1), position, normal).normal;
     float footprint = max(length(across), length(down));   // half of the turn of what is mirrored
     int count = has_interface(m.f0) ? sample_count : 0;
-    Indirect arriving = Indirect(light.rgb, light.a * lobe_radiance(n, v, m.f0, m.roughness, footprint, count));
+    Indirect arriving = Indirect(light.rgb, light.a * mirrored_radiance(n, v, m, footprint, count));
     return with_gathered(m.emission, m, max(dot(n, v), 1e-3), arriving);
 }
 

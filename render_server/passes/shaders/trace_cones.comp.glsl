@@ -32,6 +32,31 @@ bool is_fresh(ivec2 texel) { return (texelFetch(stale_texels, texel, 0).r & 2u) 
 bool is_fresh(ivec2 texel) { return true; }
 #endif
 
+#ifndef REAL
+#pragma switch MEASURED
+#ifdef MEASURED
+#include "common/measured.glsl"
+
+int measured_row(ivec2 texel) {
+    ivec2 pixel = raster_texel(texelFetch(sample_pixels, texel, 0).zw);
+    return int(materials[int(texelFetch(virtual_raster_normal, pixel, 0).w)].flags.y) - 1;
+}
+
+// A cone for each lobe, weighted by what the lobe reflects.
+vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
+    vec3 v = normalize(camera_position - s.position), d = reflect(-v, s.normal), sum = vec3(0.0), total = vec3(0.0);
+    for (int k = 0; k < int(measured_base(row).a); ++k) {
+        vec3 reflected = lobe_albedo_of(row, k, dot(s.normal, v));
+        float half_angle = lobe_widths(row, k).y;
+        March m = march(q, d, 2.0 * tan(half_angle), false);
+        sum += reflected * (m.c_rho + m.t_rho * environment(d, half_angle));
+        total += reflected;
+    }
+    return sum / max(total, vec3(1e-6));
+}
+#endif
+#endif
+
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     vec3 q = volume_coordinate(s.position);
@@ -40,6 +65,13 @@ void trace(ivec2 texel) {
     diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
 #else
     if (is_fresh(texel)) diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
+#endif
+#ifdef MEASURED
+    int row = measured_row(texel);
+    if (row >= 0) {
+        c_rho = measured_specular(s, q, row);
+        s.roughness = -1.0;
+    }
 #endif
     if (s.roughness >= 0.0) {
         vec3 v = normalize(camera_position - s.position);

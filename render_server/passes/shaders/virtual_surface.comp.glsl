@@ -44,6 +44,13 @@ void shade(ivec2 pixel) {
     vec4 position = texelFetch(virtual_raster_position, raster, 0);
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
     Material m = material_at(raster, int(normal.w), texelFetch(virtual_raster_tint, raster, 0));
+#ifdef MEASURED
+#ifdef MATERIAL_MAPS
+    float size = position.w / camera_pinhole.x;
+    if (is_polynomial(int(normal.w)))
+        take_polynomial(m, int(normal.w), imageLoad(virtual_raster_uv, raster).xy, normal.xyz, size);
+#endif
+#endif
     vec3 v = normalize(camera_position - position.xyz);
     Indirect indirect = indirect_at(pixel, position, normal.xyz);
     if (has_screen_reflection) {

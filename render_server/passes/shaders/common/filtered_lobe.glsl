@@ -15,6 +15,36 @@ float reflected_density(float n_dot_h, float v_dot_h, float alpha) {
     return ggx_distribution(n_dot_h, alpha) * n_dot_h / (4.0 * v_dot_h);
 }
 
+#ifdef MEASURED
+// Half-vector about z of a Gaussian lobe.
+vec3 gaussian_normal(vec2 u, float variance) {
+    float z = 1.0 + variance * log(1.0 - u.y * (1.0 - exp(-1.0 / variance)));
+    float level = sqrt(max(1.0 - z * z, 0.0)), phi = 2.0 * PI * u.x;
+    return vec3(level * cos(phi), level * sin(phi), z);
+}
+
+// The same for the lobes of a measured material, which share the samples.
+vec3 measured_radiance(vec3 n, vec3 v, int row, float footprint, int count) {
+    n = normalize(n + max(GRAZING - dot(n, v), 0.0) * v);
+    mat3 basis = basis_around(n);
+    vec3 local = v * basis, sum = vec3(0.0), total = vec3(0.0);
+    int lobes = int(measured_base(row).a), each = max(count / max(lobes, 1), 1);
+    for (int j = 0; j < lobes * each; ++j) {
+        int k = j / each;
+        float variance = lobe_widths(row, k).x * lobe_widths(row, k).x;
+        vec3 h = gaussian_normal(vec2(fract(float(j) * 0.6180339887), (float(j % each) + 0.5) / float(each)), variance);
+        vec3 l = reflect(-local, h);
+        float v_dot_h = dot(local, h);
+        if (l.z <= 0.0 || v_dot_h <= 0.0) continue;
+        float density = half_vector_density(1.0 - h.z, variance) / (4.0 * v_dot_h);
+        vec3 weight = lobe_weight(row, k, v_dot_h) * (l.z / max(l.z, local.z));
+        sum += weight * environment(basis * l, sqrt(1.0 / (PI * float(each) * density) + footprint * footprint));
+        total += weight;
+    }
+    return sum / max(total, vec3(1e-6));
+}
+#endif
+
 // Mean radiance over the lobe about n (unit) of what `count` samples see in the map, weighted as the lobe reflects it: of a map
 // that is the same everywhere just that, however few the samples are. `footprint`: half-angle (rad) over which the pixel itself
 // averages.

@@ -59,13 +59,18 @@ float fragment_opacity(int index) {
     return e.alpha.y * map_here(color_maps, e.maps[BASE_COLOR], true).a;
 }
 
+// Directions along u and against v of a triangle's coordinate, of any length. `s`: slopes_of.
+void map_axes(vec4 s, out vec3 rightwards, out vec3 upwards) {
+    float turn = s.x * s.w - s.y * s.z;
+    rightwards = (slopes.right * s.w - slopes.down * s.y) * sign(turn);
+    upwards = (slopes.right * s.z - slopes.down * s.x) * sign(turn);
+}
+
 // The normal `n` with a normal map's tilt. Tangents are those of the triangle's texture coordinates, turned into the plane across
 // n; the map's y points against v (glTF 2.0, section 3.9.3). Towards the viewer `v` at least.
 vec3 bent_normal(MapEntry m, vec3 n, vec3 v) {
-    vec4 s = slopes_of(m);
-    float turn = s.x * s.w - s.y * s.z;
-    vec3 tangent = (slopes.right * s.w - slopes.down * s.y) * sign(turn);
-    vec3 upwards = (slopes.right * s.z - slopes.down * s.x) * sign(turn);
+    vec3 tangent, upwards;
+    map_axes(slopes_of(m), tangent, upwards);
     tangent -= n * dot(n, tangent);
     if (!has_map(m) || dot(tangent, tangent) == 0.0) return n;
     tangent = normalize(tangent);

@@ -12,7 +12,7 @@ struct MaterialEntry {
     vec4 base_color;   // rgb linear; metallic
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
-    vec4 flags;        // double-sided
+    vec4 flags;        // double-sided; row + 1 of the measured materials, layer + 1 of a polynomial, 0: none
     vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
 #ifdef MATERIAL_MAPS
     vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
@@ -33,14 +33,34 @@ const float MASKED = 1.0, BLENDED = 2.0;   // modes of alpha
 const float APART = 5.588238;              // of the noise of materials and sides: what lies behind is left out elsewhere
 const float COARSEST = 32.0;   // mip level: a texture's mean
 
-struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; vec3 passing; };
+struct Material {
+    vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; vec3 passing;
+#ifdef MEASURED
+    int measured;   // row, -1: none
+    bool is_polynomial;
+    vec3 polynomial[6];   // of the light's direction along the next two
+    vec3 rightwards;
+    vec3 upwards;
+#endif
+};
 
 Material mapped(MaterialEntry e, vec3 base, float metallic, float roughness, float occlusion, vec3 glow) {
     metallic *= e.base_color.a;
     vec3 f0 = mix(e.dielectric.rgb, base, metallic);
     vec3 entering = base * (1.0 - metallic);
-    return Material(entering * (1.0 - e.emission.a), f0, e.dielectric.a * roughness, e.emission.rgb * glow, occlusion,
-        entering * e.emission.a);
+    Material m;
+    m.diffuse = entering * (1.0 - e.emission.a);
+    m.f0 = f0;
+    m.roughness = e.dielectric.a * roughness;
+    m.emission = e.emission.rgb * glow;
+    m.occlusion = occlusion;
+    m.passing = entering * e.emission.a;
+#ifdef MEASURED
+    m.measured = int(e.flags.y) - 1;
+    m.is_polynomial = false;
+    if (e.flags.z > 0.0) m.occlusion = 1.0;   // its place holds something else (polynomials.glsl)
+#endif
+    return m;
 }
 
 bool has_map(MapEntry m) { return m.u.w >= 0.0; }
@@ -100,7 +120,12 @@ bool is_cut_out(int index, float opacity, float even) {
 float even_noise(vec2 place) { return fract(52.9829189 * fract(dot(place, vec2(0.06711056, 0.00583715)))); }
 
 #else
-struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; vec3 passing; };
+struct Material {
+    vec3 diffuse; vec3 f0; float roughness; vec3 emission; vec3 passing;
+#ifdef MEASURED
+    int measured;
+#endif
+};
 
 // `tint`: the vertex colour, which multiplies the base colour. `size` (of a footprint, m) and `uv` are for maps.
 Material material_of(int index, vec2 uv, vec3 tint, float size) {
@@ -113,6 +138,9 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     m.f0 = mix(e.dielectric.rgb, base, e.base_color.a);
     m.roughness = e.dielectric.a;
     m.emission = e.emission.rgb;
+#ifdef MEASURED
+    m.measured = int(e.flags.y) - 1;
+#endif
     return m;
 }
 #endif

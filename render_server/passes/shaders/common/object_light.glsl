@@ -1,9 +1,27 @@
 // Radiance of a virtual object's surface towards v (docs/method.md 4.7). Needs lights.glsl and brdf.glsl.
 #include "common/gathered_light.glsl"
 
+#ifdef MEASURED
+#ifdef MATERIAL_MAPS
+#include "common/polynomial_light.glsl"
+#endif
+#endif
+
 uniform float noise_sigma;      // m at 1 m
 uniform float beam_alpha;       // of the roughest transparent objects through which beams bring light; 0: none do
 uniform float normal_offset;    // m: against self-shadowing by the virtual depth map
+
+// BRDF times cosine for a light seen under half-angle `radius`.
+vec3 response_times_cosine(vec3 n, vec3 v, vec3 l, float cosine, Material m, float radius) {
+#ifdef MEASURED
+    if (m.measured >= 0) return measured_times_cosine(m.measured, n, v, l, radius);
+#ifdef MATERIAL_MAPS
+    if (m.is_polynomial) return polynomial_response(m, l);
+#endif
+#endif
+    vec3 base = m.diffuse / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v));
+    return base * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
+}
 
 vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
     vec3 sum = vec3(0.0);
@@ -15,9 +33,7 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
         vec3 lifted = p + normal_offset * n;
         vec2 fraction = visibility(lights[i], lifted, n, 3.0 * noise_sigma * depth * depth, 0.0);
         vec3 seen = arriving(lights[i], lifted, fraction, beam_alpha);
-        vec3 base = m.diffuse / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v));
-        vec3 response = base * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
-        sum += across * seen * response;
+        sum += across * seen * response_times_cosine(n, v, l, cosine, m, radius);
     }
     return sum;
 }

@@ -1,0 +1,216 @@
+"""Measured materials as their data say, and as Deltalight draws what it makes of them, in a black room.
+
+    python -m deltalight.benchmarks.measured_materials FOLDER OUT
+
+Balls of paint (`.brdf`) stand under two lamps, a plate with a polynomial texture map under one of three.
+
+Between samples, the measurements are interpolated as Pharr and Humphreys do (Physically Based Rendering, second
+edition, 8.6.2): by Gaussian weights in (sin sin, azimuth / pi, cos cos).
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import trimesh
+import typer
+from jaxtyping import Float64, UInt8
+from scipy.spatial import cKDTree
+
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import write_png
+from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame, decode_lut
+from deltalight.protocol.scene import parse_scene
+from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.brdf_fit import fit_brdf
+from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX, BrdfMeasurements, read_brdf
+from deltalight.render_server.scene.material_file import write_material
+from deltalight.render_server.scene.polynomial_texture import (
+    INFO_NAME,
+    polynomial_terms,
+    read_polynomial_texture,
+)
+
+SIDE, FOCAL = 200, 380.0  # pixels
+EYE, RADIUS = np.array([0.0, 0.0, 1.0]), 0.22  # m
+Lamp = tuple[tuple[float, float, float], float, float]  # way of the light, irradiance, half-angle (degrees)
+PAINT_LAMPS: tuple[Lamp, ...] = (((0.45, 0.35, -0.8), 9.0, 3.0), ((-0.75, 0.1, -0.35), 5.0, 3.0))
+MAP_LAMPS = ((-0.7, 0.0, -0.7), (0.0, -0.7, -0.7), (0.4, 0.3, -0.87))
+FAR_M = 5.0
+_DISC = 12  # directions that stand for a lamp
+_NEIGHBOURS = 8
+_SHARPNESS = 100.0
+_GRAZING = 0.17  # cosine to viewer or lamp, below which nothing was measured
+
+
+class Interpolated:
+    """A measured BRDF between its samples."""
+
+    def __init__(self, samples: BrdfMeasurements) -> None:
+        self._values = samples.values
+        self._tree = cKDTree(_place(samples.light, samples.view))
+
+    def evaluate(
+        self, light: Float64[np.ndarray, "n 3"], view: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Returns the BRDF, 1/sr, for unit directions about the normal z."""
+        found = self._tree.query(_place(light, view), k=_NEIGHBOURS)
+        distance, nearest = np.asarray(found[0]), np.asarray(found[1])
+        weights = np.exp(-_SHARPNESS * (distance**2 - distance[:, :1] ** 2))
+        total = (weights[..., None] * self._values[nearest]).sum(axis=1)
+        return np.asarray(total / weights.sum(axis=1, keepdims=True))
+
+
+def _place(light: Float64[np.ndarray, "n 3"], view: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    sines = np.linalg.norm(light[:, :2], axis=1) * np.linalg.norm(view[:, :2], axis=1)
+    across = light[:, 0] * view[:, 1] - light[:, 1] * view[:, 0]
+    turn = np.abs(np.arctan2(across, (light[:, :2] * view[:, :2]).sum(axis=1)))
+    return np.stack([sines, turn / np.pi, light[:, 2] * view[:, 2]], axis=1)
+
+
+def _camera() -> CameraModel:
+    middle = (SIDE - 1) / 2
+    return CameraModel(
+        SIDE, SIDE, np.array([[FOCAL, 0, middle], [0, FOCAL, middle], [0, 0, 1]]), "plumb_bob", np.zeros(5)
+    )
+
+
+def _surface() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns which pixels show the ball (h, w), and normals and directions to the eye there."""
+    rays = np.dstack([_camera().rays(), np.ones((SIDE, SIDE))]).reshape(-1, 3) * (1, -1, -1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    b, c = rays @ EYE, EYE @ EYE - RADIUS**2
+    hits = b * b > c
+    distance = -b[hits] - np.sqrt(b[hits] ** 2 - c)
+    normals = (EYE + distance[:, None] * rays[hits]) / RADIUS
+    return hits.reshape(SIDE, SIDE), normals, -rays[hits]
+
+
+def _disc() -> Iterator[tuple[np.ndarray, float]]:
+    """Yields directions to the lamps and the irradiance from there."""
+    for way, irradiance, radius_deg in PAINT_LAMPS:
+        axis = -np.array(way) / np.linalg.norm(way)
+        aside = np.cross(axis, (0, 0, 1))
+        aside /= np.linalg.norm(aside)
+        for k in range(_DISC):
+            off, turn = np.radians(radius_deg) * np.sqrt((k + 0.5) / _DISC), 2.39996 * k
+            towards = axis + off * (np.cos(turn) * aside + np.sin(turn) * np.cross(axis, aside))
+            yield towards / np.linalg.norm(towards), irradiance / _DISC
+
+
+def measured_picture(brdf: Interpolated) -> Float64[np.ndarray, "h w 3"]:
+    """Returns the radiance of the ball as the samples say."""
+    shown, normals, views = _surface()
+    aside = np.cross(normals, (0.3, 0.9, 0.2))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    axes = np.stack([aside, np.cross(normals, aside), normals], axis=1)
+    view = np.einsum("nij,nj->ni", axes, views)
+    radiance = np.zeros_like(normals)
+    for towards, irradiance in _disc():
+        light = axes @ towards
+        lit = light[:, 2] > 1e-3
+        radiance[lit] += irradiance * light[lit, 2:] * brdf.evaluate(light[lit], view[lit])
+    picture = np.zeros((SIDE, SIDE, 3))
+    picture[shown] = radiance
+    return picture
+
+
+def drawn_picture(asset: Path, material: Path, lamps: Sequence[Lamp]) -> Float64[np.ndarray, "h w 3"]:
+    """Returns the object as Deltalight draws it."""
+    lights = [
+        {"type": "directional", "direction": way, "irradiance": strength, "angular_radius_deg": radius_deg}
+        for way, strength, radius_deg in lamps
+    ]
+    document = {
+        "objects": [{"asset": str(asset), "material": {"precomputed": str(material)}, "up_axis": "z"}],
+        "lights": {"manual": lights, "surroundings": "none"},
+        "method": {"name": "none"},
+    }
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = EYE
+    depth = np.full((SIDE, SIDE), FAR_M, np.float32)
+    view = ViewFrame(
+        color=np.zeros((SIDE, SIDE, 3), np.uint8),
+        frame_id=0,
+        timestamp_ns=0,
+        camera=_camera(),
+        pose=BoardPose(pose),
+        depth=DepthImage(depth, depth > 0, _camera(), 0.001),
+    )
+    renderer = SceneRenderer(create_context(), parse_scene(document), with_linear=True)
+    try:
+        linear = renderer.render(view).linear
+    finally:
+        renderer.release()
+    assert linear is not None
+    return linear
+
+
+def _codes(linear: Float64[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    return np.asarray(np.searchsorted(decode_lut(None)[:, 0], np.clip(linear, 0, 1)), np.uint8)
+
+
+def _agreement(name: str, one: UInt8[np.ndarray, "..."], other: UInt8[np.ndarray, "..."]) -> str:
+    error = np.mean((one.astype(float) - other) ** 2)
+    return f"{name}: {10 * np.log10(255**2 / error):.1f} dB"
+
+
+def draw_paint(path: Path, folder: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns a ball of a `.brdf` file, above as measured, below as drawn; prints how far they agree."""
+    shown, normals, views = _surface()
+    samples = read_brdf(path)
+    write_material(folder / "paint.dlmat", fit_brdf(samples))
+    trimesh.creation.icosphere(5, RADIUS).export(folder / "ball.ply", vertex_normal=True)
+    codes = [
+        _codes(measured_picture(Interpolated(samples))),
+        _codes(drawn_picture(folder / "ball.ply", folder / "paint.dlmat", PAINT_LAMPS)),
+    ]
+    facing = (normals * views).sum(axis=1) > _GRAZING
+    typer.echo(_agreement(path.stem, codes[0][shown][facing], codes[1][shown][facing]))
+    return np.vstack(codes)
+
+
+def draw_map(source: Path, folder: Path) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Returns plates with a polynomial texture map under lamps, above as the polynomials have it, below as drawn."""
+    texture = read_polynomial_texture(source)
+    write_material(folder / "map.dlmat", texture)
+    plate = trimesh.Trimesh(
+        np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / FOCAL / 2, [[0, 1, 2], [0, 2, 3]]
+    )
+    plate.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
+    plate.export(folder / "plate.obj")
+    columns = []
+    for way in MAP_LAMPS:
+        towards = -np.array([way]) / np.linalg.norm(way)
+        coded = np.clip(
+            np.tensordot(polynomial_terms(towards), texture.coefficients.astype(float), 1)[0], 0, 1
+        )
+        given = cv2.resize(coded.astype(np.float32), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        codes = [
+            np.round(255 * given).astype(np.uint8),
+            _codes(drawn_picture(folder / "plate.obj", folder / "map.dlmat", [(way, np.pi, 0.0)])),
+        ]
+        typer.echo(_agreement(f"{source.name}, light along {way}", *codes))
+        columns.append(np.vstack(codes))
+    return columns
+
+
+def main(source: Path, out: Path) -> None:
+    """Writes the picture of a folder of `.brdf` files, or of a folder with a polynomial texture map."""
+    with TemporaryDirectory() as name:
+        if (source / INFO_NAME).is_file():
+            columns = draw_map(source, Path(name))
+        else:
+            columns = [draw_paint(path, Path(name)) for path in sorted(source.glob(f"*{BRDF_SUFFIX}"))]
+    if not columns:
+        raise DeltalightError(f"{source} has no {BRDF_SUFFIX} file and no {INFO_NAME}; give another folder.")
+    write_png(out, np.hstack(columns))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

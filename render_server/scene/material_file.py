@@ -1,0 +1,113 @@
+"""Files of precomputed materials: written once by `deltalight precompute`, named by `material: {precomputed: FILE}`.
+
+A line `deltalight material VERSION SHA256`, then a .npz archive of arrays, of which that is the hash.
+"""
+
+import hashlib
+from io import BytesIO
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import write_bytes
+from deltalight.render_server.scene.gaussian_brdf import MOST_LOBES, RISE_TERMS, GaussianBrdf
+from deltalight.render_server.scene.polynomial_texture import (
+    MOST_TEXELS_EDGE,
+    TERMS,
+    PolynomialTexture,
+)
+
+MATERIAL_SUFFIX = ".dlmat"
+VERSION = 1
+_MAGIC = b"deltalight material "
+_LARGEST_BYTES = 16 << 20  # of the arrays
+_ADVICE = "make it with `deltalight precompute SOURCE --out FILE.dlmat`"
+
+
+def write_material(path: Path, material: GaussianBrdf | PolynomialTexture) -> None:
+    """Writes a precomputed material, atomically.
+
+    Raises:
+        DeltalightError: the disk refuses.
+    """
+    stream = BytesIO()
+    if isinstance(material, PolynomialTexture):
+        np.savez_compressed(stream, coefficients=material.coefficients)
+    else:
+        np.savez_compressed(
+            stream, diffuse=material.diffuse, sigmas=material.sigmas, weights=material.weights
+        )
+    content = stream.getvalue()
+    head = _MAGIC + f"{VERSION} {hashlib.sha256(content).hexdigest()}\n".encode()
+    write_bytes(path, head + content)
+
+
+def read_material(path: Path) -> GaussianBrdf | PolynomialTexture:
+    """Reads a file of `write_material`.
+
+    Raises:
+        DeltalightError: it cannot be read, is of another kind or version, damaged, or holds what is no such material.
+    """
+    try:
+        with path.open("rb") as file:
+            head, content = file.readline(200), file.read(_LARGEST_BYTES + 1)
+    except OSError as error:
+        raise DeltalightError(f"{path} cannot be read ({error.strerror}); {_ADVICE}.") from error
+    if not head.startswith(_MAGIC) or len(head.split()) != 4:
+        raise DeltalightError(f"{path.name} is no precomputed material; {_ADVICE}.")
+    version, digest = head.split()[2:]
+    if version != str(VERSION).encode():
+        raise DeltalightError(
+            f"{path.name} is a precomputed material of version {version.decode(errors='replace'):.20}, and this "
+            f"release reads version {VERSION}; {_ADVICE}."
+        )
+    if hashlib.sha256(content).hexdigest().encode() != digest:
+        raise DeltalightError(f"{path.name} is damaged or cut short; {_ADVICE} again.")
+    made = _made(_unpacked(content))
+    if made is None:
+        raise DeltalightError(f"{path.name} holds no material that can be drawn; {_ADVICE} again.")
+    return made
+
+
+def _unpacked(content: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an archive; none if it is none."""
+    try:
+        with ZipFile(BytesIO(content)) as archive:
+            if sum(item.file_size for item in archive.infolist()) > _LARGEST_BYTES:
+                return {}
+        with np.load(BytesIO(content), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except Exception:  # zipfile, zlib and numpy's parser of headers raise many kinds
+        return {}
+
+
+def _made(arrays: dict[str, np.ndarray]) -> GaussianBrdf | PolynomialTexture | None:
+    """The material of these arrays; None if they are none."""
+    if any(each.dtype.kind != "f" for each in arrays.values()):
+        return None
+    if arrays.keys() == {"coefficients"}:
+        return _polynomial(arrays["coefficients"])
+    if arrays.keys() == {"diffuse", "sigmas", "weights"}:
+        return _gaussians(
+            *(np.asarray(arrays[name], np.float64) for name in ("diffuse", "sigmas", "weights"))
+        )
+    return None
+
+
+def _polynomial(coefficients: np.ndarray) -> PolynomialTexture | None:
+    shape = coefficients.shape
+    fits = len(shape) == 4 and shape[0] == TERMS and shape[3] == 3 and 0 < max(shape[1:3]) <= MOST_TEXELS_EDGE
+    if not fits or not coefficients.size or not np.isfinite(coefficients).all():
+        return None
+    return PolynomialTexture(coefficients.astype(np.float16))
+
+
+def _gaussians(diffuse: np.ndarray, sigmas: np.ndarray, weights: np.ndarray) -> GaussianBrdf | None:
+    count = len(sigmas) if sigmas.ndim == 1 else 0
+    shapes = diffuse.shape == (3,) and weights.shape == (count, RISE_TERMS, 3) and count <= MOST_LOBES
+    finite = all(np.isfinite(each).all() and (each >= 0).all() for each in (diffuse, sigmas, weights))
+    if not (shapes and finite and (sigmas > 1e-3).all() and (sigmas <= np.pi / 2).all()):
+        return None
+    return GaussianBrdf(diffuse, sigmas, weights)
