@@ -1,6 +1,5 @@
 """H.264 for viewers of the live picture: one encoder a view and size, shared by all who look at it."""
 
-import asyncio
 import json
 import threading
 import time
@@ -23,8 +22,6 @@ LiveCodec = Literal["jpeg", "h264"]
 
 KEPT = 4  # newest pictures for viewers that are a little late; who is later goes on with a key
 KEY_INTERVAL_S = 1.0  # between keys: viewers that cannot follow do not cost the others more
-# What an encoder that nobody looks at is kept: who joins and leaves all the time would have one made each time.
-LINGER_S = 5.0
 REFINED_AFTER = 16  # encodings of one picture; then it is as good as this encoder makes it
 
 log = structlog.get_logger()
@@ -96,10 +93,6 @@ class VideoTrack:
             self._ask_for_key()
             return None
         return found[0]
-
-    def rest(self) -> None:
-        """Nobody looks any more: who comes next gets a new picture."""
-        self._pictures.clear()
 
     def close(self) -> None:
         """End the thread soon."""
@@ -209,35 +202,27 @@ class LiveVideo:
     @property
     def encoders(self) -> int:
         """The number of views that are encoded."""
-        return sum(track.members > 0 for track in self._tracks.values())
+        return len(self._tracks)
 
     def offer(self, frame: LiveFrame) -> None:
         """Encode a new frame's pictures that somebody looks at (any thread)."""
         for view, track in self._tracks.copy().items():
-            if track.members and view in frame.pictures:
+            if view in frame.pictures:
                 track.offer(frame)
 
     def join(self, view: ShownView, frame: LiveFrame) -> VideoTrack:
-        """Return the track of a view, which goes on with `frame` if nobody looked at it before."""
+        """Return the track of a view, which begins with `frame` if nobody looked at it before."""
         track = self._tracks.get(view)
         if track is None:
             track = self._tracks[view] = VideoTrack(view, self._publish, self._on_failure)
             track.start(frame)
-        elif track.members == 0:
-            track.offer(frame)
         track.members += 1
         return track
 
     def leave(self, track: VideoTrack) -> None:
-        """Leave a track, which ends where nobody looks at it for some seconds, or where it failed at once."""
+        """Leave a track, which ends where nobody else looks at it."""
         track.members -= 1
         if track.members == 0:
-            track.rest()
-            wait_s = 0.0 if track.has_failed else LINGER_S
-            asyncio.get_running_loop().call_later(wait_s, self._end_unwatched, track)
-
-    def _end_unwatched(self, track: VideoTrack) -> None:
-        if track.members == 0 and self._tracks.get(track.view) is track:
             track.close()
             del self._tracks[track.view]
 

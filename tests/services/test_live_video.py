@@ -19,7 +19,6 @@ from deltalight.protocol.envelope import encode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.publisher import Publisher
 from deltalight.services import ports
-from deltalight.services.api import live_video
 from deltalight.services.api.live_video import KEY_INTERVAL_S
 from deltalight.services.h264 import H264Decoder, H264Encoder
 from deltalight.services.live_message import LiveHeader, unpack
@@ -242,23 +241,6 @@ def test_an_odd_size_and_another_size_in_between(live: Running) -> None:
             assert seen is not None
             assert seen.shape == (size[1], size[0], 3)
             assert live.agrees(header, seen) > LEAST_PSNR_DB
-
-
-def test_who_joins_and_leaves_all_the_time_has_one_encoder(
-    live: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[tuple[int, int]] = []
-    monkeypatch.setattr(live_video, "H264Encoder", lambda *size: (made.append(size), H264Encoder(*size))[1])
-    newest = 0
-    for _ in range(4):
-        with live_socket(live.address, "?codec=h264") as socket:
-            viewer = Viewer(socket)
-            header = viewer.until("avc1.")
-            assert header.keyframe
-            assert header.frame_id > newest, "nothing old"
-            assert live.agrees(*viewer.next()) > LEAST_PSNR_DB
-            newest = header.frame_id
-    assert len(made) <= 1
 
 
 def test_the_encoder_ends_with_its_last_viewer(live: Running) -> None:
