@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from random import Random
 from statistics import mean, median
@@ -45,18 +46,10 @@ def main() -> None:
     """Measure and print."""
     with _web_process() as (process_id, address):
         for codec in ("jpeg", "h264"):
-            costs = [
-                _cost_ms(process_id, lambda c=codec: _joined(f"{address}?codec={c}")) for _ in range(ROUNDS)
-            ]
-            print(
-                json.dumps({"join": codec, "ms_each": round(median(costs), 2), "rounds": _rounded(costs)}),
-                flush=True,
-            )
+            join = partial(_joined, f"{address}?codec={codec}")
+            costs = [round(_cost_ms(process_id, join), 2) for _ in range(ROUNDS)]
+            print(json.dumps({"join": codec, "ms_each": median(costs), "rounds": costs}), flush=True)
     print(json.dumps(_refusals(Random(7))))
-
-
-def _rounded(values: list[float]) -> list[float]:
-    return [round(value, 2) for value in values]
 
 
 def _cost_ms(process_id: int, load: Callable[[], Coroutine[Any, Any, None]]) -> float:

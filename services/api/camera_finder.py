@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, ValidationError
 from deltalight.services.api.problems import ProblemError
 
 TIMEOUT_S = 20.0  # an SDK that asks the USB bus takes a second, and its import another
-# In a process of its own: the SDK of the OAK alone takes 125 MB, which no import gives back, and it may hang.
+# In a process of its own: the SDK of the OAK alone takes 131 MB, which no import gives back, and it may hang.
 COMMAND = (sys.executable, "-P", "-m", "deltalight.services.cli", "node", "--list", "--json")
 
 

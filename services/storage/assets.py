@@ -145,7 +145,7 @@ class AssetStore:
     def take_from_shelf(self, name: str) -> tuple[Asset, bool]:
         """Store an object of the shelf; return the asset and whether it is new.
 
-        The worker makes it: the packages for that would take 120 MB of this process for good.
+        The worker makes it: the packages for that would take 127 MB of this process for good.
 
         Raises:
             NotFoundError: there is none of this name.

@@ -167,7 +167,7 @@ def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:
         validate(ApiSettings, {"host": "somewhere.example"}, "api")
 
 
-MOST_GROWTH_BYTES = 20 << 20  # imports would take 120 MB for the shelf and 125 to 167 MB for cameras
+MOST_GROWTH_BYTES = 20 << 20  # imports would take 127 MB for the shelf and 131 to 175 MB for cameras
 
 
 @pytest.mark.slow
