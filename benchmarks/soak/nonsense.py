@@ -14,7 +14,7 @@ PER_S = 200.0
 def send_nonsense(port: int, seconds: float, dice: Random) -> int:
     """Publish mutated messages at a loopback port for a while; return how many were sent."""
     publisher = Publisher(ports.endpoint(port))
-    known, sent, began_s = _messages(), 0, time.monotonic()
+    known, sent, began_s = known_messages(), 0, time.monotonic()
     try:
         while time.monotonic() < began_s + seconds:
             publisher.send(mutated(dice, dice.choice(known)))
@@ -45,7 +45,7 @@ def mutated(dice: Random, pieces: list[bytes]) -> list[bytes]:
     return pieces
 
 
-def _messages() -> list[list[bytes]]:
+def known_messages() -> list[list[bytes]]:
     """Return one message of each of some streams, of a node `stranger`."""
     own: dict[str, object] = {"node": "stranger", "capture_ns": time.time_ns(), "frame_id": 7}
     camera = {"width": 8, "height": 6, "matrix": [8.0, 0.0, 3.5, 0.0, 8.0, 2.5, 0.0, 0.0, 1.0]}

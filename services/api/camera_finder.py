@@ -1,14 +1,18 @@
 """Finds the cameras of this host, as the API reports them."""
 
+import subprocess
+import sys
 import threading
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, ValidationError
 
 from deltalight.services.api.problems import ProblemError
 
-TIMEOUT_S = 10.0  # an SDK that asks the USB bus takes a second
+TIMEOUT_S = 20.0  # an SDK that asks the USB bus takes a second, and its import another
+# In a process of its own: the SDK of the OAK alone takes 131 MB, which no import gives back, and it may hang.
+COMMAND = (sys.executable, "-P", "-m", "deltalight.services.cli", "node", "--list", "--json")
 
 
 class CameraAnswer(BaseModel):
@@ -37,7 +41,7 @@ class CamerasAnswer(BaseModel):
 
 
 class CameraFinder:
-    """Searches for cameras in a thread that may hang; concurrent callers wait for the same search."""
+    """Searches for cameras in another process; concurrent callers wait for the same search."""
 
     def __init__(self) -> None:
         self._search: Future[CamerasAnswer] | None = None
@@ -47,7 +51,7 @@ class CameraFinder:
         """Return the cameras that are attached now.
 
         Raises:
-            ProblemError: the search takes too long.
+            ProblemError: the search takes too long, or fails.
         """
         with self._lock:
             search = self._search
@@ -56,20 +60,21 @@ class CameraFinder:
                 threading.Thread(target=_find, args=(search,), name="cameras", daemon=True).start()
         try:
             return search.result(TIMEOUT_S)
-        except FutureTimeoutError:
-            sentence = (
-                "Looking for cameras takes too long; unplug what hangs, or try `deltalight node --list`."
-            )
-            raise ProblemError(503, "cameras", sentence) from None
+        except (FutureTimeoutError, subprocess.TimeoutExpired):
+            raise _failed("Looking for cameras takes too long; unplug what hangs") from None
+        except (OSError, subprocess.CalledProcessError, ValidationError):
+            raise _failed("Looking for cameras ended without an answer; look into the log") from None
 
 
 def _find(search: "Future[CamerasAnswer]") -> None:
-    from deltalight.sensor_node.cameras.discovery import discover
-
     try:
-        found = discover()
-        cameras = [CameraAnswer.model_validate(camera.as_dict()) for camera in found.cameras]
-        missing = [MissingCameras(kind=m.kind, details=m.details, hint=m.hint) for m in found.missing]
-        search.set_result(CamerasAnswer(cameras=cameras, missing=missing))
+        done = subprocess.run(
+            COMMAND, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, timeout=TIMEOUT_S, check=True
+        )
+        search.set_result(CamerasAnswer.model_validate_json(done.stdout))
     except Exception as fault:  # raised by those who wait
         search.set_exception(fault)
+
+
+def _failed(sentence: str) -> ProblemError:
+    return ProblemError(503, "cameras", f"{sentence}, or try `deltalight node --list`.")

@@ -47,8 +47,9 @@ class Viewer:
 
     def prefer(self, codec: LiveCodec) -> None:
         """Take pictures coded so from now on, where they are there."""
-        self.codec = codec
-        self._hub.wake()
+        if codec != self.codec:
+            self.codec = codec
+            self._hub.wake()
 
     def leave(self) -> None:
         """Leave the encoded pictures that it followed."""

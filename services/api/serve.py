@@ -1,6 +1,7 @@
 """The REST API's process: its socket, its web server, and its initial scene."""
 
 import gc
+import logging
 import socket
 import time
 from pathlib import Path
@@ -16,7 +17,7 @@ from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.services.api.app import create_app
-from deltalight.services.api.connections import HEAD_TIMEOUT_S, LimitedProtocol
+from deltalight.services.api.connections import HEAD_TIMEOUT_S, LimitedProtocol, Seldom
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host_store import FIRST_SCENE, activate_first, import_scene
 from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultError
@@ -106,6 +107,8 @@ def http_server(app: FastAPI) -> uvicorn.Server:
         ws_max_size=LARGEST_SOCKET_MESSAGE,
         ws_per_message_deflate=False,  # JPEG does not compress further
     )
+    server_log = logging.getLogger("uvicorn.error")
+    server_log.filters = [Seldom()]
     return _Server(config)
 
 

@@ -31,6 +31,8 @@ def _task(name: str) -> Callable[..., Facts]:
         from deltalight.services.storage.recording_check import check_recording
 
         return check_recording
+    if name == "shelf":
+        return _write_shelf_item
     if name.endswith("-thumbnail"):
         from deltalight.services.storage import thumbnails
 
@@ -38,6 +40,22 @@ def _task(name: str) -> Callable[..., Facts]:
     from deltalight.services.storage import asset_facts
 
     return asset_facts.mesh_facts if name == "mesh" else asset_facts.map_facts
+
+
+def _write_shelf_item(path: Path, item: str) -> Facts:
+    """Write the file of an object of the shelf to `path`, which has no suffix; return its facts."""
+    from deltalight.services.storage.asset_facts import mesh_facts
+    from deltalight.services.storage.shelf import shelf_item
+
+    content = shelf_item(item).glb()
+    named = path.with_suffix(".glb")  # by which loaders know its format
+    try:
+        named.write_bytes(content)
+        facts = mesh_facts(named)
+    finally:
+        named.unlink(missing_ok=True)
+    path.write_bytes(content)
+    return facts
 
 
 def _main(task: str, path: str, memory_bytes: str, time_s: str, output_bytes: str, *arguments: str) -> None:

@@ -32,6 +32,7 @@ from deltalight.services.storage.asset_kinds import (
 from deltalight.services.storage.asset_sandbox import Task, probe, run_limited
 from deltalight.services.storage.database import Database, remembered
 from deltalight.services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
+from deltalight.services.storage.shelf import shelf_item
 from deltalight.services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
 
 Probe = Callable[[Path, AssetKind, str], Facts]
@@ -40,6 +41,7 @@ CONCURRENT_CHILDREN = 2  # each may use memory up to the limit of a child
 THUMBNAIL = "thumbnail.png"
 THUMBNAIL_BYTES = 1 << 20  # more than 256 x 256 pixels without any compression
 CHUNK_BYTES = 1 << 20
+MOST_SHELF_BYTES = 1 << 22  # of an object's file; the tests hold them below 1 MB
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,23 @@ class AssetStore:
             self._unpack(incoming, unpacked, shown)
             return self._keep(unpacked, Path(shown).stem + ".glb")
 
+    def take_from_shelf(self, name: str) -> tuple[Asset, bool]:
+        """Store an object of the shelf; return the asset and whether it is new.
+
+        The worker makes it: the packages for that would take 127 MB of this process for good.
+
+        Raises:
+            NotFoundError: there is none of this name.
+        """
+        item = shelf_item(name)
+        with self.receiving(MOST_SHELF_BYTES) as incoming:
+            with self._children:
+                facts = run_limited(
+                    "shelf", incoming.path, item.file_name, name, output_bytes=MOST_SHELF_BYTES
+                )
+            incoming.take_over()
+            return self._keep(incoming, item.file_name, facts)
+
     def _unpack(self, incoming: Incoming, unpacked: Incoming, name: str) -> None:
         with disk_faults():
             incoming.file.flush()
@@ -148,7 +167,7 @@ class AssetStore:
             run_limited("unzip", incoming.path, name, str(unpacked.path), str(limit), output_bytes=limit)
         unpacked.take_over()
 
-    def _keep(self, incoming: Incoming, shown: str) -> tuple[Asset, bool]:
+    def _keep(self, incoming: Incoming, shown: str, known: Facts | None = None) -> tuple[Asset, bool]:
         found = recognise(incoming.head, incoming.size_bytes, shown)
         digest = incoming.digest.hexdigest()
         checked = incoming.path.with_suffix(found.suffix)
@@ -157,7 +176,7 @@ class AssetStore:
                 incoming.file.flush()
                 os.fsync(incoming.file.fileno())
                 incoming.path.rename(checked)
-            facts = self._facts(digest, checked, found, shown)
+            facts = known or self._facts(digest, checked, found, shown)
             return self._placed(
                 checked, AssetRow(**_columns(digest, found, incoming.size_bytes, facts)), shown
             )

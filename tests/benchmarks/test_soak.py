@@ -18,7 +18,7 @@ from deltalight.benchmarks.soak.crowd import Flow, Seen
 from deltalight.benchmarks.soak.faults import FAULTS, parse_faults
 from deltalight.benchmarks.soak.figures import Soaked, all_figures
 from deltalight.benchmarks.soak.link import SHAPES, Link, LoopThread, Schedule, Shape, held_up_s
-from deltalight.benchmarks.soak.nonsense import _messages, mutated
+from deltalight.benchmarks.soak.nonsense import known_messages, mutated
 from deltalight.benchmarks.soak.plots import known_runs, nice_ceiling
 from deltalight.benchmarks.soak.profiles import PROFILES
 from deltalight.benchmarks.soak.report import FaultRecord, SoakReport
@@ -135,7 +135,7 @@ def test_a_cut_link_carries_nothing_until_it_is_mended(
 
 
 def test_nonsense_is_refused_or_read_and_nothing_else() -> None:
-    dice, known, refused = random.Random(3), _messages(), 0
+    dice, known, refused = random.Random(3), known_messages(), 0
     for pieces in known:
         assert decode(pieces)[0].node == "stranger"
     for _ in range(1000):

@@ -23,8 +23,8 @@ def trusting_probe(_path: Path, _kind: AssetKind, _name: str) -> Facts:
     return {"triangles": 4}
 
 
-def upload(store: Store, content: bytes, name: str) -> Asset:
-    with store.assets.receiving(1 << 20) as incoming:
+def upload(store: Store, content: bytes, name: str, limit_bytes: int = 1 << 20) -> Asset:
+    with store.assets.receiving(limit_bytes) as incoming:
         incoming.write(content)
         return store.assets.keep(incoming, name)[0]
 

@@ -1,7 +1,11 @@
 """The fish-eye picture and where the lights are in it; cameras of this host."""
 
+import json
+import sys
+import threading
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -10,7 +14,7 @@ from deltalight.protocol.codecs import encode_array, encode_color
 from deltalight.protocol.envelope import encode
 from deltalight.protocol.messages import RadianceMessage
 from deltalight.protocol.publisher import Publisher
-from deltalight.sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
+from deltalight.sensor_node.cameras.driver import FoundCamera, MissingSupport
 from deltalight.services import ports
 from deltalight.services.api import camera_finder
 from deltalight.services.api.fisheye import lights_in_picture
@@ -149,18 +153,32 @@ def test_while_a_recording_is_shown_its_light_is_the_one_that_counts(live: LiveA
         replay.close()
 
 
+def search(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Have cameras searched for by another program."""
+    monkeypatch.setattr(camera_finder, "COMMAND", (sys.executable, "-c", script))
+
+
 def test_cameras_of_this_host_are_listed(live: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
     found = FoundCamera("Webcam", "uvc:0", "uvc", "/dev/video0", "no permission")
     missing = MissingSupport("oak", "not installed", "install it")
-    monkeypatch.setattr(
-        "deltalight.sensor_node.cameras.discovery.discover", lambda: Discovery((found,), (missing,))
-    )
+    listed = json.dumps({"cameras": [found.as_dict()], "missing": [asdict(missing)]})
+    search(monkeypatch, f"print({listed!r})")
     answer = live.client.get("/cameras").json()
     assert answer["cameras"] == [found.as_dict()]
     assert answer["missing"][0]["hint"] == "install it"
 
 
-def test_a_search_that_hangs_is_a_sentence(live: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_that_hangs_is_a_sentence_and_ends(live: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_finder, "TIMEOUT_S", 0.05)
-    monkeypatch.setattr("deltalight.sensor_node.cameras.discovery.discover", lambda: time.sleep(0.5))
+    search(monkeypatch, "import time; time.sleep(60)")
     assert "takes too long" in sentence(live.client.get("/cameras"), 503)
+    while any(thread.name == "cameras" for thread in threading.enumerate()):
+        time.sleep(0.01)  # its process was killed
+
+
+@pytest.mark.parametrize("script", ["raise SystemExit(139)", "print('a camera')", "print('{}')"])
+def test_a_search_that_fails_is_a_sentence(
+    live: LiveApi, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    search(monkeypatch, script)
+    assert "without an answer" in sentence(live.client.get("/cameras"), 503)

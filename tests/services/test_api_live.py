@@ -231,6 +231,18 @@ def test_wrong_messages_close_only_their_own_connection(live: LiveApi, message: 
         read_frame(other)
 
 
+@pytest.mark.parametrize("orders", [("codec h264", "codec jpeg"), ("view delta", "view")])
+def test_who_changes_view_or_codec_all_the_time_is_closed(live: LiveApi, orders: tuple[str, str]) -> None:
+    with live_socket(live.address) as socket, suppress(websockets.ConnectionClosed):
+        for _ in range(30):
+            for order in orders:
+                socket.send(order)
+        while True:
+            socket.recv(timeout=5)
+    assert socket.close_code == 1008
+    assert "less often" in str(socket.close_reason)
+
+
 def test_mjpeg_streams_pictures_and_live_jpg_is_the_newest(live: LiveApi) -> None:
     with httpx.stream("GET", f"http://{live.address}/api/v1/live.mjpg") as response:
         assert response.headers["content-type"].startswith("multipart/x-mixed-replace")

@@ -1,8 +1,8 @@
 """schemathesis over the whole OpenAPI description: no 5xx, and every answer keeps to what is described.
 
 Not covered, because no description holds them: the WebSockets and the endless `live.mjpg`; nor `POST /whep`, whose
-SDP schemathesis cannot make. Render server, node and the children that record and replay are stand-ins, so that no
-request waits for a frame.
+SDP schemathesis cannot make. Render server, node and the children that record, replay, look for cameras and make
+shelf objects are stand-ins, so that no request waits.
 """
 
 import copy
@@ -16,7 +16,11 @@ from typing import Any
 import pytest
 
 from deltalight.services import ports
-from deltalight.services.api import recording_session, replay_control
+from deltalight.services.api import camera_finder, recording_session, replay_control
+from deltalight.services.storage import assets
+from deltalight.services.storage.asset_kinds import Facts
+from deltalight.services.storage.asset_sandbox import Task, run_limited
+from deltalight.services.storage.shelf import shelf_item
 from tests.services.api_samples import RunningApi, running_api
 from tests.services.live_samples import StandInStream, wait_for_frames
 from tests.services.record_samples import frames, write
@@ -61,11 +65,22 @@ class NoChild:
         return True
 
 
+def made_here(task: Task, path: Path, name: str, *arguments: str, **limits: int) -> Facts:
+    """In place of the limited process, for objects of the shelf."""
+    if task != "shelf":
+        return run_limited(task, path, name, *arguments, **limits)
+    path.write_bytes(shelf_item(arguments[0]).glb())
+    return {"triangles": 4}
+
+
 @pytest.fixture
 def full_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningApi]:
     """With pictures that come, and a render server that answers."""
     for module in (recording_session, replay_control):
         monkeypatch.setattr(module, "ChildProcess", NoChild)
+    no_cameras = 'print(\'{"cameras": [], "missing": []}\')'
+    monkeypatch.setattr(camera_finder, "COMMAND", (sys.executable, "-S", "-c", no_cameras))
+    monkeypatch.setattr(assets, "run_limited", made_here)
     control_port, stream_port = ports.private_ports(2)
     endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
     server, stream = Recorder(control_port), StandInStream(stream_port)

@@ -13,6 +13,7 @@ import httpx
 import pytest
 from typer.testing import CliRunner
 
+from deltalight.benchmarks.soak.samples import read_process
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import ControlRequest
@@ -164,3 +165,33 @@ def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:
         run_api(ApiSettings(port=port, data=tmp_path / "file"))
     with pytest.raises(DeltalightError, match="`host` is wrong"):
         validate(ApiSettings, {"host": "somewhere.example"}, "api")
+
+
+MOST_GROWTH_BYTES = 20 << 20  # imports would take 127 MB for the shelf and 131 to 175 MB for cameras
+
+
+@pytest.mark.slow
+def test_requests_that_need_large_packages_or_are_refused_leave_the_process_as_small(tmp_path: Path) -> None:
+    port, control_port, stats_port = ports.private_ports(3)
+    rest = ("api", "--port", port, "--data", tmp_path, "--control", ports.endpoint(control_port))
+    wide = b"[" + b"0, " * 30_000 + b"0]"
+    client = httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60)
+
+    def refused(content: bytes, media_type: str) -> None:
+        answer = client.post("/scenes", content=content, headers={"Content-Type": media_type})
+        assert 400 <= answer.status_code < 500, answer.text
+
+    with process(*rest, "--subscribe", ports.endpoint(stats_port)) as running:
+        wait_for(lambda: client.get("/health").is_success)
+        for place in ("/scenes", "/state", "/recordings", "/assets", "/openapi.json"):
+            client.get(place)
+        refused(wide, "application/yaml")
+        before = read_process(running.pid).rss_bytes
+        assert client.get("/cameras").is_success
+        for item in ("helmet", "chrome-ball", "helmet"):
+            assert client.post(f"/shelf/{item}").is_success
+        for _ in range(5):
+            refused(b'{"a": ' * 3000, "application/json")
+            refused(b'{"a": %s}' % wide, "application/json")
+            refused(wide, "application/yaml")
+        assert read_process(running.pid).rss_bytes - before < MOST_GROWTH_BYTES

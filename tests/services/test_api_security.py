@@ -1,12 +1,14 @@
 """Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
 
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
 from sqlalchemy import update
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from deltalight.protocol.errors import DeltalightError
@@ -17,6 +19,7 @@ from deltalight.services.api.limits import REMEMBERED_CLIENTS, RateLimit
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.storage.tables import TokenRow
 from tests.services.api_samples import RunningApi, running_api, sentence
+from tests.services.storage_samples import TETRAHEDRON, upload
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +149,12 @@ def ended(connection: socket.socket) -> bool:
     return connection.recv(1) == b""
 
 
+def rest_of(connection: socket.socket) -> bytes:
+    """What comes until the service closes a connection."""
+    connection.settimeout(30)
+    return b"".join(iter(lambda: connection.recv(1 << 20), b""))
+
+
 def test_connections_that_ask_nothing_take_nobodys_place(
     guarded: RunningApi, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,6 +171,48 @@ def test_connections_that_ask_nothing_take_nobodys_place(
         dripping.sendall(b"GET /api/v1/health HTT")
         assert ended(silent)
         assert ended(dripping)
+
+
+@pytest.mark.parametrize("drip", [b"", b" "])
+def test_a_body_that_stays_away_or_comes_in_drips_takes_nobodys_place(
+    open_api: RunningApi, monkeypatch: pytest.MonkeyPatch, drip: bytes
+) -> None:
+    monkeypatch.setattr(connections, "BODY_WINDOW_S", 0.2)
+    with socket.create_connection((open_api.client.base_url.host, open_api.client.base_url.port)) as slow:
+        slow.sendall(b"POST /api/v1/scenes HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9999\r\n\r\n{")
+        slow.sendall(drip)
+        assert ended(slow)
+    answer = open_api.client.post(
+        "/scenes", content=b" " * 100_000 + b"{}", headers={"Content-Type": "application/json"}
+    )
+    assert answer.status_code == 201
+
+
+def test_who_takes_no_answer_takes_nobodys_place(
+    open_api: RunningApi, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "STALL_TIMEOUT_S", 0.2)
+    large = upload(open_api.store, TETRAHEDRON + b"#" * 20_000_000, "large.obj", limit_bytes=1 << 25)
+    path = f"/api/v1/assets/{large.reference}/content"
+    with socket.create_connection((open_api.client.base_url.host, open_api.client.base_url.port)) as deaf:
+        deaf.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        assert deaf.recv(12) == b"HTTP/1.1 200"
+        time.sleep(1.0)
+        assert len(rest_of(deaf)) < 20_000_000
+    assert len(open_api.client.get(path.removeprefix("/api/v1")).content) > 20_000_000
+
+
+def test_refused_sockets_and_broken_requests_write_hardly_a_line(
+    guarded: RunningApi, caplog: pytest.LogCaptureFixture
+) -> None:
+    address = guarded.client.base_url.host, guarded.client.base_url.port
+    for _ in range(20):
+        with pytest.raises(InvalidStatus):
+            connect(f"ws://{address[0]}:{address[1]}/api/v1/live")
+        with socket.create_connection(address) as broken:
+            broken.sendall(b"\0\r\n\r\n")
+            assert b" 400 " in rest_of(broken)
+    assert len([record for record in caplog.records if record.name.startswith("uvicorn")]) <= 1
 
 
 def test_too_many_requests_are_told_when_to_come_again(tmp_path_factory: pytest.TempPathFactory) -> None:

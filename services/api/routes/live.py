@@ -17,6 +17,7 @@ from deltalight.services.api.credentials import TICKET_LIFE_S, principal_of
 from deltalight.services.api.events import EventQueue, packed
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.fisheye import FisheyeLight, lights_in_picture
+from deltalight.services.api.limits import RateLimit
 from deltalight.services.api.live_hub import LiveHub, Viewer
 from deltalight.services.api.live_video import LiveCodec
 from deltalight.services.api.problems import ProblemError, responses, unavailable
@@ -25,8 +26,10 @@ from deltalight.services.storage.faults import NotFoundError
 PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
 VIEW_TIMEOUT_S = 10.0  # the same, and its shaders' compilation
 POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
+ORDERS_PER_S, ORDERS_AT_ONCE = 10.0, 40  # changes of view and codec by one viewer, which are work for all
 BOUNDARY = "frame"
 CODECS: dict[str, LiveCodec] = {"jpeg": "jpeg", "h264": "h264"}
+_TOO_MANY_ORDERS = "change view and codec less often"
 UNKNOWN_CODEC = f"there is no such codec; ask for one of {', '.join(CODECS)}"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 NO_ANSWER = "The render server does not answer, or (with Retry-After) too many requests wait for it."
@@ -228,22 +231,38 @@ async def _send_frames(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) 
 
 async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) -> None:
     """Take acknowledgements, `view NAME` for another view (`view` alone: the scene's own), and `codec NAME`."""
+    orders = RateLimit(ORDERS_PER_S, ORDERS_AT_ONCE)
     try:
         while True:
             text = await socket.receive_text()
-            if text.startswith("view"):
-                viewer.look_at(_VIEW.validate_python(text.removeprefix("view").strip() or None))
-            elif not text.startswith("codec"):
+            if not text.startswith(("view", "codec")):
                 under_way.acknowledge()
-            elif (codec := text.removeprefix("codec").strip()) in CODECS:
-                viewer.prefer(CODECS[codec])
-            else:
-                await socket.close(POLICY_VIOLATION, UNKNOWN_CODEC)
+                continue
+            refusal = _TOO_MANY_ORDERS if orders.wait_s("") > 0 else _obey(viewer, text)
+            if refusal:
+                await socket.close(POLICY_VIOLATION, refusal)
                 return
+            orders.take("")
     except WebSocketDisconnect:
         return
     except (ValueError, KeyError):  # it acknowledged a frame that it never got, sent bytes, or named no view
         await socket.close(POLICY_VIOLATION, "acknowledge each frame once; views are as in output.view")
+
+
+def _obey(viewer: Viewer, order: str) -> str:
+    """Show a viewer another view, or in another codec; return why not, else nothing.
+
+    Raises:
+        ValueError: there is no such view.
+    """
+    if order.startswith("view"):
+        viewer.look_at(_VIEW.validate_python(order.removeprefix("view").strip() or None))
+        return ""
+    codec = CODECS.get(order.removeprefix("codec").strip())
+    if codec is None:
+        return UNKNOWN_CODEC
+    viewer.prefer(codec)
+    return ""
 
 
 async def _next_in(hub: LiveHub, view: ShownView) -> bytes:

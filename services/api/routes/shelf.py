@@ -9,7 +9,7 @@ from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.models import AssetAnswer
 from deltalight.services.api.problems import responses
 from deltalight.services.api.routes.assets import KEPT_ANSWERS, announced
-from deltalight.services.storage.shelf import SHELF, shelf_item
+from deltalight.services.storage.shelf import SHELF
 
 router = APIRouter(tags=["assets"], prefix="/shelf")
 ROUTERS = (router,)
@@ -41,9 +41,5 @@ def take_from_shelf(
     item: Annotated[str, Path(description="Its `name`.", examples=["chrome-ball"])],
 ) -> AssetAnswer:
     """Make an asset of an object of the shelf, to be named by scenes; 200 where it is there already."""
-    found, assets = shelf_item(item), shared.store.assets
-    content = found.glb()
-    with assets.receiving(len(content)) as incoming:
-        incoming.write(content)
-        asset, is_new = assets.keep(incoming, found.file_name)
+    asset, is_new = shared.store.assets.take_from_shelf(item)
     return announced(shared, asset, response, is_new=is_new)
