@@ -35,7 +35,8 @@ NODE_RETRY_S = 10.0
 class RoomsHost:
     """The rooms of a file on this host; `data` is the folder of scenes, `sessions` holds the session files.
 
-    `on_cluster`: their render servers run on the Ray cluster at `ray_address`; None = one of this host alone.
+    `on_cluster`: their render servers run on the Ray cluster at `ray_address`; None = one of this host alone. The
+    directory of rooms answers at `rooms_address`.
     """
 
     rooms: RoomsFile
@@ -46,6 +47,7 @@ class RoomsHost:
     rooms_port: int = ports.ROOMS_PORT
     on_cluster: bool = False
     ray_address: str | None = None
+    rooms_address: str = ports.LOOPBACK
 
     def require_free_ports(self) -> None:
         """Check the ports that have been chosen, before a child is started.
@@ -88,10 +90,12 @@ class RoomsHost:
                 keeper.poll()
                 time.sleep(POLL_INTERVAL_S)
 
-    @property
+    @cached_property
     def directory(self) -> str:
-        """The endpoint of the directory of rooms."""
-        return ports.endpoint(self.rooms_port)
+        """The endpoint of the directory of rooms, with the name of its key where it leaves the host."""
+        if self.rooms_address == ports.LOOPBACK:
+            return ports.endpoint(self.rooms_port)
+        return reachable_endpoint(self.commands, self.rooms_address, self.rooms_port)
 
     def _cluster(self, stack: ExitStack) -> RayCluster | None:
         if not self.on_cluster:
@@ -141,7 +145,9 @@ class RoomsHost:
         settings = load_configuration(self.commands.config).section("keys", KeySettings)
         found = {}
         for name, node in self.rooms.nodes.items():
-            if node.found is not None:
+            if node.endpoint is not None:
+                found[name] = node.endpoint
+            elif node.found is not None:
                 found[name] = node_endpoint(node.found, settings)
             else:
                 found[name] = reachable_endpoint(self.commands, address, self.node_ports[name])

@@ -6,6 +6,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from deltalight.protocol.documents import StrictModel, nearest, read_mapping, validate
+from deltalight.protocol.endpoints import parse_endpoint
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import Name
 from deltalight.sensor_node.cameras.drivers import SYNTHETIC
@@ -18,7 +19,7 @@ Device = Annotated[int, Field(ge=0)] | None
 
 
 class NodeEntry(StrictModel):
-    """A sensor node: one of this host with its `source`, or one `found` on the network by its name."""
+    """A sensor node: of this host with its `source`, `found` on the network by its name, or at an `endpoint`."""
 
     source: str | None = Field(
         default=None,
@@ -28,11 +29,18 @@ class NodeEntry(StrictModel):
     found: Name | None = Field(
         default=None, description="Name under which a node of another host announces itself."
     )
+    endpoint: str | None = Field(
+        default=None, description="Where a node of another host publishes, `tcp://KEY@HOST:PORT`."
+    )
 
     @model_validator(mode="after")
-    def _is_one_of_both(self) -> Self:
-        if (self.source is None) == (self.found is None):
-            raise ValueError("give either the source of a node here, or the name of one that is found")
+    def _is_one_of_all(self) -> Self:
+        if sum(each is not None for each in (self.source, self.found, self.endpoint)) != 1:
+            raise ValueError(
+                "give either the source of a node here, or the name of one that is found, or an endpoint"
+            )
+        if self.endpoint is not None:
+            parse_endpoint(self.endpoint)
         return self
 
 
