@@ -156,11 +156,17 @@ def _run_rooms(
     on_cluster: bool,
     ray_address: str | None,
 ) -> None:
+    from deltalight.services.rooms.capacity import with_slots
     from deltalight.services.rooms.host import RoomsHost
+    from deltalight.services.rooms.render_actor import hardware_devices
     from deltalight.services.rooms.rooms_file import load_rooms, require_cluster_form, require_local_form
 
     rooms = load_rooms(path)
     (require_cluster_form if on_cluster else require_local_form)(rooms)
+    if on_cluster and ray_address is not None:
+        rooms = rooms.replaced(slots=1)  # its hosts say how many they offer
+    else:
+        rooms = with_slots(rooms, hardware_devices())
     with TemporaryDirectory(prefix="deltalight-") as folder:
         host = RoomsHost(
             rooms, commands, data, Path(folder), port, rooms_port, on_cluster, ray_address, rooms_host

@@ -16,6 +16,7 @@ from deltalight.services.child import ChildSpec
 from deltalight.services.discovery import node_endpoint
 from deltalight.services.host import PREPARED, HostCommands, recording_of
 from deltalight.services.host_store import activate_document, open_store, write_scene
+from deltalight.services.rooms.capacity import load_figures
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
 from deltalight.services.rooms.local_placer import LocalPlacer
@@ -74,10 +75,11 @@ class RoomsHost:
             cluster = self._cluster(stack)
             address = ports.LOOPBACK if cluster is None else cluster.own_address
             endpoints = self._node_endpoints(address)
-            plans = self._plans(endpoints)
+            store = stack.enter_context(open_store(self.data, self.commands.config))
+            plans = self._plans(store, endpoints)
             placer = self._local_placer(forward) if cluster is None else self._ray_placer(cluster, forward)
             stack.callback(placer.close)
-            keeper = RoomKeeper(plans, placer, forward)
+            keeper = RoomKeeper(plans, placer, forward, store.drained)
             directory = DirectoryServer(self.directory, keeper, self.commands.keys([self.directory]))
             stack.callback(directory.close)
             nodes = [NodeSupervisor(spec, forward) for spec in self._nodes(address)]
@@ -107,7 +109,8 @@ class RoomsHost:
     def _ray_placer(self, cluster: RayCluster, forward: Callable[[str], None]) -> RayPlacer:
         config = None if self.commands.config is None else self.commands.config.absolute()
         commands = replace(self.commands, config=config)
-        return RayPlacer(cluster, self._server, commands, forward=forward)
+        figures = None if self.rooms.figures is None else load_figures(self.rooms.figures)
+        return RayPlacer(cluster, self._server, commands, figures=figures, forward=forward)
 
     def _local_placer(self, forward: Callable[[str], None]) -> LocalPlacer:
         spare = replace(self.commands.child("spare", "server"), warm=PREPARED["server"])
@@ -153,16 +156,15 @@ class RoomsHost:
                 found[name] = reachable_endpoint(self.commands, address, self.node_ports[name])
         return found
 
-    def _plans(self, endpoints: Mapping[str, str]) -> list[RoomPlan]:
+    def _plans(self, store: Store, endpoints: Mapping[str, str]) -> list[RoomPlan]:
         plans = []
-        with open_store(self.data, self.commands.config) as store:
-            for name, room in self.rooms.rooms.items():
-                source = recording_of(self.rooms.nodes[room.nodes[0]].source)
-                document = room_scene(store.of_room(name, tuple(self.rooms.rooms)), name, room, source)
-                path = self.sessions / f"{name}.json"
-                write_scene(path, document)
-                nodes = tuple(RoomNode(name=node, endpoint=endpoints[node]) for node in room.nodes)
-                plans.append(RoomPlan(name, room.title, nodes, path, room.labels))
+        for name, room in self.rooms.rooms.items():
+            source = recording_of(self.rooms.nodes[room.nodes[0]].source)
+            document = room_scene(store.of_room(name, tuple(self.rooms.rooms)), name, room, source)
+            path = self.sessions / f"{name}.json"
+            write_scene(path, document)
+            nodes = tuple(RoomNode(name=node, endpoint=endpoints[node]) for node in room.nodes)
+            plans.append(RoomPlan(name, room.title, nodes, path, room.labels))
         return plans
 
 

@@ -9,8 +9,16 @@ from typing import Any
 
 from deltalight.services import ports
 from deltalight.services.host import HostCommands
+from deltalight.services.rooms.capacity import RoomFigures
 from deltalight.services.rooms.local_placer import Command
-from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
+from deltalight.services.rooms.placer import (
+    NoSlotError,
+    Placement,
+    PlacementEvent,
+    RoomOrder,
+    Slot,
+    choose_slot,
+)
 from deltalight.services.rooms.ray_cluster import SLOT_RESOURCE, ClusterHost, RayCluster
 from deltalight.services.rooms.render_actor import END_TIMEOUT_S, SESSION, News, RenderActor, RenderTask
 
@@ -32,7 +40,8 @@ class RayPlacer:
     """Places each render server by an actor on a host of the cluster (a `Placer`), in a slot that the host offers.
 
     A slot is a whole `render_slot`, never a part of a GPU: the actor chooses the EGL device itself. With `commands`
-    the actor finds the keys of its host; all hosts of a fleet have the same.
+    the actor finds the keys of its host; all hosts of a fleet have the same. A host that does not have what it
+    claims, by the `figures` of a room if they are known, is refused: it has no slots until Ray starts there anew.
     """
 
     def __init__(
@@ -41,8 +50,11 @@ class RayPlacer:
         command: Command,
         commands: HostCommands,
         *,
+        figures: RoomFigures | None = None,
         forward: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
     ) -> None:
+        self._figures = figures
+        self._refused: dict[str, str] = {}  # why, by Ray's id of the host
         self._cluster = cluster
         self._command = command
         self._commands = commands
@@ -51,20 +63,23 @@ class RayPlacer:
         self._used: set[tuple[str, int]] = set()  # addresses and ports
 
     def slots(self) -> list[Slot]:
-        """Return the slots of all hosts that live."""
-        return [slot for host in self._cluster.hosts() for slot in self._slots_of(host)]
+        """Return the slots of all hosts that live and are not refused."""
+        return [slot for host in self._hosts() for slot in self._slots_of(host)]
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
         """Start the render server of a room (`Placer.place`)."""
-        hosts = self._cluster.hosts()
-        chosen = choose_slot([each for host in hosts for each in self._slots_of(host)], order, slot)
+        hosts = self._hosts()
+        try:
+            chosen = choose_slot([each for host in hosts for each in self._slots_of(host)], order, slot)
+        except NoSlotError as fault:
+            raise NoSlotError(" ".join([str(fault), *self._refusals()])) from None
         host = next(host for host in hosts if host.name == chosen.host)
         placement = Placement(
             order.room, order.epoch, chosen.name, self._fresh_endpoint(host), self._fresh_endpoint(host)
         )
         spec = self._command(replace(order, session_file=SESSION), placement, None)
         rank = int(chosen.name.rpartition("/")[2]) - 1
-        task = RenderTask(placement, spec, _text(order), self._commands, rank)
+        task = RenderTask(placement, spec, _text(order), self._commands, rank, host, self._figures)
         actor = self._actor_class(host, f"{order.room}-{order.epoch}").remote(task)
         late_s = time.monotonic() + START_TIMEOUT_S
         self._placed[chosen.name] = _Placed(placement, host, actor, actor.news.remote(), late_s)
@@ -100,6 +115,14 @@ class RayPlacer:
             self._cluster.ray.wait(endings, num_returns=len(endings), timeout=END_TIMEOUT_S)
         for slot in list(self._placed):
             self._forget(slot)
+
+    def _hosts(self) -> list[ClusterHost]:
+        return [host for host in self._cluster.hosts() if host.node_id not in self._refused]
+
+    def _refusals(self) -> list[str]:
+        """Say why hosts that live are refused."""
+        hosts = (self._refused.get(host.node_id) for host in self._cluster.hosts())
+        return [f"{why[:1].upper()}{why[1:]}" for why in hosts if why is not None]
 
     def _slots_of(self, host: ClusterHost) -> list[Slot]:
         names = [f"{host.name}/{number}" for number in range(1, host.slots + 1)]
@@ -150,6 +173,9 @@ class RayPlacer:
             return self._lost(slot, f"It ran on {placed.host.name}, and {what}.")
         for line in news.lines:
             self._forward(line)
+        for event in news.events:
+            if event.host_refused:
+                self._refused[placed.host.node_id] = event.detail
         if any(event.kind == "lost" for event in news.events):
             self._forget(slot)
         else:

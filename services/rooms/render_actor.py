@@ -1,6 +1,7 @@
 """A room on a host of a Ray cluster: the actor that starts its render server there and tells what becomes of it."""
 
 import ctypes
+import math
 import os
 import shutil
 import tempfile
@@ -16,7 +17,15 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.host import HostCommands
+from deltalight.services.rooms.capacity import (
+    FalseClaimError,
+    RoomFigures,
+    check_claim,
+    find_device_apart,
+    is_claim,
+)
 from deltalight.services.rooms.placer import Placement, PlacementEvent
+from deltalight.services.rooms.ray_cluster import ClusterHost
 from deltalight.services.rooms.render_process import RenderProcess
 
 SESSION = Path("session.json")  # in the actor's folder
@@ -43,6 +52,7 @@ class RenderTask:
     """What an actor starts.
 
     `rank` is the slot's number on its host, from 0, and `session` the text of the scene document, if there is one.
+    What the `host` claims by its labels and slots is checked, by the `figures` of a room if they are known.
     """
 
     placement: Placement
@@ -50,6 +60,8 @@ class RenderTask:
     session: str
     commands: HostCommands
     rank: int
+    host: ClusterHost
+    figures: RoomFigures | None = None
 
 
 class RenderActor:
@@ -63,7 +75,7 @@ class RenderActor:
         self._lines: deque[str] = deque()
         self._asked_s = time.monotonic()
         self._epoch = task.placement.epoch
-        self._fault = ""
+        self._fault: DeltalightError | None = None
         self._lock = threading.Lock()
         self._render: RenderProcess | None = None
         self._folder = tempfile.mkdtemp(prefix="deltalight-")
@@ -71,7 +83,7 @@ class RenderActor:
         try:
             self._render = _started(task, self._lines.append)
         except DeltalightError as fault:
-            self._fault = str(fault)
+            self._fault = fault
         threading.Thread(target=self._end_without_keeper, args=(os.getppid(),), daemon=True).start()
 
     def news(self) -> News:
@@ -104,7 +116,8 @@ class RenderActor:
 
     def _events(self) -> list[PlacementEvent]:
         if self._render is None:
-            return [PlacementEvent(self._epoch, "lost", self._fault)]
+            is_false = isinstance(self._fault, FalseClaimError)
+            return [PlacementEvent(self._epoch, "lost", str(self._fault), host_refused=is_false)]
         with self._lock:
             events = self._render.news()
         if self._render.is_gone:
@@ -129,9 +142,18 @@ def _started(task: RenderTask, forward: Callable[[str], None]) -> RenderProcess:
     if task.session:
         SESSION.write_text(task.session)
     devices = hardware_devices()
-    options = ("--device", str(devices[task.rank % len(devices)])) if devices else ()
+    device = devices[task.rank % len(devices)] if devices else None
+    _check_host(task.host, device, max(1, len(devices)), task.figures)
+    options = () if device is None else ("--device", str(device))
     spec = replace(task.spec, arguments=(*task.spec.arguments, *options))
     return RenderProcess(placement, spec, task.commands.keys(endpoints), forward)
+
+
+def _check_host(host: ClusterHost, device: int | None, devices: int, figures: RoomFigures | None) -> None:
+    """Compare what a host claims with what is found on one of its devices; without a claim nothing is asked."""
+    if figures is not None or is_claim(host.labels):
+        slots = math.ceil(host.slots / devices)
+        check_claim(host.name, host.labels, slots, find_device_apart(device), figures)
 
 
 def hardware_devices() -> list[int]:

@@ -1,7 +1,7 @@
 """The rooms file of `deltalight up --rooms`: the nodes, the rooms that show them, and the slots that rooms run in."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -65,14 +65,30 @@ class RoomEntry(StrictModel):
 class RoomsFile(StrictModel):
     """Nodes and rooms by name, and `slots`: how many rooms run at once, or the EGL device of each slot."""
 
-    slots: Annotated[int, Field(ge=1, le=MAX_ROOMS)] | Annotated[tuple[Device, ...], Field(min_length=1)] = (
-        Field(
-            default=1,
-            description="How many rooms run at once on this host, or a list with the EGL device of each slot.",
-        )
+    slots: (
+        Annotated[int, Field(ge=1, le=MAX_ROOMS)]
+        | Annotated[tuple[Device, ...], Field(min_length=1)]
+        | Literal["auto"]
+    ) = Field(
+        default=1,
+        description="How many rooms run at once on this host, or a list with the EGL device of each slot, or `auto`: "
+        "as many as fit by `figures`.",
+    )
+    figures: Path | None = Field(
+        default=None,
+        description="report.json of `deltalight gpu-check --steps memory,speed` on a device like those of the slots.",
+    )
+    frames_per_s: Annotated[float, Field(gt=0, le=240)] = Field(
+        default=30.0, description="What each room shall reach, for `slots: auto`."
     )
     nodes: dict[Name, NodeEntry] = Field(min_length=1, max_length=MAX_ROOMS)
     rooms: dict[Name, RoomEntry] = Field(min_length=1, max_length=MAX_ROOMS)
+
+    @model_validator(mode="after")
+    def _auto_has_figures(self) -> Self:
+        if self.slots == "auto" and self.figures is None:
+            raise ValueError("`slots: auto` needs `figures`, the report.json of `deltalight gpu-check`")
+        return self
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
@@ -89,7 +105,8 @@ class RoomsFile(StrictModel):
 
     @property
     def devices(self) -> tuple[int | None, ...]:
-        """The EGL device of each slot; None = the driver's first."""
+        """The EGL device of each slot; None = the driver's first. `auto` has none: see `capacity.with_slots`."""
+        assert self.slots != "auto"
         return (None,) * self.slots if isinstance(self.slots, int) else self.slots
 
 
@@ -103,7 +120,8 @@ def load_rooms(path: Path) -> RoomsFile:
     folder = path.absolute().parent
     nodes = {name: _placed(node, folder) for name, node in rooms.nodes.items()}
     entries = {name: _with_scene(name, room, folder) for name, room in rooms.rooms.items()}
-    return rooms.replaced(nodes=nodes, rooms=entries)
+    figures = None if rooms.figures is None else folder / rooms.figures
+    return rooms.replaced(nodes=nodes, rooms=entries, figures=figures)
 
 
 def require_cluster_form(rooms: RoomsFile) -> None:
@@ -112,7 +130,7 @@ def require_cluster_form(rooms: RoomsFile) -> None:
     Raises:
         DeltalightError: it names devices, which hosts of a cluster choose themselves.
     """
-    if not isinstance(rooms.slots, int):
+    if isinstance(rooms.slots, tuple):
         raise DeltalightError(
             "hosts of a cluster choose the EGL devices of their slots themselves; give `slots` as a number."
         )

@@ -169,6 +169,30 @@ def test_drain_start_and_move_by_rest(house: House) -> None:
     assert client.post("/rooms/door/move", json={"slt": "slot-1"}).status_code == 422
 
 
+def test_hosts_are_listed_and_drained_by_rest(house: House) -> None:
+    client = house.api.client
+    host, other = house.get("/hosts")  # of stand-ins each slot is a host
+    assert (host["drained"], host["slots"], host["rooms"]) == (False, 1, ["hall"])
+    drained = client.post(f"/hosts/{host['name']}/drain").json()
+    assert (drained["name"], drained["drained"]) == (host["name"], True)
+    house.keeper.poll()
+    wait_for(lambda: house.get("/rooms/hall")["state"] == "waiting")
+    assert [each["drained"] for each in house.get("/hosts")] == [True, False]
+    assert other["rooms"] == ["door"]
+    assert client.post("/hosts/mars/drain").status_code == 404
+    assert client.delete(f"/hosts/{host['name']}/drain").json()["drained"] is False
+    assert "is not drained" in sentence(client.delete(f"/hosts/{host['name']}/drain"), 409)
+    house.directory.close()
+    assert "does not answer" in sentence(client.post(f"/hosts/{host['name']}/drain"), 503)
+
+
+def test_a_web_process_of_rooms_is_ready_while_storage_and_directory_answer(house: House) -> None:
+    assert house.api.client.get("/ready").status_code == 200, "though no picture came"
+    house.directory.close()
+    wait_for(lambda: house.api.client.get("/ready").status_code == 503)
+    assert "the directory of rooms does not answer" in sentence(house.api.client.get("/ready"), 503)
+
+
 def test_a_directory_that_is_gone_leaves_what_runs(house: House) -> None:
     house.directory.close()
     refused = house.api.client.post("/rooms/hall/drain")
@@ -191,10 +215,11 @@ def test_a_token_that_may_look_sees_rooms_and_moves_none(tmp_path: Path) -> None
             api.client.get("/rooms").status_code,
             api.client.get("/rooms", headers=looks).status_code,
             api.client.post("/rooms/hall/drain", headers=looks).status_code,
+            api.client.post("/hosts/local/drain", headers=looks).status_code,
             api.client.patch(f"/rooms/hall/scenes/{scene}", headers=looks, json={"name": "x"}).status_code,
             api.client.post("/rooms/hall/tickets", headers=looks).status_code,
         ]
-        assert statuses == [401, 200, 403, 403, 201]
+        assert statuses == [401, 200, 403, 403, 403, 201]
 
 
 def test_an_installation_without_a_directory_has_one_room(tmp_path: Path) -> None:
@@ -204,6 +229,8 @@ def test_an_installation_without_a_directory_has_one_room(tmp_path: Path) -> Non
         assert api.client.get("/rooms/room/scenes").json() == api.client.get("/scenes").json()
         refused = api.client.post("/rooms/room/drain")
         assert "deltalight up --rooms" in sentence(refused, 409)
+        assert api.client.get("/hosts").json() == []
+        assert "deltalight up --rooms" in sentence(api.client.delete("/hosts/local/drain"), 409)
 
 
 def room_at(epoch: int | None) -> RoomList:
