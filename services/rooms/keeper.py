@@ -15,6 +15,7 @@ from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, Placer, RoomOrder, Slot
 from deltalight.services.rooms.status import (
+    Reason,
     RoomEndpoints,
     RoomList,
     RoomNode,
@@ -66,6 +67,12 @@ class _Room:
 
     def wait(self, why: str) -> None:
         self.state, self.why, self.placement, self.shows = "waiting", why, None, False
+
+    @property
+    def waits_for(self) -> Reason | None:
+        if self.state == "waiting":
+            return "drained" if self.drained else "slot"
+        return "failed" if self.state == "failed" else None
 
     def drain(self) -> None:
         self.drained = True
@@ -339,6 +346,7 @@ class RoomKeeper:
             nodes=room.plan.nodes,
             state=room.state,
             why=" ".join(filter(None, (room.why, *faults))),
+            waits_for=room.waits_for,
             slot=None if placement is None else placement.slot,
             endpoints=endpoints,
             moving_to=None if room.successor is None else room.successor.slot,

@@ -20,12 +20,14 @@ import pytest
 from deltalight.protocol.keys import create_keys
 from deltalight.services import ports
 from tests.deploy.chart_samples import SOFTWARE, of_kind, pods, rendered
+from tests.deploy.test_deploy import DEPLOY, check_names
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(find_spec("helm_python") is None, reason="Helm's library is not installed"),
     pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
 ]
+FLEET_BOARD = DEPLOY / "grafana" / "boards" / "fleet.json"
 KEEPER, RENDER, WEB = "127.0.0.2", "127.0.0.3", "127.0.0.4"  # addresses of the pods
 PATIENCE_S = 120.0
 ONE_ROOM = {"nodes": {"desk": {"source": "synthetic"}}, "rooms": {"hall": {"nodes": ["desk"]}}}
@@ -125,4 +127,5 @@ def test_the_commands_of_the_pods_show_a_room_that_another_host_renders() -> Non
         wait_for(lambda: web.get("/rooms/hall/live.jpg").content.startswith(b"\xff\xd8"))
         assert {slot["host"] for slot in web.get("/rooms").json()["slots"]} != {"local"}
         assert web.post("/recordings", json={}).status_code == 409, "the keeper's web process records"
+        check_names(web.get("/metrics").text, [FLEET_BOARD])
         assert httpx.get(f"http://127.0.0.1:{release.web}/api/v1/rooms").status_code == 401

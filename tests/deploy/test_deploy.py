@@ -5,7 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -197,10 +197,16 @@ def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path
 
 def check_metrics(text: str) -> None:
     """Boards and alerts ask for names that the service gives."""
+    check_names(
+        text, [DEPLOY / "prometheus" / "alerts.yml", DEPLOY / "grafana" / "boards" / "deltalight.json"]
+    )
+
+
+def check_names(text: str, files: Sequence[Path]) -> None:
+    """Each metric that the files ask for is in this text of a service."""
     given = {sample.name for family in text_string_to_metric_families(text) for sample in family.samples}
     families = {family.name for family in text_string_to_metric_families(text)}
-    asked = set(METRIC.findall((DEPLOY / "prometheus" / "alerts.yml").read_text()))
-    asked |= set(METRIC.findall((DEPLOY / "grafana" / "boards" / "deltalight.json").read_text()))
+    asked = {name for file in files for name in METRIC.findall(file.read_text())}
     missing = {name for name in asked if name not in given and name.removesuffix("_total") not in families}
     assert not missing
 

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import connect
 
 from deltalight.services import ports
@@ -16,11 +18,14 @@ from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.keeper import RoomKeeper
 from deltalight.services.rooms.status import RoomEndpoints, RoomList, RoomNode, RoomStatus
+from tests.deploy.test_deploy import DEPLOY, check_names
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.live_samples import StandInStream
 from tests.services.render_server_samples import Recorder
 from tests.services.room_samples import StandInPlacer, plans, running
 from tests.services.test_api_scenes import wait_for
+
+FLEET_BOARD = DEPLOY / "grafana" / "boards" / "fleet.json"
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,42 @@ def test_pictures_follow_the_newest_epoch_and_not_the_server_before(house: House
         with closing(stream_of("door")):
             wait_for(lambda: live.received > seen + 10)
     assert house.api.client.get("/rooms/hall/live.jpg").status_code == 503
+
+
+def measured(house: House) -> dict[tuple[str, ...], float]:
+    """Prometheus' samples by name and values of labels, which come by name."""
+    text = house.api.client.get("/metrics").text
+    samples = (sample for family in text_string_to_metric_families(text) for sample in family.samples)
+    return {(sample.name, *sample.labels.values()): sample.value for sample in samples}
+
+
+def test_a_monitor_reads_states_slots_and_the_gap_of_a_failover(house: House) -> None:
+    before = measured(house)
+    assert before["deltalight_room_state", "door", "running"] == 1
+    assert before["deltalight_room_waits", "slot", "attic"] == 1
+    assert before["deltalight_slots", "slot-1", "used"] == 1
+    rooms = house.api.app.state.rooms  # type: ignore[attr-defined]
+
+    def streaming() -> StandInStream:
+        return StandInStream(int(house.placer.of("door").publish.rpartition(":")[2]))
+
+    live = rooms.contexts["door"].live
+    with closing(streaming()):
+        wait_for(lambda: live.received > 2)
+    seen, left_s = live.received, time.monotonic()
+    house.replaced("door")
+    with closing(streaming()):
+        wait_for(lambda: live.received > seen + 2)
+    away_s = time.monotonic() - left_s
+    after = measured(house)
+    assert after["deltalight_room_restarts_total", "door"] == 1
+    assert after["deltalight_room_gap_seconds_count", "door"] == 1
+    assert 0 < after["deltalight_room_gap_seconds_sum", "door"] < away_s + 1
+    assert after["deltalight_room_frame_seconds_count", "door"] >= seen
+    house.api.client.post("/rooms/door/drain").raise_for_status()
+    wait_for(lambda: measured(house)["deltalight_room_waits", "drained", "door"] == 1)
+    assert ("deltalight_room_gap_seconds_count", "hall") not in after, "it showed nothing yet"
+    check_names(house.api.client.get("/metrics").text, [FLEET_BOARD])
 
 
 def test_drain_start_and_move_by_rest(house: House) -> None:

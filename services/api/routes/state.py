@@ -123,9 +123,9 @@ def state(shared: Shared) -> State:
 
 
 @state_router.get("/metrics", response_class=PlainTextResponse)
-def metrics(shared: Shared) -> Response:
-    """Measurements for Prometheus."""
-    return Response(shared.metrics.text(), media_type=MEDIA_TYPE)
+def metrics(shared: Shared, rooms: AllRooms) -> Response:
+    """Measurements for Prometheus: of a room, and of what all rooms have in common."""
+    return Response(shared.metrics.text() + rooms.metrics.text(), media_type=MEDIA_TYPE)
 
 
 @state_router.get("/settings")

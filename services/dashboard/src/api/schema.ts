@@ -312,7 +312,7 @@ export interface paths {
         };
         /**
          * Metrics
-         * @description Measurements for Prometheus.
+         * @description Measurements for Prometheus: of a room, and of what all rooms have in common.
          */
         readonly get: operations["metrics"];
         readonly put?: never;

@@ -53,7 +53,11 @@ function Rooms() {
               </span>
               {host.drained && <span class="badge waiting">drained</span>}
               {role.value === "control" && (
-                <button type="button" onClick={() => void (host.drained ? undrainHost : drainHost)(host.name)}>
+                <button
+                  type="button"
+                  class="button"
+                  onClick={() => void (host.drained ? undrainHost : drainHost)(host.name)}
+                >
                   {host.drained ? "Take rooms" : "Drain"}
                 </button>
               )}
