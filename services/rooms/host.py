@@ -110,14 +110,14 @@ class RoomsHost:
         config = None if self.commands.config is None else self.commands.config.absolute()
         commands = replace(self.commands, config=config)
         figures = None if self.rooms.figures is None else load_figures(self.rooms.figures)
-        return RayPlacer(cluster, self._server, commands, figures=figures, forward=forward)
+        spare = _spare(commands)
+        return RayPlacer(cluster, self._server, commands, figures=figures, spare=spare, forward=forward)
 
     def _local_placer(self, forward: Callable[[str], None]) -> LocalPlacer:
-        spare = replace(self.commands.child("spare", "server"), warm=PREPARED["server"])
         return LocalPlacer(
             self.rooms.devices,
             self._server,
-            spare=spare if self.commands.spares else None,
+            spare=_spare(self.commands),
             keys=self.commands.keys([self.directory]),
             forward=forward,
         )
@@ -166,6 +166,11 @@ class RoomsHost:
             nodes = tuple(RoomNode(name=node, endpoint=endpoints[node]) for node in room.nodes)
             plans.append(RoomPlan(name, room.title, nodes, path, room.labels))
         return plans
+
+
+def _spare(commands: HostCommands) -> ChildSpec | None:
+    """Return what waits to become a render server, None if there shall be no spares."""
+    return replace(commands.child("spare", "server"), warm=PREPARED["server"]) if commands.spares else None
 
 
 class NodeSupervisor:

@@ -4,6 +4,7 @@ import ctypes
 import math
 import os
 import shutil
+import subprocess
 import tempfile
 import threading
 import time
@@ -15,7 +16,7 @@ from typing import Any
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
-from deltalight.services.child import ChildSpec
+from deltalight.services.child import ChildSpec, end_all, open_spare, take_spare
 from deltalight.services.host import HostCommands
 from deltalight.services.rooms.capacity import (
     FalseClaimError,
@@ -67,24 +68,37 @@ class RenderTask:
 class RenderActor:
     """Holds one render slot, and runs the render server of a room in it.
 
+    Without a task it is the spare of its host: a process that has prepared itself (`ChildSpec.warm`) waits in it,
+    takes no slot, and becomes the render server of the task that it is told to `begin` with.
+
     Ends with it when Ray's raylet, its parent, is gone, or when no keeper has asked for `LEASE_S`: a host that was
     cut off must not go on, because the room runs elsewhere by then.
     """
 
-    def __init__(self, task: RenderTask) -> None:
+    def __init__(self, task: RenderTask | None, spare: ChildSpec | None = None) -> None:
         self._lines: deque[str] = deque()
         self._asked_s = time.monotonic()
-        self._epoch = task.placement.epoch
+        self._epoch = 0
         self._fault: DeltalightError | None = None
         self._lock = threading.Lock()
         self._render: RenderProcess | None = None
         self._folder = tempfile.mkdtemp(prefix="deltalight-")
         os.chdir(self._folder)
-        try:
-            self._render = _started(task, self._lines.append)
-        except DeltalightError as fault:
-            self._fault = fault
+        self._spare = None if spare is None else open_spare(spare.arguments, spare.warm)
+        if task is not None:
+            self._start(task)
         threading.Thread(target=self._end_without_keeper, args=(os.getppid(),), daemon=True).start()
+
+    def begin(self, task: RenderTask) -> News:
+        """Start the render server of a task by the spare; return the first news."""
+        self._start(task)
+        return self.news()
+
+    def waits(self) -> bool:
+        """Return after a second whether the spare still lives."""
+        time.sleep(NEWS_WAIT_S)
+        self._asked_s = time.monotonic()
+        return self._spare is not None and self._spare.poll() is None
 
     def news(self) -> News:
         """Return what happened since the last call; waits a second for it."""
@@ -98,7 +112,9 @@ class RenderActor:
         return News(tuple(events), tuple(lines))
 
     def end(self) -> None:
-        """End the render server, and return when it is gone."""
+        """End the render server or the spare, and return when it is gone."""
+        if self._spare is not None:
+            end_all([self._spare])
         if self._render is not None:
             self._render.end()
             deadline_s = time.monotonic() + END_TIMEOUT_S
@@ -108,7 +124,16 @@ class RenderActor:
 
     def process_id(self) -> int:
         """Return the process id of the render server; 0 = it was not started."""
-        return 0 if self._render is None else self._render.process.pid
+        with self._lock:
+            return 0 if self._render is None else self._render.process.pid
+
+    def _start(self, task: RenderTask) -> None:
+        with self._lock:
+            spare, self._spare, self._epoch = self._spare, None, task.placement.epoch
+            try:
+                self._render = _started(task, self._lines.append, spare)
+            except DeltalightError as fault:
+                self._fault = fault
 
     @property
     def _is_gone(self) -> bool:
@@ -133,7 +158,9 @@ class RenderActor:
         os._exit(1)
 
 
-def _started(task: RenderTask, forward: Callable[[str], None]) -> RenderProcess:
+def _started(
+    task: RenderTask, forward: Callable[[str], None], spare: "subprocess.Popen[str] | None"
+) -> RenderProcess:
     placement = task.placement
     endpoints = placement.publish, placement.control
     for endpoint in endpoints:
@@ -146,7 +173,8 @@ def _started(task: RenderTask, forward: Callable[[str], None]) -> RenderProcess:
     _check_host(task.host, device, max(1, len(devices)), task.figures)
     options = () if device is None else ("--device", str(device))
     spec = replace(task.spec, arguments=(*task.spec.arguments, *options))
-    return RenderProcess(placement, spec, task.commands.keys(endpoints), forward)
+    keys = task.commands.keys(endpoints)
+    return RenderProcess(placement, spec, keys, forward, take_spare(spare, spec))
 
 
 def _check_host(host: ClusterHost, device: int | None, devices: int, figures: RoomFigures | None) -> None:

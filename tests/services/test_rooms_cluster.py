@@ -117,6 +117,21 @@ def test_two_rooms_run_on_two_hosts_and_the_third_waits_and_says_why(
     assert found == {"alpha": (1, "east"), "beta": (1, None)}
 
 
+def test_a_killed_render_server_is_replaced_by_the_spare_of_its_host(
+    hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slot, before = installation.room("hall").slot, settled(installation, "hall")
+    assert slot is not None
+    host = slot.partition("/")[0]
+    wait_for(lambda: sum("server" in each.cmdline() for each in rendering(hosts.raylet(host))) == 2)
+    time.sleep(3)  # it prepares itself
+    said = installation.kill("hall")
+    with capsys.disabled():
+        print(f"\na render server of a host that lives was replaced after {said}")
+    assert "by the spare" in said
+    assert (installation.room("hall").slot, settled(installation, "hall")) == (slot, before)
+
+
 def test_rooms_of_killed_hosts_return_on_others_with_equal_pictures(
     hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
 ) -> None:
