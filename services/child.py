@@ -142,6 +142,12 @@ def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subproces
     return open_process(arguments, subprocess.PIPE, spare_environment(prepared))
 
 
+def take_spare(spare: "subprocess.Popen[str] | None", spec: ChildSpec) -> "subprocess.Popen[str] | None":
+    """Tell a spare to go on as a deltalight command; None where there is no spare, or it died."""
+    words = spec.arguments[len(ChildSpec.deltalight("").arguments) :]
+    return spare if spare is not None and use_spare(spare, words) else None
+
+
 def end_all(processes: Sequence[subprocess.Popen[str]]) -> None:
     """End processes: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
     try:

@@ -126,3 +126,7 @@ def test_every_dependency_is_pinned_also_those_of_other_machines() -> None:
     node = (ROOT / "deploy" / "node.in").read_text().splitlines()[1:]
     assert _names(node) <= _names([*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["oak"]])
     assert _names(node) <= {*PINNED.findall((ROOT / "deploy" / "node.lock").read_text())}
+    fleet = (ROOT / "deploy" / "fleet.in").read_text().splitlines()[2:]
+    extras = (PROJECT["optional-dependencies"][name] for name in ("cluster", "postgres", "s3"))
+    assert _names(fleet) == _names([each for extra in extras for each in extra])
+    assert _names(fleet) <= {*PINNED.findall((ROOT / "deploy" / "fleet.lock").read_text())}

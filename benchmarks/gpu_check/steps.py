@@ -8,6 +8,7 @@ from functools import partial
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any
 
 from deltalight.benchmarks.gpu_check.record import Findings, Skipped
@@ -128,14 +129,33 @@ def speed(findings: Findings) -> str:
 
 
 def memory(findings: Findings) -> str:
-    """Say what each method's frame holds: bytes of each source and stage (`deltalight graph`), and GL objects."""
+    """Say what each method's frame holds: bytes of each source and stage (`deltalight graph`), and GL objects.
+
+    `room_bytes` is what a room takes of the device's memory, whatever its method.
+    """
     held: dict[str, dict[str, Any]] = {}
     with _context() as gpu:
+        free_bytes = _free_bytes(gpu)
         for method in METHODS:
             with _noting(findings, method):
                 held[method] = _held(gpu, method, findings.scratch)
-                findings.keep(f"{method} was the last", held=held)
+                room_bytes = _room_bytes(gpu, held, free_bytes)
+                findings.keep(f"{method} was the last", held=held, room_bytes=room_bytes)
     return f"memory of {len(held)} methods"
+
+
+def _free_bytes(gpu: "GpuContext") -> int | None:
+    from deltalight.render_server.gpu.device_memory import device_memory, gl_integers
+
+    return device_memory(gpu.ctx.extensions, gl_integers(), is_software=gpu.is_software)[1]
+
+
+def _room_bytes(gpu: "GpuContext", held: dict[str, dict[str, Any]], free_bytes: int | None) -> int:
+    """Return the process's peak in software, else what is less free than `free_bytes`, or the largest frame."""
+    if gpu.is_software:
+        return getrusage(RUSAGE_SELF).ru_maxrss * 1024
+    now, largest = _free_bytes(gpu), max(each["total_bytes"] for each in held.values())
+    return int(largest if now is None or free_bytes is None else max(largest, free_bytes - now))
 
 
 def _held(gpu: "GpuContext", method: str, folder: Path) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from deltalight.services.api.recording_store import RecordingStore
 from deltalight.services.api.recording_videos import RecordingVideos
 from deltalight.services.api.render_link import RenderLink
 from deltalight.services.api.replay_control import ReplayControl
+from deltalight.services.api.room_metrics import RoomMetrics
 from deltalight.services.api.routes import recordings
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.snapshot_store import SnapshotStore
@@ -45,10 +46,12 @@ class Room:
 
     context: Context
     streams: Streams
+    metrics: RoomMetrics
     nodes: tuple[str, ...] = ()  # endpoints
 
     def follow(self, endpoints: RoomEndpoints | None) -> None:
         """Use another render server from now on, None = there is none."""
+        self.metrics.note_replaced(self.context.room)
         published = () if endpoints is None else (endpoints.publish,)
         self.streams.follow((*published, *self.nodes))
         self.context.recording_sessions.use_endpoints((*published, *self.nodes))
@@ -73,7 +76,10 @@ class Rooms:
     """
 
     def __init__(self, settings: ApiSettings, store: Store, keys: Keys | None) -> None:
-        self._builder = _Builder(settings, store, keys)
+        self.metrics = RoomMetrics(
+            self._newest, lambda: 0 if self.follower is None else self.follower.refused
+        )
+        self._builder = _Builder(settings, store, keys, self.metrics)
         self.directory: DirectoryClient | None = None
         self.follower: RoomFollower | None = None
         if settings.rooms is None:
@@ -113,6 +119,9 @@ class Rooms:
         if self.directory is not None:
             self.directory.close()
 
+    def _newest(self) -> RoomList:
+        return RoomList(rooms=(), slots=()) if self.follower is None else self.follower.newest
+
     def _found(self, found: RoomList) -> dict[str, Room]:
         if not found.rooms:
             raise DeltalightError(
@@ -132,8 +141,8 @@ class Rooms:
 class _Builder:
     """Builds rooms, with what they share."""
 
-    def __init__(self, settings: ApiSettings, store: Store, keys: Keys | None) -> None:
-        self._settings, self._store, self._keys = settings, store, keys
+    def __init__(self, settings: ApiSettings, store: Store, keys: Keys | None, metrics: RoomMetrics) -> None:
+        self._settings, self._store, self._keys, self._metrics = settings, store, keys, metrics
         self._problems, self._cameras = Problems(), CameraFinder()
         self._tickets = Tickets(store=store.tickets)
         self._recordings = RecordingStore(store.folder / "recordings")
@@ -166,9 +175,9 @@ class _Builder:
         return self._room(context, nodes, nodes)
 
     def _room(self, context: Context, endpoints: Sequence[str], nodes: tuple[str, ...] = ()) -> Room:
-        streams = Streams(endpoints, _sinks(context), self._keys)
+        streams = Streams(endpoints, _sinks(context, self._metrics), self._keys)
         context.link.on_source = streams.use_source
-        return Room(context, streams, nodes)
+        return Room(context, streams, self._metrics, nodes)
 
     def _context(
         self, room: str, store: Store, control: str | None, endpoints: Sequence[str], beside: str
@@ -222,17 +231,20 @@ class _Builder:
         )
 
 
-def _sinks(context: Context) -> dict[str, Sink]:
+def _sinks(context: Context, metrics: RoomMetrics) -> dict[str, Sink]:
     """Route composites to viewers, radiance to the fish-eye view, and reports to the watch and to event listeners."""
     return {
-        "composite": lambda message, parts: _publish_composite(context, message, parts),
+        "composite": lambda message, parts: _publish_composite(context, metrics, message, parts),
         "radiance": context.fisheye.note,
         "stats": lambda message, _parts: _publish_report(context, message),
     }
 
 
-def _publish_composite(context: Context, message: Message, parts: Sequence[memoryview]) -> None:
+def _publish_composite(
+    context: Context, metrics: RoomMetrics, message: Message, parts: Sequence[memoryview]
+) -> None:
     if isinstance(message, CompositeMessage) and message.encoding == "jpeg":
+        metrics.note_frame(context.room, (message.rendered_ns - message.received_ns) / 1e9)
         context.live.publish(message, [bytes(part) for part in parts], context.watch.detail(message.node))
 
 

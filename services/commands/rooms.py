@@ -1,5 +1,8 @@
 """`deltalight rooms`: the rooms of an installation, and which of them run where."""
 
+import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -71,6 +74,29 @@ def drain_host(host: Host, *, directory: Directory = HERE, config_file: ConfigFi
 def undrain_host(host: Host, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
     """Let rooms start on a drained host again."""
     _print_rooms(_directory(directory, config_file).host_command("undrain-host", host))
+
+
+@rooms.command()
+def claim(
+    figures: Annotated[
+        Path, typer.Argument(help="report.json of `deltalight gpu-check --steps memory,speed` on this host.")
+    ],
+    *,
+    frames_per_s: Annotated[
+        float, typer.Option(min=0.1, max=240, help="Frames a second that each room shall reach.")
+    ] = 30.0,
+) -> None:
+    """Print what this host offers to a cluster, by the figures of a room: the options of `ray start`."""
+    from deltalight.services.rooms.capacity import find_device_apart, labels_of, load_figures, slots_of
+    from deltalight.services.rooms.ray_cluster import SLOT_RESOURCE
+    from deltalight.services.rooms.render_actor import hardware_devices
+
+    room = load_figures(figures)
+    devices: Sequence[int | None] = hardware_devices() or (None,)
+    found = [find_device_apart(device) for device in devices]
+    slots = sum(slots_of(room, each, frames_per_s) for each in found)
+    labels = ",".join(f"{key}={value}" for key, value in labels_of(found[0]).items())
+    typer.echo(f"--resources='{json.dumps({SLOT_RESOURCE: slots})}' --labels={labels}")
 
 
 def _directory(address: str, config_file: ConfigFile) -> "DirectoryClient":

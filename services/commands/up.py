@@ -64,6 +64,9 @@ def up(
     rooms_port: Annotated[
         int, typer.Option(min=1, max=65535, help="Port of the directory of rooms, with --rooms.")
     ] = ROOMS_PORT,
+    rooms_host: Annotated[
+        str, typer.Option(help="Address of this host at which the directory answers, with --placer ray.")
+    ] = LOOPBACK,
     placer: Annotated[
         PlacerKind, typer.Option(help="What runs the rooms: this host, or the hosts of a Ray cluster.")
     ] = PlacerKind.LOCAL,
@@ -86,6 +89,11 @@ def up(
 
     if ray_address is not None and placer is not PlacerKind.RAY:
         raise DeltalightError("--ray-address names the cluster of --placer ray; give both, or neither.")
+    if rooms_host != LOOPBACK and placer is not PlacerKind.RAY:
+        raise DeltalightError(
+            "--rooms-host is for web processes elsewhere, which reach the render servers of --placer ray alone; leave"
+            " it out, or give both."
+        )
     if rooms is not None:
         if source is not None or node is not None or scene is not None or device is not None:
             raise DeltalightError(
@@ -100,6 +108,7 @@ def up(
             data_folder(data, config_file),
             port=port,
             rooms_port=rooms_port,
+            rooms_host=rooms_host,
             on_cluster=on_cluster,
             ray_address=ray_address,
         )
@@ -143,16 +152,25 @@ def _run_rooms(
     *,
     port: int,
     rooms_port: int,
+    rooms_host: str,
     on_cluster: bool,
     ray_address: str | None,
 ) -> None:
+    from deltalight.services.rooms.capacity import with_slots
     from deltalight.services.rooms.host import RoomsHost
+    from deltalight.services.rooms.render_actor import hardware_devices
     from deltalight.services.rooms.rooms_file import load_rooms, require_cluster_form, require_local_form
 
     rooms = load_rooms(path)
     (require_cluster_form if on_cluster else require_local_form)(rooms)
+    if on_cluster and ray_address is not None:
+        rooms = rooms.replaced(slots=1)  # its hosts say how many they offer
+    else:
+        rooms = with_slots(rooms, hardware_devices())
     with TemporaryDirectory(prefix="deltalight-") as folder:
-        host = RoomsHost(rooms, commands, data, Path(folder), port, rooms_port, on_cluster, ray_address)
+        host = RoomsHost(
+            rooms, commands, data, Path(folder), port, rooms_port, on_cluster, ray_address, rooms_host
+        )
         host.require_free_ports()
         typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
         host.run(lambda line: typer.echo(line, err=True))

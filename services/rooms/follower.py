@@ -41,7 +41,7 @@ class RoomFollower:
         self._followed: dict[str, RoomEndpoints | None] = {}
         self.refused = 0
         self.newest = RoomList(rooms=(), slots=())
-        self._is_answered = True
+        self.is_answered = True  # the last question
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="room-follower", daemon=True)
 
@@ -89,8 +89,8 @@ class RoomFollower:
         while not self._stop.wait(POLL_INTERVAL_S):
             try:
                 self.look()
-                self._is_answered = True
+                self.is_answered = True
             except DeltalightError as fault:
-                if self._is_answered:
+                if self.is_answered:
                     log.warning("the directory of rooms does not answer", fault=str(fault))
-                self._is_answered = False
+                self.is_answered = False

@@ -16,6 +16,7 @@ from deltalight.services.child import ChildSpec
 from deltalight.services.discovery import node_endpoint
 from deltalight.services.host import PREPARED, HostCommands, recording_of
 from deltalight.services.host_store import activate_document, open_store, write_scene
+from deltalight.services.rooms.capacity import load_figures
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
 from deltalight.services.rooms.local_placer import LocalPlacer
@@ -35,7 +36,8 @@ NODE_RETRY_S = 10.0
 class RoomsHost:
     """The rooms of a file on this host; `data` is the folder of scenes, `sessions` holds the session files.
 
-    `on_cluster`: their render servers run on the Ray cluster at `ray_address`; None = one of this host alone.
+    `on_cluster`: their render servers run on the Ray cluster at `ray_address`; None = one of this host alone. The
+    directory of rooms answers at `rooms_address`.
     """
 
     rooms: RoomsFile
@@ -46,6 +48,7 @@ class RoomsHost:
     rooms_port: int = ports.ROOMS_PORT
     on_cluster: bool = False
     ray_address: str | None = None
+    rooms_address: str = ports.LOOPBACK
 
     def require_free_ports(self) -> None:
         """Check the ports that have been chosen, before a child is started.
@@ -72,10 +75,11 @@ class RoomsHost:
             cluster = self._cluster(stack)
             address = ports.LOOPBACK if cluster is None else cluster.own_address
             endpoints = self._node_endpoints(address)
-            plans = self._plans(endpoints)
+            store = stack.enter_context(open_store(self.data, self.commands.config))
+            plans = self._plans(store, endpoints)
             placer = self._local_placer(forward) if cluster is None else self._ray_placer(cluster, forward)
             stack.callback(placer.close)
-            keeper = RoomKeeper(plans, placer, forward)
+            keeper = RoomKeeper(plans, placer, forward, store.drained)
             directory = DirectoryServer(self.directory, keeper, self.commands.keys([self.directory]))
             stack.callback(directory.close)
             nodes = [NodeSupervisor(spec, forward) for spec in self._nodes(address)]
@@ -88,10 +92,12 @@ class RoomsHost:
                 keeper.poll()
                 time.sleep(POLL_INTERVAL_S)
 
-    @property
+    @cached_property
     def directory(self) -> str:
-        """The endpoint of the directory of rooms."""
-        return ports.endpoint(self.rooms_port)
+        """The endpoint of the directory of rooms, with the name of its key where it leaves the host."""
+        if self.rooms_address == ports.LOOPBACK:
+            return ports.endpoint(self.rooms_port)
+        return reachable_endpoint(self.commands, self.rooms_address, self.rooms_port)
 
     def _cluster(self, stack: ExitStack) -> RayCluster | None:
         if not self.on_cluster:
@@ -103,14 +109,15 @@ class RoomsHost:
     def _ray_placer(self, cluster: RayCluster, forward: Callable[[str], None]) -> RayPlacer:
         config = None if self.commands.config is None else self.commands.config.absolute()
         commands = replace(self.commands, config=config)
-        return RayPlacer(cluster, self._server, commands, forward=forward)
+        figures = None if self.rooms.figures is None else load_figures(self.rooms.figures)
+        spare = _spare(commands)
+        return RayPlacer(cluster, self._server, commands, figures=figures, spare=spare, forward=forward)
 
     def _local_placer(self, forward: Callable[[str], None]) -> LocalPlacer:
-        spare = replace(self.commands.child("spare", "server"), warm=PREPARED["server"])
         return LocalPlacer(
             self.rooms.devices,
             self._server,
-            spare=spare if self.commands.spares else None,
+            spare=_spare(self.commands),
             keys=self.commands.keys([self.directory]),
             forward=forward,
         )
@@ -141,23 +148,29 @@ class RoomsHost:
         settings = load_configuration(self.commands.config).section("keys", KeySettings)
         found = {}
         for name, node in self.rooms.nodes.items():
-            if node.found is not None:
+            if node.endpoint is not None:
+                found[name] = node.endpoint
+            elif node.found is not None:
                 found[name] = node_endpoint(node.found, settings)
             else:
                 found[name] = reachable_endpoint(self.commands, address, self.node_ports[name])
         return found
 
-    def _plans(self, endpoints: Mapping[str, str]) -> list[RoomPlan]:
+    def _plans(self, store: Store, endpoints: Mapping[str, str]) -> list[RoomPlan]:
         plans = []
-        with open_store(self.data, self.commands.config) as store:
-            for name, room in self.rooms.rooms.items():
-                source = recording_of(self.rooms.nodes[room.nodes[0]].source)
-                document = room_scene(store.of_room(name, tuple(self.rooms.rooms)), name, room, source)
-                path = self.sessions / f"{name}.json"
-                write_scene(path, document)
-                nodes = tuple(RoomNode(name=node, endpoint=endpoints[node]) for node in room.nodes)
-                plans.append(RoomPlan(name, room.title, nodes, path, room.labels))
+        for name, room in self.rooms.rooms.items():
+            source = recording_of(self.rooms.nodes[room.nodes[0]].source)
+            document = room_scene(store.of_room(name, tuple(self.rooms.rooms)), name, room, source)
+            path = self.sessions / f"{name}.json"
+            write_scene(path, document)
+            nodes = tuple(RoomNode(name=node, endpoint=endpoints[node]) for node in room.nodes)
+            plans.append(RoomPlan(name, room.title, nodes, path, room.labels))
         return plans
+
+
+def _spare(commands: HostCommands) -> ChildSpec | None:
+    """Return what waits to become a render server, None if there shall be no spares."""
+    return replace(commands.child("spare", "server"), warm=PREPARED["server"]) if commands.spares else None
 
 
 class NodeSupervisor:

@@ -7,13 +7,15 @@ that they have waited.
 import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, Placer, RoomOrder, Slot
 from deltalight.services.rooms.status import (
+    Reason,
     RoomEndpoints,
     RoomList,
     RoomNode,
@@ -21,6 +23,7 @@ from deltalight.services.rooms.status import (
     RoomStatus,
     SlotStatus,
 )
+from deltalight.services.storage.drained import Drained
 
 MAXIMUM_FAILED_STARTS = 3  # in a row
 
@@ -39,6 +42,16 @@ class RoomPlan:
     labels: Mapping[str, str] = field(default_factory=dict)
 
 
+class Memory(Protocol):
+    """Keeps what is drained over a restart (`storage.drained.DrainedStore`)."""
+
+    def load(self) -> Drained:
+        """Return what was kept last."""
+
+    def keep(self, drained: Drained) -> None:
+        """Store it; raises DeltalightError where it cannot be."""
+
+
 @dataclass(eq=False)
 class _Room:
     plan: RoomPlan
@@ -55,23 +68,46 @@ class _Room:
     def wait(self, why: str) -> None:
         self.state, self.why, self.placement, self.shows = "waiting", why, None, False
 
+    @property
+    def waits_for(self) -> Reason | None:
+        if self.state == "waiting":
+            return "drained" if self.drained else "slot"
+        return "failed" if self.state == "failed" else None
+
+    def drain(self) -> None:
+        self.drained = True
+        self.wait(f"It was drained; `deltalight rooms start {self.plan.name}` starts it again.")
+
     def run_as(self, placement: Placement) -> None:
         self.state, self.why, self.placement, self.shows = "starting", "", placement, False
 
 
 class RoomKeeper:
-    """Decides where rooms run; `notice` gets a line for each change. Any thread may call it."""
+    """Decides where rooms run; `notice` gets a line for each change. Any thread may call it.
+
+    What is drained stays so in the next keeper with this `memory`; what that refuses to keep is not drained.
+    """
 
     def __init__(
-        self, plans: Sequence[RoomPlan], placer: Placer, notice: Callable[[str], None] = lambda _line: None
+        self,
+        plans: Sequence[RoomPlan],
+        placer: Placer,
+        notice: Callable[[str], None] = lambda _line: None,
+        memory: Memory | None = None,
     ) -> None:
-        self._placer, self._notice = placer, notice
+        self._placer, self._notice, self._memory = placer, notice, memory
         self._queue = itertools.count()
         self._epochs = itertools.count(1)
         self._rooms = {plan.name: _Room(plan, next(self._queue)) for plan in plans}
         self._faults: Mapping[str, str] = {}  # of nodes
-        self._drained_hosts: set[str] = set()
+        drained = Drained() if memory is None else memory.load()
+        self._drained_hosts = set(drained.hosts)
+        for name in drained.rooms & self._rooms.keys():
+            self._rooms[name].drain()
         self._lock = threading.Lock()
+        self._drains = (
+            threading.Lock()
+        )  # held over the database's answer, so that rooms are looked after meanwhile
 
     def poll(self) -> None:
         """Learn what happened, then place the rooms that wait."""
@@ -98,12 +134,14 @@ class RoomKeeper:
         Raises:
             DeltalightError: there is no such room.
         """
-        with self._lock:
-            room = self._room(name)
-            self._release(room)
-            room.drained = True
-            room.wait(f"It was drained; `deltalight rooms start {name}` starts it again.")
-            self._notice(f"room {name}: drained.")
+        room = self._room(name)
+        with self._drains:
+            drained = self._drained()
+            self._keep(replace(drained, rooms=drained.rooms | {name}))
+            with self._lock:
+                self._release(room)
+                room.drain()
+        self._notice(f"room {name}: drained.")
 
     def start(self, name: str) -> None:
         """Start a room that was drained or has failed.
@@ -111,12 +149,16 @@ class RoomKeeper:
         Raises:
             DeltalightError: there is no such room.
         """
-        with self._lock:
-            room = self._room(name)
-            if room.placement is not None:
-                return
-            room.drained, room.failed_starts, room.queued = False, 0, next(self._queue)
-            room.wait("It is about to start.")
+        room = self._room(name)
+        with self._drains:
+            if room.drained:
+                drained = self._drained()
+                self._keep(replace(drained, rooms=drained.rooms - {name}))
+            with self._lock:
+                if room.placement is not None:
+                    return
+                room.drained, room.failed_starts, room.queued = False, 0, next(self._queue)
+                room.wait("It is about to start.")
 
     def move(self, name: str, slot: str | None = None) -> None:
         """Start a room's next render server in this slot, or a free one; once that shows frames, the old one ends.
@@ -143,11 +185,15 @@ class RoomKeeper:
         """
         with self._lock:
             hosts = dict.fromkeys(slot.host for slot in self._placer.slots())
-            if host not in hosts:
-                hint = nearest(host, hosts) or ", ".join(hosts) or "none"
-                raise DeltalightError(f"there is no host {host[:80]} with a slot; did you mean {hint}?")
-            self._drained_hosts.add(host)
-            self._notice(f"host {host}: drained.")
+        if host not in hosts:
+            hint = nearest(host, hosts) or ", ".join(hosts) or "none"
+            raise DeltalightError(f"there is no host {host[:80]} with a slot; did you mean {hint}?")
+        with self._drains:
+            drained = self._drained()
+            self._keep(replace(drained, hosts=drained.hosts | {host}))
+            with self._lock:
+                self._drained_hosts.add(host)
+        self._notice(f"host {host}: drained.")
 
     def undrain_host(self, host: str) -> None:
         """Let rooms start on a host again.
@@ -155,12 +201,23 @@ class RoomKeeper:
         Raises:
             DeltalightError: it is not drained.
         """
-        with self._lock:
-            if host not in self._drained_hosts:
-                known = ", ".join(sorted(self._drained_hosts)) or "none is"
+        with self._drains:
+            drained = self._drained()
+            if host not in drained.hosts:
+                known = ", ".join(sorted(drained.hosts)) or "none is"
                 raise DeltalightError(f"the host {host[:80]} is not drained ({known}).")
-            self._drained_hosts.remove(host)
-            self._notice(f"host {host}: takes rooms again.")
+            self._keep(replace(drained, hosts=drained.hosts - {host}))
+            with self._lock:
+                self._drained_hosts.remove(host)
+        self._notice(f"host {host}: takes rooms again.")
+
+    def _drained(self) -> Drained:
+        rooms = frozenset(name for name, room in self._rooms.items() if room.drained)
+        return Drained(rooms, frozenset(self._drained_hosts))
+
+    def _keep(self, drained: Drained) -> None:
+        if self._memory is not None:
+            self._memory.keep(drained)
 
     def _room(self, name: str) -> _Room:
         if name not in self._rooms:
@@ -197,7 +254,8 @@ class RoomKeeper:
         room.why = "" if event.shows else f"No frames come from {names}."
 
     def _lose(self, room: _Room, event: PlacementEvent) -> None:
-        room.failed_starts = room.failed_starts + 1 if room.state == "starting" else 0
+        has_failed = room.state == "starting" and not event.host_refused
+        room.failed_starts = room.failed_starts + 1 if has_failed else 0
         room.restarts += 1
         self._notice(f"room {room.plan.name}: {event.detail}")
         if room.successor is not None:
@@ -288,6 +346,7 @@ class RoomKeeper:
             nodes=room.plan.nodes,
             state=room.state,
             why=" ".join(filter(None, (room.why, *faults))),
+            waits_for=room.waits_for,
             slot=None if placement is None else placement.slot,
             endpoints=endpoints,
             moving_to=None if room.successor is None else room.successor.slot,

@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 
 from deltalight.protocol.keys import Keys
 from deltalight.services import ports
-from deltalight.services.child import SPARE_AFTER_S, ChildSpec, end_all, open_spare
+from deltalight.services.child import SPARE_AFTER_S, ChildSpec, end_all, open_spare, take_spare
 from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
 from deltalight.services.rooms.render_process import RenderProcess
-from deltalight.services.warm_spare import use_spare
 
 # The command line of a placement's render server on a device (None = the driver's first).
 Command = Callable[[RoomOrder, Placement, int | None], ChildSpec]
@@ -112,8 +111,7 @@ class LocalPlacer:
 
     def _take_spare(self, spec: ChildSpec) -> subprocess.Popen[str] | None:
         spare, self._spare = self._spare, None
-        words = spec.arguments[len(ChildSpec.deltalight("").arguments) :]
-        return spare if spare is not None and use_spare(spare, words) else None
+        return take_spare(spare, spec)
 
     def _start_spare_if_due(self) -> None:
         """Start a spare once those that were placed have had the time to start."""

@@ -62,7 +62,8 @@ class PlacementEvent:
     """News of a placement.
 
     `reported`: the render server says how it is; `shows` tells whether it renders frames now. `lost`: it is gone, or
-    was ended because it hung; `refused` tells that it did not take its input, so that another attempt is in vain.
+    was ended because it hung; `refused` tells that it did not take its input, so that another attempt is in vain, and
+    `host_refused` that its host does not have what it claims.
     """
 
     epoch: int
@@ -70,6 +71,7 @@ class PlacementEvent:
     detail: str = ""
     shows: bool = False
     refused: bool = False
+    host_refused: bool = False
 
 
 class Placer(Protocol):

@@ -8,9 +8,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from deltalight.services import ports
+from deltalight.services.child import SPARE_AFTER_S, ChildSpec
 from deltalight.services.host import HostCommands
+from deltalight.services.rooms.capacity import RoomFigures
 from deltalight.services.rooms.local_placer import Command
-from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
+from deltalight.services.rooms.placer import (
+    NoSlotError,
+    Placement,
+    PlacementEvent,
+    RoomOrder,
+    Slot,
+    choose_slot,
+)
 from deltalight.services.rooms.ray_cluster import SLOT_RESOURCE, ClusterHost, RayCluster
 from deltalight.services.rooms.render_actor import END_TIMEOUT_S, SESSION, News, RenderActor, RenderTask
 
@@ -25,14 +34,28 @@ class _Placed:
     actor: Any
     news: Any  # the answer that is awaited
     late_s: float | None  # when an actor that has not answered yet is given up
+    holder: Any = None  # of the slot, where a spare became the actor
     ending: Any = None  # the answer of `end`
+
+
+@dataclass
+class _Spare:
+    actor: Any
+    waits: Any  # the answer that is awaited
+
+
+class SlotHolder:
+    """Holds a render slot for a spare that has become a room's actor; ends with its keeper."""
 
 
 class RayPlacer:
     """Places each render server by an actor on a host of the cluster (a `Placer`), in a slot that the host offers.
 
     A slot is a whole `render_slot`, never a part of a GPU: the actor chooses the EGL device itself. With `commands`
-    the actor finds the keys of its host; all hosts of a fleet have the same.
+    the actor finds the keys of its host; all hosts of a fleet have the same. A host that does not have what it
+    claims, by the `figures` of a room if they are known, is refused: it has no slots until Ray starts there anew.
+
+    With a `spare`, a command line that prepares and waits (`ChildSpec.warm`), each host that has had a room has one.
     """
 
     def __init__(
@@ -41,8 +64,14 @@ class RayPlacer:
         command: Command,
         commands: HostCommands,
         *,
+        figures: RoomFigures | None = None,
+        spare: ChildSpec | None = None,
         forward: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
     ) -> None:
+        self._figures, self._spare_spec = figures, spare
+        self._spares: dict[str, _Spare] = {}  # by Ray's id of the host, as the next
+        self._spare_due_s: dict[str, float] = {}
+        self._refused: dict[str, str] = {}  # why, by Ray's id of the host
         self._cluster = cluster
         self._command = command
         self._commands = commands
@@ -51,24 +80,35 @@ class RayPlacer:
         self._used: set[tuple[str, int]] = set()  # addresses and ports
 
     def slots(self) -> list[Slot]:
-        """Return the slots of all hosts that live."""
-        return [slot for host in self._cluster.hosts() for slot in self._slots_of(host)]
+        """Return the slots of all hosts that live and are not refused."""
+        return [slot for host in self._hosts() for slot in self._slots_of(host)]
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
         """Start the render server of a room (`Placer.place`)."""
-        hosts = self._cluster.hosts()
-        chosen = choose_slot([each for host in hosts for each in self._slots_of(host)], order, slot)
+        hosts = self._hosts()
+        try:
+            chosen = choose_slot([each for host in hosts for each in self._slots_of(host)], order, slot)
+        except NoSlotError as fault:
+            raise NoSlotError(" ".join([str(fault), *self._refusals()])) from None
         host = next(host for host in hosts if host.name == chosen.host)
         placement = Placement(
             order.room, order.epoch, chosen.name, self._fresh_endpoint(host), self._fresh_endpoint(host)
         )
         spec = self._command(replace(order, session_file=SESSION), placement, None)
         rank = int(chosen.name.rpartition("/")[2]) - 1
-        task = RenderTask(placement, spec, _text(order), self._commands, rank)
-        actor = self._actor_class(host, f"{order.room}-{order.epoch}").remote(task)
-        late_s = time.monotonic() + START_TIMEOUT_S
-        self._placed[chosen.name] = _Placed(placement, host, actor, actor.news.remote(), late_s)
+        task = RenderTask(placement, spec, _text(order), self._commands, rank, host, self._figures)
+        self._placed[chosen.name] = self._start(task, f"{order.room}-{order.epoch}")
+        self._spare_due_s[host.node_id] = time.monotonic() + SPARE_AFTER_S
         return placement
+
+    def _start(self, task: RenderTask, name: str) -> _Placed:
+        late_s, host = time.monotonic() + START_TIMEOUT_S, task.host
+        spare = self._spares.pop(host.node_id, None)
+        if spare is None:
+            actor = self._remote(RenderActor, host, 1, name=name, lifetime="detached").remote(task)
+            return _Placed(task.placement, host, actor, actor.news.remote(), late_s)
+        holder = self._remote(SlotHolder, host, 1).remote()
+        return _Placed(task.placement, host, spare.actor, spare.actor.begin.remote(task), late_s, holder)
 
     def release(self, placement: Placement) -> None:
         """End a render server; its slot is free once it is gone."""
@@ -78,7 +118,8 @@ class RayPlacer:
             placed.late_s = time.monotonic() + END_TIMEOUT_S
 
     def watch(self) -> list[PlacementEvent]:
-        """Return what happened since the last call."""
+        """Return what happened since the last call; start spares where it is time."""
+        self._keep_spares()
         ray = self._cluster.ray
         awaited = [placed.ending or placed.news for placed in self._placed.values()]
         if not awaited:
@@ -92,14 +133,27 @@ class RayPlacer:
         return {slot: ray.get(placed.actor.process_id.remote()) for slot, placed in self._placed.items()}
 
     def close(self) -> None:
-        """End all render servers; the cluster stays."""
+        """End all render servers and spares; the cluster stays."""
+        spares = list(self._spares.values())
         for placed in list(self._placed.values()):
             self.release(placed.placement)
         endings = [placed.ending for placed in self._placed.values()]
+        endings += [spare.actor.end.remote() for spare in spares]
         if endings:
             self._cluster.ray.wait(endings, num_returns=len(endings), timeout=END_TIMEOUT_S)
         for slot in list(self._placed):
             self._forget(slot)
+        for spare in spares:
+            self._cluster.ray.kill(spare.actor)
+        self._spares = {}
+
+    def _hosts(self) -> list[ClusterHost]:
+        return [host for host in self._cluster.hosts() if host.node_id not in self._refused]
+
+    def _refusals(self) -> list[str]:
+        """Say why hosts that live are refused."""
+        hosts = (self._refused.get(host.node_id) for host in self._cluster.hosts())
+        return [f"{why[:1].upper()}{why[1:]}" for why in hosts if why is not None]
 
     def _slots_of(self, host: ClusterHost) -> list[Slot]:
         names = [f"{host.name}/{number}" for number in range(1, host.slots + 1)]
@@ -109,17 +163,42 @@ class RayPlacer:
         placed = self._placed.get(slot)
         return None if placed is None else placed.placement.room
 
-    def _actor_class(self, host: ClusterHost, name: str) -> Any:  # noqa: ANN401 (Ray's)
+    def _keep_spares(self) -> None:
+        """Start the spare of each host whose rooms have had the time to start, and forget those that died."""
+        now_s = time.monotonic()
+        for node_id in [each for each, spare in self._spares.items() if not self._waits(spare)]:
+            self._cluster.ray.kill(self._spares.pop(node_id).actor)
+            self._spare_due_s[node_id] = now_s + SPARE_AFTER_S
+        if self._spare_spec is None:
+            return
+        for host in {placed.host.node_id: placed.host for placed in self._placed.values()}.values():
+            if host.node_id not in self._spares and now_s >= self._spare_due_s[host.node_id]:
+                name = f"spare-{host.node_id[:12]}-{now_s:.3f}"
+                made = self._remote(RenderActor, host, 0, name=name, lifetime="detached")
+                actor = made.remote(None, self._spare_spec)
+                self._spares[host.node_id] = _Spare(actor, actor.waits.remote())
+
+    def _waits(self, spare: _Spare) -> bool:
+        ray = self._cluster.ray
+        if not ray.wait([spare.waits], timeout=0)[0]:
+            return True
+        try:
+            lives = bool(ray.get(spare.waits))
+        except ray.exceptions.RayError:
+            return False
+        spare.waits = spare.actor.waits.remote()
+        return lives
+
+    def _remote(self, kind: type, host: ClusterHost, slots: int, **more: str) -> Any:  # noqa: ANN401 (Ray's)
         ray = self._cluster.ray
         there = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(host.node_id, soft=False)
-        return ray.remote(RenderActor).options(
-            name=name,
-            lifetime="detached",
+        return ray.remote(kind).options(
             num_cpus=0,
-            resources={SLOT_RESOURCE: 1},
+            resources={SLOT_RESOURCE: slots} if slots else {},
             max_restarts=0,  # who runs where is the keeper's: a new placement has a new epoch
             max_concurrency=CALLS_AT_ONCE,
             scheduling_strategy=there,
+            **more,
         )
 
     def _fresh_endpoint(self, host: ClusterHost) -> str:
@@ -150,6 +229,9 @@ class RayPlacer:
             return self._lost(slot, f"It ran on {placed.host.name}, and {what}.")
         for line in news.lines:
             self._forward(line)
+        for event in news.events:
+            if event.host_refused:
+                self._refused[placed.host.node_id] = event.detail
         if any(event.kind == "lost" for event in news.events):
             self._forget(slot)
         else:
@@ -163,7 +245,10 @@ class RayPlacer:
 
     def _forget(self, slot: str) -> None:
         """End the actor, which takes its render server with it, and free its slot."""
-        self._cluster.ray.kill(self._placed.pop(slot).actor)
+        placed = self._placed.pop(slot)
+        for actor in (placed.actor, placed.holder):
+            if actor is not None:
+                self._cluster.ray.kill(actor)
 
 
 def reachable_endpoint(commands: HostCommands, address: str, port: int) -> str:

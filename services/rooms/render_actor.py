@@ -1,8 +1,10 @@
 """A room on a host of a Ray cluster: the actor that starts its render server there and tells what becomes of it."""
 
 import ctypes
+import math
 import os
 import shutil
+import subprocess
 import tempfile
 import threading
 import time
@@ -14,9 +16,17 @@ from typing import Any
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
-from deltalight.services.child import ChildSpec
+from deltalight.services.child import ChildSpec, end_all, open_spare, take_spare
 from deltalight.services.host import HostCommands
+from deltalight.services.rooms.capacity import (
+    FalseClaimError,
+    RoomFigures,
+    check_claim,
+    find_device_apart,
+    is_claim,
+)
 from deltalight.services.rooms.placer import Placement, PlacementEvent
+from deltalight.services.rooms.ray_cluster import ClusterHost
 from deltalight.services.rooms.render_process import RenderProcess
 
 SESSION = Path("session.json")  # in the actor's folder
@@ -43,6 +53,7 @@ class RenderTask:
     """What an actor starts.
 
     `rank` is the slot's number on its host, from 0, and `session` the text of the scene document, if there is one.
+    What the `host` claims by its labels and slots is checked, by the `figures` of a room if they are known.
     """
 
     placement: Placement
@@ -50,29 +61,44 @@ class RenderTask:
     session: str
     commands: HostCommands
     rank: int
+    host: ClusterHost
+    figures: RoomFigures | None = None
 
 
 class RenderActor:
     """Holds one render slot, and runs the render server of a room in it.
 
+    Without a task it is the spare of its host: a process that has prepared itself (`ChildSpec.warm`) waits in it,
+    takes no slot, and becomes the render server of the task that it is told to `begin` with.
+
     Ends with it when Ray's raylet, its parent, is gone, or when no keeper has asked for `LEASE_S`: a host that was
     cut off must not go on, because the room runs elsewhere by then.
     """
 
-    def __init__(self, task: RenderTask) -> None:
+    def __init__(self, task: RenderTask | None, spare: ChildSpec | None = None) -> None:
         self._lines: deque[str] = deque()
         self._asked_s = time.monotonic()
-        self._epoch = task.placement.epoch
-        self._fault = ""
+        self._epoch = 0
+        self._fault: DeltalightError | None = None
         self._lock = threading.Lock()
         self._render: RenderProcess | None = None
         self._folder = tempfile.mkdtemp(prefix="deltalight-")
         os.chdir(self._folder)
-        try:
-            self._render = _started(task, self._lines.append)
-        except DeltalightError as fault:
-            self._fault = str(fault)
+        self._spare = None if spare is None else open_spare(spare.arguments, spare.warm)
+        if task is not None:
+            self._start(task)
         threading.Thread(target=self._end_without_keeper, args=(os.getppid(),), daemon=True).start()
+
+    def begin(self, task: RenderTask) -> News:
+        """Start the render server of a task by the spare; return the first news."""
+        self._start(task)
+        return self.news()
+
+    def waits(self) -> bool:
+        """Return after a second whether the spare still lives."""
+        time.sleep(NEWS_WAIT_S)
+        self._asked_s = time.monotonic()
+        return self._spare is not None and self._spare.poll() is None
 
     def news(self) -> News:
         """Return what happened since the last call; waits a second for it."""
@@ -86,7 +112,9 @@ class RenderActor:
         return News(tuple(events), tuple(lines))
 
     def end(self) -> None:
-        """End the render server, and return when it is gone."""
+        """End the render server or the spare, and return when it is gone."""
+        if self._spare is not None:
+            end_all([self._spare])
         if self._render is not None:
             self._render.end()
             deadline_s = time.monotonic() + END_TIMEOUT_S
@@ -96,7 +124,16 @@ class RenderActor:
 
     def process_id(self) -> int:
         """Return the process id of the render server; 0 = it was not started."""
-        return 0 if self._render is None else self._render.process.pid
+        with self._lock:
+            return 0 if self._render is None else self._render.process.pid
+
+    def _start(self, task: RenderTask) -> None:
+        with self._lock:
+            spare, self._spare, self._epoch = self._spare, None, task.placement.epoch
+            try:
+                self._render = _started(task, self._lines.append, spare)
+            except DeltalightError as fault:
+                self._fault = fault
 
     @property
     def _is_gone(self) -> bool:
@@ -104,7 +141,8 @@ class RenderActor:
 
     def _events(self) -> list[PlacementEvent]:
         if self._render is None:
-            return [PlacementEvent(self._epoch, "lost", self._fault)]
+            is_false = isinstance(self._fault, FalseClaimError)
+            return [PlacementEvent(self._epoch, "lost", str(self._fault), host_refused=is_false)]
         with self._lock:
             events = self._render.news()
         if self._render.is_gone:
@@ -120,7 +158,9 @@ class RenderActor:
         os._exit(1)
 
 
-def _started(task: RenderTask, forward: Callable[[str], None]) -> RenderProcess:
+def _started(
+    task: RenderTask, forward: Callable[[str], None], spare: "subprocess.Popen[str] | None"
+) -> RenderProcess:
     placement = task.placement
     endpoints = placement.publish, placement.control
     for endpoint in endpoints:
@@ -129,9 +169,19 @@ def _started(task: RenderTask, forward: Callable[[str], None]) -> RenderProcess:
     if task.session:
         SESSION.write_text(task.session)
     devices = hardware_devices()
-    options = ("--device", str(devices[task.rank % len(devices)])) if devices else ()
+    device = devices[task.rank % len(devices)] if devices else None
+    _check_host(task.host, device, max(1, len(devices)), task.figures)
+    options = () if device is None else ("--device", str(device))
     spec = replace(task.spec, arguments=(*task.spec.arguments, *options))
-    return RenderProcess(placement, spec, task.commands.keys(endpoints), forward)
+    keys = task.commands.keys(endpoints)
+    return RenderProcess(placement, spec, keys, forward, take_spare(spare, spec))
+
+
+def _check_host(host: ClusterHost, device: int | None, devices: int, figures: RoomFigures | None) -> None:
+    """Compare what a host claims with what is found on one of its devices; without a claim nothing is asked."""
+    if figures is not None or is_claim(host.labels):
+        slots = math.ceil(host.slots / devices)
+        check_claim(host.name, host.labels, slots, find_device_apart(device), figures)
 
 
 def hardware_devices() -> list[int]:

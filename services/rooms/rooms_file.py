@@ -1,11 +1,12 @@
 """The rooms file of `deltalight up --rooms`: the nodes, the rooms that show them, and the slots that rooms run in."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from deltalight.protocol.documents import StrictModel, nearest, read_mapping, validate
+from deltalight.protocol.endpoints import parse_endpoint
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import Name
 from deltalight.sensor_node.cameras.drivers import SYNTHETIC
@@ -18,7 +19,7 @@ Device = Annotated[int, Field(ge=0)] | None
 
 
 class NodeEntry(StrictModel):
-    """A sensor node: one of this host with its `source`, or one `found` on the network by its name."""
+    """A sensor node: of this host with its `source`, `found` on the network by its name, or at an `endpoint`."""
 
     source: str | None = Field(
         default=None,
@@ -28,11 +29,18 @@ class NodeEntry(StrictModel):
     found: Name | None = Field(
         default=None, description="Name under which a node of another host announces itself."
     )
+    endpoint: str | None = Field(
+        default=None, description="Where a node of another host publishes, `tcp://KEY@HOST:PORT`."
+    )
 
     @model_validator(mode="after")
-    def _is_one_of_both(self) -> Self:
-        if (self.source is None) == (self.found is None):
-            raise ValueError("give either the source of a node here, or the name of one that is found")
+    def _is_one_of_all(self) -> Self:
+        if sum(each is not None for each in (self.source, self.found, self.endpoint)) != 1:
+            raise ValueError(
+                "give either the source of a node here, or the name of one that is found, or an endpoint"
+            )
+        if self.endpoint is not None:
+            parse_endpoint(self.endpoint)
         return self
 
 
@@ -57,14 +65,30 @@ class RoomEntry(StrictModel):
 class RoomsFile(StrictModel):
     """Nodes and rooms by name, and `slots`: how many rooms run at once, or the EGL device of each slot."""
 
-    slots: Annotated[int, Field(ge=1, le=MAX_ROOMS)] | Annotated[tuple[Device, ...], Field(min_length=1)] = (
-        Field(
-            default=1,
-            description="How many rooms run at once on this host, or a list with the EGL device of each slot.",
-        )
+    slots: (
+        Annotated[int, Field(ge=1, le=MAX_ROOMS)]
+        | Annotated[tuple[Device, ...], Field(min_length=1)]
+        | Literal["auto"]
+    ) = Field(
+        default=1,
+        description="How many rooms run at once on this host, or a list with the EGL device of each slot, or `auto`: "
+        "as many as fit by `figures`.",
+    )
+    figures: Path | None = Field(
+        default=None,
+        description="report.json of `deltalight gpu-check --steps memory,speed` on a device like those of the slots.",
+    )
+    frames_per_s: Annotated[float, Field(gt=0, le=240)] = Field(
+        default=30.0, description="What each room shall reach, for `slots: auto`."
     )
     nodes: dict[Name, NodeEntry] = Field(min_length=1, max_length=MAX_ROOMS)
     rooms: dict[Name, RoomEntry] = Field(min_length=1, max_length=MAX_ROOMS)
+
+    @model_validator(mode="after")
+    def _auto_has_figures(self) -> Self:
+        if self.slots == "auto" and self.figures is None:
+            raise ValueError("`slots: auto` needs `figures`, the report.json of `deltalight gpu-check`")
+        return self
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
@@ -81,7 +105,8 @@ class RoomsFile(StrictModel):
 
     @property
     def devices(self) -> tuple[int | None, ...]:
-        """The EGL device of each slot; None = the driver's first."""
+        """The EGL device of each slot; None = the driver's first. `auto` has none: see `capacity.with_slots`."""
+        assert self.slots != "auto"
         return (None,) * self.slots if isinstance(self.slots, int) else self.slots
 
 
@@ -95,7 +120,8 @@ def load_rooms(path: Path) -> RoomsFile:
     folder = path.absolute().parent
     nodes = {name: _placed(node, folder) for name, node in rooms.nodes.items()}
     entries = {name: _with_scene(name, room, folder) for name, room in rooms.rooms.items()}
-    return rooms.replaced(nodes=nodes, rooms=entries)
+    figures = None if rooms.figures is None else folder / rooms.figures
+    return rooms.replaced(nodes=nodes, rooms=entries, figures=figures)
 
 
 def require_cluster_form(rooms: RoomsFile) -> None:
@@ -104,7 +130,7 @@ def require_cluster_form(rooms: RoomsFile) -> None:
     Raises:
         DeltalightError: it names devices, which hosts of a cluster choose themselves.
     """
-    if not isinstance(rooms.slots, int):
+    if isinstance(rooms.slots, tuple):
         raise DeltalightError(
             "hosts of a cluster choose the EGL devices of their slots themselves; give `slots` as a number."
         )

@@ -7,6 +7,7 @@ from pydantic import Field
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.message_fields import Name
 
+Reason = Literal["slot", "drained", "failed"]
 RoomState = Literal["waiting", "starting", "running", "failed"]
 
 
@@ -35,6 +36,9 @@ class RoomStatus(StrictModel):
         description="`waiting` for a slot, or drained; `starting`; `running`; `failed` until it is started again."
     )
     why: str = Field("", description="Why it waits, failed, or shows nothing; else empty.")
+    waits_for: Reason | None = Field(
+        None, description="`slot` = until one is free; `drained`, `failed` = until it is started again."
+    )
     slot: str | None = Field(None, description="Where its render server runs.")
     endpoints: RoomEndpoints | None = None
     moving_to: str | None = Field(None, description="The slot in which its next render server starts.")

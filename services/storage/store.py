@@ -14,6 +14,7 @@ from deltalight.services.storage.asset_sandbox import probe as probe_asset
 from deltalight.services.storage.assets import AssetStore, Probe
 from deltalight.services.storage.data_folder import ASSETS, DATABASE, use_folder
 from deltalight.services.storage.database import Database
+from deltalight.services.storage.drained import DrainedStore
 from deltalight.services.storage.faults import StorageFaultError
 from deltalight.services.storage.feed import Feed
 from deltalight.services.storage.scenes import SceneStore
@@ -57,6 +58,7 @@ class Store:
             self.scenes = SceneStore(self._database)
             self.tokens = TokenStore(self._database)
             self.tickets = TicketStore(self._database)
+            self.drained = DrainedStore(self._database)
             self._opened = opening.pop_all()
 
     def __enter__(self) -> Self:

@@ -317,6 +317,7 @@ def test_a_method_leaves_no_objects_and_says_what_it_holds(
     assert step.record.state is State.PASSED, step.record
     assert step.record.figures["held"]["paper"]["gl_objects"] > 50
     assert step.record.figures["held"]["paper"]["total_bytes"] > 1_000_000
+    assert step.record.figures["room_bytes"] > step.record.figures["held"]["paper"]["total_bytes"]
 
 
 @pytest.mark.slow

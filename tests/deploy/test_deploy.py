@@ -5,7 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,10 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from deltalight.services import ports
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.rooms.rooms_file import load_rooms
+from deltalight.services.settings import load_configuration
+from tests.deploy.chart_samples import options_of
 from tests.services.record_samples import slow_demo
 
 ROOT = Path(__file__).parents[2]
@@ -55,7 +59,7 @@ def compose() -> dict[str, Any]:
 )
 def test_compose_accepts_the_files(files: list[Path]) -> None:
     options = [part for file in files for part in ("--file", str(file))]
-    for profile in ([], ["--profile", "monitoring"]):
+    for profile in ([], ["--profile", "monitoring"], ["--profile", "rooms"]):
         done = subprocess.run(
             [*compose_tool(), *options, *profile, "config"],
             cwd=ROOT,
@@ -104,10 +108,27 @@ def test_volumes_belong_to_the_user_that_runs() -> None:
 
 
 @pytest.mark.parametrize("file", [NVIDIA, DRI], ids=["nvidia", "dri"])
-def test_the_commands_on_gpus_are_the_other_one_without_software(file: Path) -> None:
-    override = yaml.safe_load(file.read_text())["services"]["server"]["command"]
-    ours = [word for word in compose()["services"]["server"]["command"] if word != "--allow-software"]
+@pytest.mark.parametrize("service", ["server", "rooms"])
+def test_the_commands_on_gpus_are_the_other_one_without_software(file: Path, service: str) -> None:
+    override = yaml.safe_load(file.read_text())["services"][service]["command"]
+    ours = [word for word in compose()["services"][service]["command"] if word != "--allow-software"]
     assert override == ours
+
+
+def test_the_service_of_rooms_has_known_options_settings_and_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
+    service = compose()["services"]["rooms"]
+    command, *options = service["command"]
+    assert {option.partition("=")[0] for option in options} <= options_of(command)
+    assert f"--rooms={service['volumes'][2].split(':')[1]}" in options
+    rooms = load_rooms(ROOT / service["volumes"][2].split(":")[0])
+    assert len(rooms.rooms) == len(rooms.devices) == 2
+    assert rooms.nodes["desk"].source == "/recordings/demo.mcap"
+    for name, value in service["environment"].items():
+        monkeypatch.setenv(name, value)
+    settings = load_configuration().section("api", ApiSettings)
+    secrets = {f"/run/secrets/{name}" for name in service["secrets"]}
+    assert {str(settings.token_file), str(settings.view_token_file)} == secrets
+    assert settings.leaves_host
 
 
 @contextmanager
@@ -176,10 +197,16 @@ def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path
 
 def check_metrics(text: str) -> None:
     """Boards and alerts ask for names that the service gives."""
+    check_names(
+        text, [DEPLOY / "prometheus" / "alerts.yml", DEPLOY / "grafana" / "boards" / "deltalight.json"]
+    )
+
+
+def check_names(text: str, files: Sequence[Path]) -> None:
+    """Each metric that the files ask for is in this text of a service."""
     given = {sample.name for family in text_string_to_metric_families(text) for sample in family.samples}
     families = {family.name for family in text_string_to_metric_families(text)}
-    asked = set(METRIC.findall((DEPLOY / "prometheus" / "alerts.yml").read_text()))
-    asked |= set(METRIC.findall((DEPLOY / "grafana" / "boards" / "deltalight.json").read_text()))
+    asked = {name for file in files for name in METRIC.findall(file.read_text())}
     missing = {name for name in asked if name not in given and name.removesuffix("_total") not in families}
     assert not missing
 

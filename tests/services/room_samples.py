@@ -64,12 +64,12 @@ class StandInPlacer:
         """Have the render server of a room report."""
         self.events.append(PlacementEvent(self.of(room, slot).epoch, "reported", shows=shows))
 
-    def lose(self, room: str, *, refused: bool = False, slot: str | None = None) -> None:
+    def lose(self, room: str, *, slot: str | None = None, **kind: bool) -> None:
         """Have the render server of a room die."""
         placement = self.of(room, slot)
         del self.placed[placement.slot]
         self._end(placement.epoch)
-        self.events.append(PlacementEvent(placement.epoch, "lost", "It broke.", refused=refused))
+        self.events.append(PlacementEvent(placement.epoch, "lost", "It broke.", **kind))
 
     def of(self, room: str, slot: str | None = None) -> Placement:
         """The placement of a room, in this slot if it is in two."""

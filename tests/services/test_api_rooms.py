@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import connect
 
 from deltalight.services import ports
@@ -16,11 +18,14 @@ from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.keeper import RoomKeeper
 from deltalight.services.rooms.status import RoomEndpoints, RoomList, RoomNode, RoomStatus
+from tests.deploy.test_deploy import DEPLOY, check_names
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.live_samples import StandInStream
 from tests.services.render_server_samples import Recorder
 from tests.services.room_samples import StandInPlacer, plans, running
 from tests.services.test_api_scenes import wait_for
+
+FLEET_BOARD = DEPLOY / "grafana" / "boards" / "fleet.json"
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,42 @@ def test_pictures_follow_the_newest_epoch_and_not_the_server_before(house: House
     assert house.api.client.get("/rooms/hall/live.jpg").status_code == 503
 
 
+def measured(house: House) -> dict[tuple[str, ...], float]:
+    """Prometheus' samples by name and values of labels, which come by name."""
+    text = house.api.client.get("/metrics").text
+    samples = (sample for family in text_string_to_metric_families(text) for sample in family.samples)
+    return {(sample.name, *sample.labels.values()): sample.value for sample in samples}
+
+
+def test_a_monitor_reads_states_slots_and_the_gap_of_a_failover(house: House) -> None:
+    before = measured(house)
+    assert before["deltalight_room_state", "door", "running"] == 1
+    assert before["deltalight_room_waits", "slot", "attic"] == 1
+    assert before["deltalight_slots", "slot-1", "used"] == 1
+    rooms = house.api.app.state.rooms  # type: ignore[attr-defined]
+
+    def streaming() -> StandInStream:
+        return StandInStream(int(house.placer.of("door").publish.rpartition(":")[2]))
+
+    live = rooms.contexts["door"].live
+    with closing(streaming()):
+        wait_for(lambda: live.received > 2)
+    seen, left_s = live.received, time.monotonic()
+    house.replaced("door")
+    with closing(streaming()):
+        wait_for(lambda: live.received > seen + 2)
+    away_s = time.monotonic() - left_s
+    after = measured(house)
+    assert after["deltalight_room_restarts_total", "door"] == 1
+    assert after["deltalight_room_gap_seconds_count", "door"] == 1
+    assert 0 < after["deltalight_room_gap_seconds_sum", "door"] < away_s + 1
+    assert after["deltalight_room_frame_seconds_count", "door"] >= seen
+    house.api.client.post("/rooms/door/drain").raise_for_status()
+    wait_for(lambda: measured(house)["deltalight_room_waits", "drained", "door"] == 1)
+    assert ("deltalight_room_gap_seconds_count", "hall") not in after, "it showed nothing yet"
+    check_names(house.api.client.get("/metrics").text, [FLEET_BOARD])
+
+
 def test_drain_start_and_move_by_rest(house: House) -> None:
     client = house.api.client
     drained = client.post("/rooms/hall/drain").json()
@@ -167,6 +208,30 @@ def test_drain_start_and_move_by_rest(house: House) -> None:
     assert client.post("/rooms/cellar/drain").status_code == 404
     assert client.post("/rooms/hall/start").json()["state"] == "waiting"
     assert client.post("/rooms/door/move", json={"slt": "slot-1"}).status_code == 422
+
+
+def test_hosts_are_listed_and_drained_by_rest(house: House) -> None:
+    client = house.api.client
+    host, other = house.get("/hosts")  # of stand-ins each slot is a host
+    assert (host["drained"], host["slots"], host["rooms"]) == (False, 1, ["hall"])
+    drained = client.post(f"/hosts/{host['name']}/drain").json()
+    assert (drained["name"], drained["drained"]) == (host["name"], True)
+    house.keeper.poll()
+    wait_for(lambda: house.get("/rooms/hall")["state"] == "waiting")
+    assert [each["drained"] for each in house.get("/hosts")] == [True, False]
+    assert other["rooms"] == ["door"]
+    assert client.post("/hosts/mars/drain").status_code == 404
+    assert client.delete(f"/hosts/{host['name']}/drain").json()["drained"] is False
+    assert "is not drained" in sentence(client.delete(f"/hosts/{host['name']}/drain"), 409)
+    house.directory.close()
+    assert "does not answer" in sentence(client.post(f"/hosts/{host['name']}/drain"), 503)
+
+
+def test_a_web_process_of_rooms_is_ready_while_storage_and_directory_answer(house: House) -> None:
+    assert house.api.client.get("/ready").status_code == 200, "though no picture came"
+    house.directory.close()
+    wait_for(lambda: house.api.client.get("/ready").status_code == 503)
+    assert "the directory of rooms does not answer" in sentence(house.api.client.get("/ready"), 503)
 
 
 def test_a_directory_that_is_gone_leaves_what_runs(house: House) -> None:
@@ -191,10 +256,11 @@ def test_a_token_that_may_look_sees_rooms_and_moves_none(tmp_path: Path) -> None
             api.client.get("/rooms").status_code,
             api.client.get("/rooms", headers=looks).status_code,
             api.client.post("/rooms/hall/drain", headers=looks).status_code,
+            api.client.post("/hosts/local/drain", headers=looks).status_code,
             api.client.patch(f"/rooms/hall/scenes/{scene}", headers=looks, json={"name": "x"}).status_code,
             api.client.post("/rooms/hall/tickets", headers=looks).status_code,
         ]
-        assert statuses == [401, 200, 403, 403, 201]
+        assert statuses == [401, 200, 403, 403, 403, 201]
 
 
 def test_an_installation_without_a_directory_has_one_room(tmp_path: Path) -> None:
@@ -204,6 +270,8 @@ def test_an_installation_without_a_directory_has_one_room(tmp_path: Path) -> Non
         assert api.client.get("/rooms/room/scenes").json() == api.client.get("/scenes").json()
         refused = api.client.post("/rooms/room/drain")
         assert "deltalight up --rooms" in sentence(refused, 409)
+        assert api.client.get("/hosts").json() == []
+        assert "deltalight up --rooms" in sentence(api.client.delete("/hosts/local/drain"), 409)
 
 
 def room_at(epoch: int | None) -> RoomList:

@@ -33,6 +33,7 @@ COMMANDS = {
     "rooms move",
     "rooms drain-host",
     "rooms undrain-host",
+    "rooms claim",
     "recordings info",
     "recordings recover",
     "recordings import",

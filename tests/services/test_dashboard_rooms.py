@@ -79,6 +79,14 @@ def test_rooms_are_chosen_by_their_pictures_and_drained_by_hand(page: Page, api:
     api.client.post("/rooms/door/drain").raise_for_status()
     page.get_by_role("banner").get_by_title("All rooms").click()
     expect(page.get_by_role("article", name="The door")).to_contain_text("It was drained")
+    host = page.get_by_role("list", name="Hosts").get_by_role("listitem").filter(has_text="slot-1")
+    expect(host).to_contain_text("1 of 1 slots in use")
+    host.get_by_role("button", name="Drain").click()
+    expect(host).to_contain_text("drained")
+    photograph(page, "rooms_hosts")
+    assert [each["drained"] for each in api.client.get("/hosts").json()] == [True, False, False]
+    host.get_by_role("button", name="Take rooms").click()
+    expect(host.get_by_role("button", name="Drain")).to_be_visible()
 
 
 def test_a_single_room_has_no_list(tmp_path: Path, browser: Browser) -> None:

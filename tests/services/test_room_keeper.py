@@ -7,6 +7,9 @@ import pytest
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.rooms.keeper import MAXIMUM_FAILED_STARTS, RoomKeeper
 from deltalight.services.rooms.status import RoomStatus
+from deltalight.services.storage.drained import Drained, DrainedStore
+from deltalight.services.storage.faults import StorageFaultError
+from deltalight.services.storage.store import Store
 from tests.services.room_samples import StandInPlacer, plans, running
 
 
@@ -85,6 +88,60 @@ def test_a_room_that_never_starts_fails_and_frees_its_slot(keeper: RoomKeeper, p
     keeper.start("hall")
     running(keeper, placer, "hall")
     assert states(keeper) == ["running", "waiting", "starting"]
+
+
+class FullDisk(DrainedStore):
+    """Refuses to keep anything."""
+
+    def keep(self, drained: Drained) -> None:
+        raise StorageFaultError(f"{sorted(drained.rooms)} cannot be stored; free some space.")
+
+
+def test_drained_rooms_and_hosts_stay_so_over_a_restart(placer: StandInPlacer, tmp_path: Path) -> None:
+    named = plans(tmp_path, "hall", "door", "attic")
+    with Store(tmp_path / "data") as store:
+        placer.slot_names = ("here/1", "here/2")
+        before = RoomKeeper(named, placer, memory=store.drained)
+        before.poll()
+        before.drain("attic")
+        before.drain("hall")
+        before.start("hall")
+        before.drain_host("here")
+    with Store(tmp_path / "data") as store:
+        again = StandInPlacer()
+        again.slot_names = placer.slot_names
+        after = RoomKeeper(named[1:], again, memory=store.drained)
+        after.poll()
+        assert "It was drained" in rooms(after)["attic"].why
+        assert "drained" in rooms(after)["door"].why, "its only host is"
+        assert again.placed == {}
+        after.undrain_host("here")
+        after.start("attic")
+        after.poll()
+        assert {room.state for room in after.status().rooms} == {"starting"}
+        assert store.drained.load() == Drained()
+
+
+def test_what_cannot_be_kept_is_not_drained(placer: StandInPlacer, tmp_path: Path) -> None:
+    with Store(tmp_path / "data") as store:
+        keeper = RoomKeeper(plans(tmp_path, "hall"), placer, memory=FullDisk(store._database))
+        keeper.poll()
+        with pytest.raises(StorageFaultError, match="free some space"):
+            keeper.drain("hall")
+        with pytest.raises(StorageFaultError, match="free some space"):
+            keeper.drain_host(placer.slots()[0].host)
+        assert rooms(keeper)["hall"].state == "starting"
+        assert not any(slot.drained for slot in keeper.status().slots)
+
+
+def test_hosts_that_are_refused_are_no_failed_starts_of_the_room(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    keeper.poll()
+    for _ in range(MAXIMUM_FAILED_STARTS + 1):
+        placer.lose("hall", host_refused=True)
+        keeper.poll()
+    assert rooms(keeper)["hall"].state == "starting"
 
 
 def test_a_room_whose_input_is_refused_fails_at_once(keeper: RoomKeeper, placer: StandInPlacer) -> None:

@@ -117,6 +117,21 @@ def test_two_rooms_run_on_two_hosts_and_the_third_waits_and_says_why(
     assert found == {"alpha": (1, "east"), "beta": (1, None)}
 
 
+def test_a_killed_render_server_is_replaced_by_the_spare_of_its_host(
+    hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slot, before = installation.room("hall").slot, settled(installation, "hall")
+    assert slot is not None
+    host = slot.partition("/")[0]
+    wait_for(lambda: sum("server" in each.cmdline() for each in rendering(hosts.raylet(host))) == 2)
+    time.sleep(3)  # it prepares itself
+    said = installation.kill("hall")
+    with capsys.disabled():
+        print(f"\na render server of a host that lives was replaced after {said}")
+    assert "by the spare" in said
+    assert (installation.room("hall").slot, settled(installation, "hall")) == (slot, before)
+
+
 def test_rooms_of_killed_hosts_return_on_others_with_equal_pictures(
     hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -151,6 +166,11 @@ def test_a_room_of_a_killed_host_waits_for_a_slot_and_says_so(
     wait_for(lambda: "all 1 slots are in use" in installation.room("door").why)
     wait_for(lambda: is_gone(server))
     assert (epoch(installation, "hall"), settled(installation, "hall")) == (other, picture)
+    hosts.add("liar", labels={"gpu": "NVIDIA-H100-80GB-HBM3"})
+    wait_for(
+        lambda: "The host liar is refused: it claims the device NVIDIA-H100" in installation.room("door").why
+    )
+    assert "liar" not in {slot.host for slot in installation.directory.rooms().slots}
     installation.hosts.append(hosts.add("epsilon"))
     wait_for(lambda: installation.is_shown("door"))
 
@@ -206,12 +226,14 @@ def test_an_actor_without_keeper_ends_its_render_server(tmp_path: Path) -> None:
         "from deltalight.services.host import HostCommands\n"
         "from deltalight.services.rooms import render_actor\n"
         "from deltalight.services.rooms.placer import Placement\n"
+        "from deltalight.services.rooms.ray_cluster import ClusterHost\n"
         "from deltalight.services import ports\n"
         "render_actor.LEASE_S = 1.0\n"
         "publish, control = map(ports.endpoint, ports.private_ports(2))\n"
         "spec = ChildSpec('room', ('-c', 'import time; time.sleep(100)'))\n"
         "placement = Placement('hall', 1, 'a/1', publish, control)\n"
-        "task = render_actor.RenderTask(placement, spec, '', HostCommands(), 0)\n"
+        "host = ClusterHost('a', 'id', '127.0.0.1', 1, {})\n"
+        "task = render_actor.RenderTask(placement, spec, '', HostCommands(), 0, host)\n"
         "actor = render_actor.RenderActor(task)\n"
         "print(actor.process_id(), flush=True)\n"
         "time.sleep(60)\n"

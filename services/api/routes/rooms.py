@@ -1,5 +1,6 @@
 """Routes of the rooms: which there are, how they are doing, and where they run."""
 
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Depends, Path
@@ -11,7 +12,15 @@ from deltalight.protocol.message_fields import NAME_PATTERN
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.rooms import Rooms
-from deltalight.services.rooms.directory import DRAIN, MOVE, START, SilentDirectoryError
+from deltalight.services.rooms.directory import (
+    DRAIN,
+    DRAIN_HOST,
+    MOVE,
+    START,
+    UNDRAIN_HOST,
+    DirectoryClient,
+    SilentDirectoryError,
+)
 from deltalight.services.rooms.status import RoomList, RoomState, RoomStatus, SlotStatus
 from deltalight.services.storage.faults import ConflictError, NotFoundError
 
@@ -58,6 +67,15 @@ class RoomsAnswer(BaseModel):
     can_move: bool = Field(description="Whether rooms can be drained, started and moved here.")
 
 
+class HostAnswer(BaseModel):
+    """A host that renders."""
+
+    name: str
+    drained: bool = Field(description="Whether no room starts on it.")
+    slots: int = Field(description="How many rooms it can render at once; 0 = it is away.")
+    rooms: list[str] = Field(description="Which rooms it renders.")
+
+
 class MoveOrder(BaseModel):
     """Where to move a room."""
 
@@ -73,6 +91,10 @@ async def _rooms(connection: HTTPConnection) -> Rooms:
 
 
 AllRooms = Annotated[Rooms, Depends(_rooms)]
+HostName = Annotated[
+    str,
+    Path(description="The host's `name`.", pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,252}$", examples=["local"]),
+]
 RoomName = Annotated[str, Path(description="The room's `name`.", pattern=NAME_PATTERN, examples=["room"])]
 
 
@@ -117,19 +139,65 @@ def move_room(
     return _commanded(rooms, MOVE, room, order.slot)
 
 
+@router.get("/hosts")
+def list_hosts(rooms: AllRooms) -> list[HostAnswer]:
+    """List the hosts whose slots rooms run in; empty for a single room."""
+    return _hosts(_answer(rooms).slots)
+
+
+@router.post("/hosts/{host}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
+@in_pool("render server")
+def drain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
+    """Move the host's rooms to others, one after another; those without a slot there end and wait.
+
+    It stays drained over restarts, until that is deleted.
+    """
+    del shared
+    if all(each.name != host for each in list_hosts(rooms)):
+        raise NotFoundError(f"there is no host {host!r:.80} with a slot; list the hosts for their names.")
+    return _host(_ordered(rooms, lambda directory: directory.host_command(DRAIN_HOST, host)), host)
+
+
+@router.delete("/hosts/{host}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
+@in_pool("render server")
+def undrain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
+    """Let rooms start on the host again."""
+    del shared
+    return _host(_ordered(rooms, lambda directory: directory.host_command(UNDRAIN_HOST, host)), host)
+
+
+def _hosts(slots: Sequence[SlotStatus]) -> list[HostAnswer]:
+    return [_host_of(name, slots) for name in dict.fromkeys(slot.host for slot in slots)]
+
+
+def _host(found: RoomList, name: str) -> HostAnswer:
+    return _host_of(name, found.slots)
+
+
+def _host_of(name: str, slots: Sequence[SlotStatus]) -> HostAnswer:
+    own = [slot for slot in slots if slot.host == name]
+    rooms = [slot.room for slot in own if slot.room is not None]
+    return HostAnswer(name=name, drained=any(slot.drained for slot in own), slots=len(own), rooms=rooms)
+
+
 def _commanded(rooms: Rooms, op: str, room: str, slot: str | None = None) -> RoomAnswer:
     _one(_answer(rooms), room)
-    if rooms.directory is None or rooms.follower is None:
+    found = _ordered(rooms, lambda directory: directory.command(op, room, slot))
+    return _one(_described(rooms.contexts, found), room)
+
+
+def _ordered(rooms: Rooms, order: Callable[[DirectoryClient], RoomList]) -> RoomList:
+    """Give an order to the directory, and return all rooms after it."""
+    if rooms.directory is None:
         raise ConflictError(
             "this installation has a single room, which stays where it is; for several, use `deltalight up --rooms`."
         )
     try:
-        found = rooms.directory.command(op, room, slot)
+        return order(rooms.directory)
     except SilentDirectoryError as fault:
         raise ProblemError(503, "directory", str(fault)) from fault
     except DeltalightError as refusal:
         raise ConflictError(str(refusal)) from refusal
-    return _one(_described(rooms.contexts, found), room)
 
 
 def _answer(rooms: Rooms) -> RoomsAnswer:

@@ -14,6 +14,7 @@ from deltalight.services.api.live_video import LiveCodec
 from deltalight.services.api.metrics import MEDIA_TYPE
 from deltalight.services.api.models import PictureState, ProcessAnswer
 from deltalight.services.api.problems import ProblemError, responses, unavailable
+from deltalight.services.api.routes.rooms import AllRooms
 from deltalight.services.api.streams import Report
 
 READY_PICTURE_S = 10.0  # five pictures of a slow renderer
@@ -90,18 +91,20 @@ def health(shared: Shared) -> Health:
 
 
 @state_router.get("/ready", responses=unavailable("The storage, the render server or a picture is missing."))
-def ready(shared: Shared) -> Health:
-    """Whether storage, render server and newest picture are there: for what chooses among web processes."""
-    _, since_s = shared.live.state()
-    missing = [
-        each
-        for each, is_missing in (
-            ("the storage does not answer", not shared.store.answers()),
-            ("the render server does not answer", not shared.link.is_reachable),
-            (f"no picture came within {READY_PICTURE_S:.0f} s", since_s is None or since_s > READY_PICTURE_S),
-        )
-        if is_missing
-    ]
+def ready(shared: Shared, rooms: AllRooms) -> Health:
+    """Whether storage, render server and newest picture are there: for what chooses among web processes.
+
+    With a directory of rooms: whether storage and directory are, because rooms may wait.
+    """
+    parts = [("the storage does not answer", not shared.store.answers())]
+    if rooms.follower is not None:
+        parts.append(("the directory of rooms does not answer", not rooms.follower.is_answered))
+    else:
+        _, since_s = shared.live.state()
+        is_old = since_s is None or since_s > READY_PICTURE_S
+        parts.append(("the render server does not answer", not shared.link.is_reachable))
+        parts.append((f"no picture came within {READY_PICTURE_S:.0f} s", is_old))
+    missing = [each for each, is_missing in parts if is_missing]
     if missing:
         raise ProblemError(503, "not-ready", f"Not ready: {'; '.join(missing)}.")
     return health(shared)
@@ -121,9 +124,9 @@ def state(shared: Shared) -> State:
 
 
 @state_router.get("/metrics", response_class=PlainTextResponse)
-def metrics(shared: Shared) -> Response:
-    """Measurements for Prometheus."""
-    return Response(shared.metrics.text(), media_type=MEDIA_TYPE)
+def metrics(shared: Shared, rooms: AllRooms) -> Response:
+    """Measurements for Prometheus: of a room, and of what all rooms have in common."""
+    return Response(shared.metrics.text() + rooms.metrics.text(), media_type=MEDIA_TYPE)
 
 
 @state_router.get("/settings")

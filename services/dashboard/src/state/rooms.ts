@@ -36,13 +36,32 @@ export function freeSlots(): readonly string[] {
   return (rooms.value?.slots ?? []).filter((slot) => slot.room == null && !slot.drained).map((slot) => slot.name);
 }
 
+/** The hosts of all slots, each with its rooms. */
+export const hosts = computed(() => {
+  const slots = rooms.value?.slots ?? [];
+  return [...new Set(slots.map((slot) => slot.host))].map((name) => {
+    const own = slots.filter((slot) => slot.host === name);
+    return {
+      name,
+      drained: own.some((slot) => slot.drained),
+      slots: own.length,
+      rooms: own.flatMap((slot) => slot.room ?? []),
+    };
+  });
+});
+export const drainHost = (name: string): Promise<void> => command("POST", `${ROOT}/hosts/${name}/drain`);
+export const undrainHost = (name: string): Promise<void> => command("DELETE", `${ROOT}/hosts/${name}/drain`);
+
 export const drainRoom = ({ name }: RoomAnswer): Promise<void> => order(name, "drain");
 export const startRoom = ({ name }: RoomAnswer): Promise<void> => order(name, "start");
 export const moveRoom = ({ name }: RoomAnswer, slot: string): Promise<void> => order(name, "move", { slot });
 
-async function order(name: string, what: string, body?: unknown): Promise<void> {
+const order = (name: string, what: string, body?: unknown): Promise<void> =>
+  command("POST", `${apiOf(name)}/${what}`, body);
+
+async function command(method: "POST" | "DELETE", path: string, body?: unknown): Promise<void> {
   try {
-    await request("POST", `${apiOf(name)}/${what}`, { body });
+    await request(method, path, { body });
   } catch (fault) {
     toast(fault instanceof Error ? fault.message : String(fault), "error");
   }

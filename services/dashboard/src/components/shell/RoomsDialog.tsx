@@ -5,14 +5,17 @@ import type { RoomAnswer } from "../../api/types";
 import { rateText } from "../../math/units";
 import {
   areRoomsShown,
+  drainHost,
   drainRoom,
   freeSlots,
+  hosts,
   moveRoom,
   openRoom,
   readRooms,
   rooms,
   shownRoom,
   startRoom,
+  undrainHost,
 } from "../../state/rooms";
 import { Dialog } from "../ui/Dialog";
 import { Icon } from "../ui/Icon";
@@ -40,6 +43,28 @@ function Rooms() {
           </li>
         ))}
       </ul>
+      {hosts.value.length > 1 && (
+        <ul class="hosts" aria-label="Hosts">
+          {hosts.value.map((host) => (
+            <li key={host.name} class="spread">
+              <span class="cut">{host.name}</span>
+              <span class="quiet small">
+                {host.rooms.length} of {host.slots} slots in use
+              </span>
+              {host.drained && <span class="badge waiting">drained</span>}
+              {role.value === "control" && (
+                <button
+                  type="button"
+                  class="button"
+                  onClick={() => void (host.drained ? undrainHost : drainHost)(host.name)}
+                >
+                  {host.drained ? "Take rooms" : "Drain"}
+                </button>
+              )}
+            </li>
+          ))}
+        </ul>
+      )}
     </Dialog>
   );
 }
