@@ -66,7 +66,8 @@ class Resource(Generic[T]):
 class Stage:
     """A function of resources.
 
-    `ran`: whether the last run of the graph called it; `plugin`: whose stage it is; `lag`: what it may wait for.
+    `ran`: whether the last run of the graph called it; `plugin`: whose stage it is; `lag`: what it may wait for;
+    `view`: which of the views declared it.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Stage:
     same: Same | None
     plugin: Plugin | None = None
     lag: Lag | None = None
+    view: int = 0
     seen: tuple[int, ...] | None = None
     ran: bool = False
 
@@ -138,16 +140,24 @@ class Graph:
         self._polled: list[tuple[Resource[Any], Callable[[], Any], Same]] = []
         self._owned: list[Any] = []
         self._plugin: Plugin | None = None
+        self._view = 0
+        self._shared: dict[str, Any] = {}
         self._lags: list[Lag] = []
         self._lag: Lag | None = None
 
-    def source(self, name: str, clock: Clock) -> Resource[Any]:
-        """Declares a resource that is set from outside (`Resource.write`)."""
-        return self._declare((name,), None, frozenset([clock]))[0]
+    def source(self, name: str, clock: Clock, *, of_each_view: bool | None = None) -> Resource[Any]:
+        """Declares a resource that is set from outside (`Resource.write`).
+
+        `of_each_view`: every view has its own; None: if it follows the clock `view`. The others are of all views.
+        """
+        own = clock == "view" if of_each_view is None else of_each_view
+        if self._view and not own and name in self._resources:
+            return self._resources[name]
+        return self._declare((_of_view(name, self._view),), None, frozenset([clock]))[0]
 
     def polled(self, name: str, clock: Clock, ask: Callable[[], Any], same: Same) -> Resource[Any]:
         """Declares a source that is asked for before every run that needs it."""
-        resource = self.source(name, clock)
+        resource = self.source(name, clock, of_each_view=True)
         self._polled.append((resource, ask, same))
         return resource
 
@@ -171,8 +181,10 @@ class Graph:
         """Declares a stage that only puts values together: it runs no kernel and is not timed, and pictures of the
         graph show it with the stage that it serves.
         """
-        self._values.add(name)
-        return self.stage(name, function, *inputs, same=same)
+        resource = self.stage(name, function, *inputs, same=same)
+        assert resource.stage is not None
+        self._values.add(resource.stage.name)
+        return resource
 
     def section(self, name: str) -> None:
         """Begins a section of the frame, for who reads the graph: what is declared from here on belongs to it."""
@@ -186,6 +198,25 @@ class Graph:
             yield
         finally:
             self._plugin = None
+
+    @contextmanager
+    def of_view(self, number: int) -> Iterator[None]:
+        """What is declared in here is of one of several views of one world, counted from 0.
+
+        The same stage (function and inputs) as the first view's is not declared again: it runs once for all views.
+        The others are told apart by the view's number, and names mean those of the view where it has them.
+        """
+        self._view = number
+        try:
+            yield
+        finally:
+            self._view = 0
+
+    def shared(self, name: str, make: Callable[[], T]) -> T:
+        """Returns what `make` made for the first view: what stages are methods of that serve all views."""
+        if not self._view:
+            self._shared[name] = make()
+        return self._shared[name]
 
     @contextmanager
     def lagging(self, turns: int, *behind: Resource[Any]) -> Iterator[None]:
@@ -224,6 +255,10 @@ class Graph:
         outputs: tuple[str, ...],
         same: Same | None,
     ) -> tuple[Resource[Any], ...]:
+        known = self._same_stage(name, function, inputs)
+        if known is not None:
+            return known.outputs
+        name, outputs = _of_view(name, self._view), tuple(_of_view(each, self._view) for each in outputs)
         if any(stage.name == name for stage in self._stages):
             raise GraphError(f"There is a stage `{name}` already; give this one another name.")
         if not outputs:
@@ -231,13 +266,32 @@ class Graph:
         for item in inputs:
             if isinstance(item, Resource) and item is not self._resources.get(item.name):
                 raise GraphError(f"Stage `{name}` reads `{item.name}` of another graph.")
-        stage = Stage(name, function, (), (), same, self._plugin, self._lag)
+        stage = Stage(name, function, (), (), same, self._plugin, self._lag, self._view)
         stage.outputs = self._declare(outputs, stage)
         self._stages.append(stage)
         self._named[stage] = [item if isinstance(item, str) else item.name for item in inputs]
         self._order = None
         self.own(getattr(function, "__self__", None))
         return stage.outputs
+
+    def _same_stage(
+        self, name: str, function: Callable[..., Any], inputs: Sequence[Resource[Any] | str]
+    ) -> Stage | None:
+        """Returns the first view's stage that computes the same as one that another view is about to declare."""
+        if not self._view:
+            return None
+        named = [
+            self._name_in_view(item, self._view) if isinstance(item, str) else item.name for item in inputs
+        ]
+        found = (stage for stage in self._stages if stage.name == name and not stage.view)
+        return next(
+            (stage for stage in found if stage.function == function and self._named[stage] == named), None
+        )
+
+    def _name_in_view(self, name: str, view: int) -> str:
+        """Returns a resource's name, that of the view's own if it has one."""
+        own = _of_view(name, view)
+        return own if own in self._resources else name
 
     def _declare(
         self, names: tuple[str, ...], stage: Stage | None, clocks: frozenset[Clock] = frozenset()
@@ -265,6 +319,7 @@ class Graph:
         Raises:
             GraphError: there is none.
         """
+        name = self._name_in_view(name, self._view)
         if name not in self._resources:
             raise GraphError(f"There is no resource `{name}`{self._nearest(name)}.")
         return self._resources[name]
@@ -329,6 +384,7 @@ class Graph:
         order.append(stage)
 
     def _read(self, stage: Stage, name: str) -> Resource[Any]:
+        name = self._name_in_view(name, stage.view)
         if name not in self._resources:
             raise GraphError(
                 f"Stage `{stage.name}` reads `{name}`, which no stage writes{self._nearest(name)}."
@@ -471,6 +527,11 @@ class Graph:
         for item in reversed(self._owned):
             item.release()
         self._owned.clear()
+
+
+def _of_view(name: str, view: int) -> str:
+    """Returns the name of a stage or resource of a view; that of the first is plain."""
+    return f"{name} (view {view + 1})" if view else name
 
 
 def _links(circle: Sequence[Stage]) -> str:
