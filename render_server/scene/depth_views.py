@@ -94,6 +94,10 @@ class DepthViews:
             copied |= larger & covered[number][pixel] & _is_there(other, local, pixel)
         return replace(mesh, triangles=mesh.triangles[~short_axis.all_of(copied[mesh.triangles])])
 
+    def count_showing(self, points: Points) -> Int64[np.ndarray, " n"]:
+        """Returns how many frames show a surface at each point."""
+        return np.asarray(sum(_is_there(each, *each.find(points)).astype(np.int64) for each in self.frames))
+
     def in_free_space(self, points: Points) -> Mask:
         """Returns which points lie before what a camera sees: nothing is there."""
         free = np.zeros(len(points), bool)

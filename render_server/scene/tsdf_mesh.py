@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from deltalight.protocol import short_axis
 from deltalight.render_server.scene.depth_mesh import REAL_MATERIAL
 from deltalight.render_server.scene.depth_surface import DepthSurface
-from deltalight.render_server.scene.depth_views import PosedSurface
+from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.scene.tsdf_volume import (
     BLOCK,
@@ -307,8 +307,7 @@ class _SeenPoints(NamedTuple):
 
 def place_volumes(frames: Sequence[PosedSurface]) -> tuple[TsdfPlacement, TsdfPlacement]:
     """Places a cube around the near points of the cameras' frames, and a coarser one around all of them."""
-    parts = [_seen_points(frame.surface, frame.view) for frame in frames]
-    shown = parts[0] if len(parts) == 1 else _SeenPoints(*map(np.concatenate, zip(*parts, strict=True)))
+    shown = _all_seen_points(frames)
     near = shown.z <= NEAR_MEDIANS * np.median(shown.z)
     pixel = max(1 / float(frame.view.camera.matrix[0, 0]) for frame in frames)
     details_1m = max(frame.noise_sigma for frame in frames), pixel
@@ -316,6 +315,16 @@ def place_volumes(frames: Sequence[PosedSurface]) -> tuple[TsdfPlacement, TsdfPl
     beyond = shown if near.all() else shown.only(~near)
     around = _placement(shown, beyond, details_1m, FINE_TRIANGLES[1])
     return inside, replace(around, hole=inside.box)
+
+
+def _all_seen_points(frames: Sequence[PosedSurface]) -> _SeenPoints:
+    """Returns the points of all frames; the area of a surface that several show is divided among them."""
+    parts = [_seen_points(frame.surface, frame.view) for frame in frames]
+    if len(parts) == 1:
+        return parts[0]
+    together = _SeenPoints(*map(np.concatenate, zip(*parts, strict=True)))
+    showing = DepthViews(tuple(frames)).count_showing(together.points)
+    return together._replace(area=together.area / np.maximum(showing, 1))
 
 
 def _placement(

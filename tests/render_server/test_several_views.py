@@ -43,17 +43,9 @@ FAST: dict[str, object] = {"cone_scale": 4, "cone_count": 8, "shadow_samples": 1
 METHODS: dict[str, dict[str, object]] = {
     "exact": {},
     "paper": {"operator": "paper"},
-    "dlpv": {"name": "dlpv", "volume_size": 16},
-    "differential": {"name": "differential"},
+    "dlpv": {"name": "dlpv", "volume_size": 16, "rsm_size": 128, "query_scale": 2},
 }
-WORLD_KERNELS = (
-    "voxelize",
-    "reflective_shadow_map",
-    "light_voxels",
-    "filter_voxels",
-    "gather_voxels",
-    "group_surfels",
-)
+WORLD_KERNELS = "voxelize", "reflective_shadow_map", "light_voxels", "filter_voxels", "gather_voxels"
 FRONT, BACK, TOP, END = -0.29, -0.31, 0.2, 0.6  # of a wall: x of both sides, height, half its length
 BEHIND = look_at((-0.75, -0.3, 0.9), (-0.12, 0, 0.05))  # looks over the wall, at its back
 FACING = look_at((0.7, -0.2, 0.6), (-0.3, 0, 0.2))  # sees its front
@@ -88,7 +80,9 @@ def document(stage: Stage, geometry: str, **method: object) -> SceneDocument:
     wall = shifted(trimesh.creation.box((FRONT - BACK, 2 * END, TOP)), (FRONT + BACK) / 2, 0, TOP / 2)
     white = stage.virtual(cube(0.1, (-0.12, 0, 0)), (0.8, 0.8, 0.8))
     model = trimesh.util.concatenate([floor(1.0), wall])
-    given = stage.document([white], [directional((-0.9, 0.1, -0.5))], model, **{**FAST, **method})
+    own = {} if "name" in method else method
+    given = stage.document([white], [directional((-0.9, 0.1, -0.5))], model, **{**FAST, **own})
+    given = given.replaced(method=method) if "name" in method else given
     if geometry == "model":
         return given
     return given.replaced(real=given.real.model_copy(update={"geometry": geometry}))
@@ -230,5 +224,6 @@ def covering(mesh: TriangleMesh, points: np.ndarray) -> np.ndarray:
     """How many triangles of a floor's mesh lie over each point (x, y)."""
     a, b, c = np.moveaxis(mesh.positions[mesh.triangles][..., :2].astype(float), 1, 0)[:, None]
     at = points[:, None]
-    sides = [np.cross(end - start, at - start) > 0 for start, end in ((a, b), (b, c), (c, a))]
+    edges = [(end - start, at - start) for start, end in ((a, b), (b, c), (c, a))]
+    sides = [along[..., 0] * to[..., 1] > along[..., 1] * to[..., 0] for along, to in edges]
     return np.asarray((np.sum(sides, axis=0) % 3 == 0).sum(axis=1))
