@@ -208,7 +208,15 @@ def run_views(job: ViewsJob, *, out: Path | None, as_json: bool) -> None:
 def _table(report: ViewsReport) -> Table:
     width, height = report.size
     table = Table(title=f"{width} x {height}, {report.geometry}, {report.renderer}, {report.cpus} processors")
-    for name in ("method", "what changes", "one camera, processor ms", "two cameras", "three", "second adds", "third"):
+    for name in (
+        "method",
+        "what changes",
+        "one camera, processor ms",
+        "two cameras",
+        "three",
+        "second adds",
+        "third",
+    ):
         table.add_column(name, justify="left" if name in ("method", "what changes") else "right")
     for method, motions in report.methods.items():
         for motion, found in motions.items():

@@ -5,23 +5,21 @@ clocks of all that it is computed from, so the graph shows what a moving camera 
 drawn.
 """
 
-import inspect
 import time
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from typing import Any, Final, Generic, Literal, TypeVar, get_args
+from typing import Any, Generic, TypeVar
 
 from deltalight.protocol.plugins import Plugin
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Dispatch, watched
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
 from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.graph_report import CLOCKS, Clock, SourceReport, StageReport, links, summary
 from deltalight.render_server.lag import Lag
 
-Clock = Literal["scene", "lights", "world", "objects", "view"]
-CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
 T = TypeVar("T")
 Same = Callable[[Any, Any], bool]
 
@@ -85,38 +83,6 @@ class Stage:
     def clocks(self) -> frozenset[Clock]:
         """The clocks that make it run."""
         return self.outputs[0].clocks
-
-
-@dataclass(frozen=True)
-class SourceReport:
-    """One source as the frame left it. `changed`: whether it did in this frame."""
-
-    name: str
-    clock: Clock
-    size_bytes: int
-    changed: bool
-
-
-@dataclass(frozen=True)
-class StageReport:
-    """One stage as the frame left it.
-
-    `size_bytes` is the GPU memory of what it writes, as far as no other stage or source has it by itself; `time_ms`
-    what it took when it last ran. `is_value`: it only puts values together. `summary` and `file` tell what its
-    function does, and where it stands.
-    """
-
-    name: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    clocks: tuple[Clock, ...]
-    size_bytes: int
-    time_ms: float | None
-    ran: bool
-    section: str
-    is_value: bool
-    summary: str
-    file: str
 
 
 class Graph:
@@ -375,9 +341,7 @@ class Graph:
         if stage in order:
             return
         if stage in waiting:
-            raise GraphError(
-                f"Stages read each other in a circle: {_links(waiting[waiting.index(stage) :])}."
-            )
+            raise GraphError(f"Stages read each other in a circle: {links(waiting[waiting.index(stage) :])}.")
         for item in stage.inputs:
             if item.stage is not None:
                 self._place(item.stage, order, [*waiting, stage])
@@ -495,7 +459,7 @@ class Graph:
                 stage.ran or stage.seen is not seen.get(stage, stage.seen),
                 self._section_of(stage),
                 stage.name in self._values,
-                _summary(stage.function),
+                summary(stage.function),
                 stage.function.__module__.removeprefix("deltalight.").replace(".", "/") + ".py",
             )
             for stage in self._sorted()
@@ -532,18 +496,3 @@ class Graph:
 def _of_view(name: str, view: int) -> str:
     """Returns the name of a stage or resource of a view; that of the first is plain."""
     return f"{name} (view {view + 1})" if view else name
-
-
-def _links(circle: Sequence[Stage]) -> str:
-    """What each stage of a circle reads of the next."""
-    links = []
-    for stage, writer in zip(circle, [*circle[1:], circle[0]], strict=True):
-        item = next(item for item in stage.inputs if item.stage is writer)
-        links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
-    return ", ".join(links)
-
-
-def _summary(function: Callable[..., Any]) -> str:
-    """First sentence of a function's documentation, without its full stop."""
-    text = " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
-    return text.split(". ")[0].rstrip(".")

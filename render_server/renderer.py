@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +19,6 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView, View
 from deltalight.render_server.frame_budget import Level
-from deltalight.render_server.frame_graph import ShownBuffers
 from deltalight.render_server.gpu.context import GpuContext, GpuMemoryError
 from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
@@ -27,9 +26,10 @@ from deltalight.render_server.live_scene import LiveScene, RelitFrame
 from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
 from deltalight.render_server.post_effects.bloom import bloomed
-from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts, FrameArtifacts
+from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
 from deltalight.render_server.room_mesh import RoomMesh, room_mesh
 from deltalight.render_server.scene.depth_mesh import depth_mesh
+from deltalight.render_server.started_frame import CameraState, FrameSource, PassTimes, StartedView
 from deltalight.render_server.view import CameraView, PosedFrame, output_size, resized_frame
 
 MEMORY_RETRY_S = 10.0  # after which a scene is built anew that the GPU had no memory for
@@ -120,7 +120,7 @@ class SceneRenderer:
         self._live = self._build(scene, waits=waits)
         self._full: tuple[GpuMemoryError, float] | None = None  # and when to try again
         self._readback = AsyncReadback(gpu)
-        self._cameras: list[_Camera] = [_Camera()]
+        self._cameras: list[CameraState] = [CameraState()]
         self.scene = scene
 
     def _build(self, scene: SceneDocument, *, waits: bool) -> LiveScene:
@@ -140,7 +140,7 @@ class SceneRenderer:
 
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
-        self._cameras = [_Camera()]
+        self._cameras = [CameraState()]
         self._live.forget_frames()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
@@ -191,14 +191,14 @@ class SceneRenderer:
         started_s = time.perf_counter()
         with_linear = with_linear or self._with_linear
         if len(frames) != len(self._cameras):
-            self._cameras = [_Camera() for _ in frames]
+            self._cameras = [CameraState() for _ in frames]
         sized = [self._resized(camera, frame) for camera, frame in zip(self._cameras, frames, strict=True)]
         sources = self._sources(sized, whole=whole or with_linear or self.scene.output.has_bloom)
         started = [self._start_all(source, others, with_linear=with_linear) for source in sources]
         times = self._end_frame(sources)
         submitted_ms = 1e3 * (time.perf_counter() - started_s)
 
-        def finish(source: "_Source", views: Sequence["_StartedView"], *, accounts: bool) -> CompositeFrame:
+        def finish(source: FrameSource, views: Sequence[StartedView], *, accounts: bool) -> CompositeFrame:
             main, *rest = views
             if accounts and main.composed is not None:
                 self._live.account(main.composed, max(submitted_ms, sum(times.ran.values())))
@@ -216,8 +216,8 @@ class SceneRenderer:
         ]
 
     def _start_all(
-        self, source: "_Source", others: Sequence[ShownView], *, with_linear: bool
-    ) -> list["_StartedView"]:
+        self, source: FrameSource, others: Sequence[ShownView], *, with_linear: bool
+    ) -> list[StartedView]:
         """Starts a frame in the document's view and the others, and notes what it shows."""
         main = self._start(source, self.scene.output.view, with_linear=with_linear)
         views = [main, *(self._start_other(source, view) for view in others)]
@@ -225,11 +225,11 @@ class SceneRenderer:
         source.camera.shown = ShownFrame(source.frame, cameras, source.buffers, self._live.model)
         return views
 
-    def _end_frame(self, sources: Sequence["_Source"]) -> "_PassTimes":
+    def _end_frame(self, sources: Sequence[FrameSource]) -> PassTimes:
         if self.graph is None or all(source.relit is None for source in sources):
-            return _PassTimes({}, {})
+            return PassTimes({}, {})
         ran = dict(self._live.timers.end_frame())
-        return _PassTimes(ran, self.graph.reused_times_ms(ran))
+        return PassTimes(ran, self.graph.reused_times_ms(ran))
 
     def _find_faults(self) -> None:
         """Finds faults of the device since the last call; builds the scene anew where its memory was full.
@@ -261,7 +261,7 @@ class SceneRenderer:
         self._live = self._build(self.scene, waits=False)
         self._full = None
 
-    def _sources(self, frames: Sequence[ViewFrame], *, whole: bool) -> list["_Source"]:
+    def _sources(self, frames: Sequence[ViewFrame], *, whole: bool) -> list[FrameSource]:
         """Relights the frames together; without a pose there is nothing but a camera's picture."""
         for camera, frame in zip(self._cameras, frames, strict=True):
             camera.shown = camera.relit = None
@@ -274,13 +274,13 @@ class SceneRenderer:
                 camera.relit = found
         return [self._source(camera, frame) for camera, frame in zip(self._cameras, frames, strict=True)]
 
-    def _source(self, camera: "_Camera", frame: ViewFrame) -> "_Source":
+    def _source(self, camera: CameraState, frame: ViewFrame) -> FrameSource:
         if frame.pose is None or camera.posed is None:
             camera.relit = None
-            return _Source(camera, frame, None, None, None, [])
+            return FrameSource(camera, frame, None, None, None, [])
         buffers = None if camera.relit is None else camera.relit.shown()
         seen = camera.posed.view if buffers is None else buffers.view
-        return _Source(camera, frame, camera.relit, buffers, seen, self._live.describe_lights())
+        return FrameSource(camera, frame, camera.relit, buffers, seen, self._live.describe_lights())
 
     @property
     def graph(self) -> Graph | None:
@@ -292,7 +292,7 @@ class SceneRenderer:
         holder = next((each for each in self._cameras if each.holds(frame)), self._cameras[0])
         return self._resized(holder, frame)
 
-    def _resized(self, camera: "_Camera", frame: ViewFrame) -> ViewFrame:
+    def _resized(self, camera: CameraState, frame: ViewFrame) -> ViewFrame:
         """Returns a camera's frame at the composite's size; the same object for the same frame."""
         size = output_size(frame, self.scene.output)
         if size == (frame.camera.width, frame.camera.height):
@@ -356,7 +356,7 @@ class SceneRenderer:
         depth_m = np.where(coverage >= SHOWN_FRACTION, of_objects, np.maximum(real, 0))
         return PictureLayers(*(values.astype(np.float32) for values in (coverage, radiance, depth_m)))
 
-    def _start(self, source: "_Source", view: View, *, with_linear: bool) -> "_StartedView":
+    def _start(self, source: FrameSource, view: View, *, with_linear: bool) -> StartedView:
         """Starts the picture of the document's own view, and its linear radiance if `with_linear`."""
         relit = source.relit
         if relit is None or (view == "lights" and source.is_lit):
@@ -366,23 +366,23 @@ class SceneRenderer:
             take = self._begin_reading(source, relit, view, composite)
             if isinstance(composite, Composite) and with_linear:
                 self._readback.push(composite.linear, "f2")
-        return _StartedView(view, source.seen_in(view), take, relit)
+        return StartedView(view, source.seen_in(view), take, relit)
 
-    def _start_other(self, source: "_Source", view: ShownView) -> "_StartedView":
+    def _start_other(self, source: FrameSource, view: ShownView) -> StartedView:
         """Starts the frame in a view that was asked for beside the document's own."""
         frame, relit, seen = source.frame, source.relit, source.seen_in(view)
         if view == "lights" and source.is_lit:
             lights = self._live.lighting.picture(frame)
-            return _StartedView(view, seen, lambda: lights, None)
+            return StartedView(view, seen, lambda: lights, None)
         if view == "camera" or relit is None:
-            return _StartedView(view, seen, lambda: frame.color, None)
+            return StartedView(view, seen, lambda: frame.color, None)
         composite = relit.compose_view(view)
         with self._live.timers.measure("readback"):
             take = self._begin_reading(source, relit, view, composite)
-        return _StartedView(view, seen, take, relit)
+        return StartedView(view, seen, take, relit)
 
     def _begin_reading(
-        self, source: "_Source", relit: RelitFrame, view: ShownView, composite: Picture
+        self, source: FrameSource, relit: RelitFrame, view: ShownView, composite: Picture
     ) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
         """Begins to read a picture, and what the camera's artifacts on it need; returns what takes both."""
         frame, output = source.frame, self.scene.output
@@ -409,10 +409,10 @@ class SceneRenderer:
 
     def _finished(
         self,
-        source: "_Source",
-        main: "_StartedView",
-        rest: Sequence["_StartedView"],
-        times: "_PassTimes",
+        source: FrameSource,
+        main: StartedView,
+        rest: Sequence[StartedView],
+        times: PassTimes,
         *,
         with_linear: bool,
     ) -> CompositeFrame:
@@ -441,7 +441,7 @@ class SceneRenderer:
         size = frame.camera.width, frame.camera.height
         return np.asarray(color if color.shape[1::-1] == size else cv2.resize(color, size))
 
-    def _artifacts_of(self, source: "_Source", relit: RelitFrame, view: ShownView) -> FrameArtifacts | None:
+    def _artifacts_of(self, source: FrameSource, relit: RelitFrame, view: ShownView) -> FrameArtifacts | None:
         """Learns from the camera's frame; returns what it puts on the objects if the scene asks for that."""
         frame, output = source.frame, self.scene.output
         if not output.camera_artifacts or view != "composite" or output.tone != "camera":
@@ -456,66 +456,3 @@ class SceneRenderer:
         """Frees all GL objects."""
         self._live.release()
         self._readback.release()
-
-
-class _PassTimes(NamedTuple):
-    """Milliseconds by pass: of those that the frame ran, and of the others when they last ran."""
-
-    ran: dict[str, float]
-    reused: dict[str, float]
-
-
-@dataclass(eq=False)
-class _Camera:
-    """What is kept of one camera: its artifacts, its last frame with a pose, at the composite's size, and its newest.
-
-    `sized`: the newest frame as it came, and at the composite's size. `shown` and `relit` are of the newest picture.
-    """
-
-    artifacts: CameraArtifacts = field(default_factory=CameraArtifacts)
-    posed: PosedFrame | None = None
-    sized: tuple[ViewFrame, ViewFrame] | None = None
-    shown: ShownFrame | None = None
-    relit: RelitFrame | None = None
-
-    def holds(self, frame: ViewFrame) -> bool:
-        """Whether the newest frame that came is this one."""
-        return self.sized is not None and self.sized[0] is frame
-
-
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """What all views of a frame are made from; `lights` are plain values."""
-
-    camera: _Camera
-    frame: ViewFrame
-    relit: RelitFrame | None
-    buffers: ShownBuffers | None
-    seen: CameraView | None
-    lights: list[dict[str, Any]]
-
-    @property
-    def is_lit(self) -> bool:
-        """Whether there are lights to show."""
-        return bool(self.lights)
-
-    def seen_in(self, view: ShownView) -> CameraView | None:
-        """Returns the camera's view; None if the picture is not the camera's, or there is no pose."""
-        if view == "lights" and self.is_lit:
-            return self.seen if self.frame.radiance_map is None else None
-        return None if view == "rsm" and self.relit is not None else self.seen
-
-
-@dataclass(frozen=True, eq=False)
-class _StartedView:
-    """A picture of one view; `take` returns it, and waits for the GPU if it was `composed` there."""
-
-    view: ShownView
-    seen: CameraView | None
-    take: Callable[[], UInt8[np.ndarray, "h w 3"]]
-    composed: RelitFrame | None
-
-    @property
-    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
-        """The pose that the picture was made with; None if there is none, or it is not the camera's."""
-        return None if self.seen is None else self.seen.world_from_camera
