@@ -182,7 +182,8 @@ class Graph:
         """Returns what `make` made for the first view: what stages are methods of that serve all views."""
         if not self._view:
             self._shared[name] = make()
-        return self._shared[name]
+        made: T = self._shared[name]
+        return made
 
     @contextmanager
     def lagging(self, turns: int, *behind: Resource[Any]) -> Iterator[None]:
