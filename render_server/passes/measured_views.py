@@ -7,10 +7,10 @@ import numpy as np
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.view import CameraView
 
-VIEW_FLOATS = 24  # of a MeasuredView in shaders/common/measured_views.glsl
+VIEW_TEXELS = 6  # of a MeasuredView in shaders/common/measured_views.glsl
 
 
 class MeasuredViews:
@@ -27,7 +27,7 @@ class MeasuredViews:
         self._radiance.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         self._depth = gpu.ctx.texture_array(shape, 1, dtype="f4")
         self._depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        self._cameras = gpu.ctx.buffer(reserve=4 * VIEW_FLOATS * len(sizes))
+        self._cameras = texture_2d(gpu, (VIEW_TEXELS, len(sizes)), 4, "f4")
         self._copy = Kernel(gpu, "measured_view")
 
     @property
@@ -35,14 +35,14 @@ class MeasuredViews:
         """What real_radiance.glsl reads instead of one camera's picture."""
         return {
             "SEVERAL_VIEWS": True,
-            "MeasuredViews": self._cameras,
+            "view_cameras": self._cameras,
             "view_radiance": self._radiance,
             "view_depth": self._depth,
         }
 
     def write(self, views: Sequence[CameraView], scenes: Sequence[Bindings]) -> None:
         """Copies the pictures and depths that the `scenes` bind, one for each view."""
-        self._cameras.write(b"".join(_packed(view) for view in views))
+        self._cameras.write(b"".join(_packed(view) for view in views), alignment=1)
         for layer, (view, scene) in enumerate(zip(views, scenes, strict=True)):
             self._copy.run(view.size, scene, radiance_out=self._radiance, depth_out=self._depth, layer=layer)
         self._radiance.build_mipmaps()
@@ -54,7 +54,7 @@ class MeasuredViews:
 
 
 def _packed(view: CameraView) -> bytes:
-    """Returns a std430 MeasuredView: matrix by columns, pinhole, extent."""
+    """Returns the texels of a MeasuredView: matrix by columns, pinhole, extent."""
     matrix = view.camera.matrix
     pinhole = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     values = np.concatenate([view.camera_from_world.T.ravel(), pinhole, view.size, (0.0, 0.0)])

@@ -8,11 +8,11 @@ from deltalight.benchmarks.variants import RENDERED, parse_variants
 from deltalight.benchmarks.views import MOTIONS, Room, ViewsJob, ViewsReport, moments_of, run_views
 from deltalight.services.demo import demo_scene
 
-SMALL = "paper:volume_size=32,rsm_size=64"
+SMALL = "paper:volume_size=32,rsm_size=128"
 
 
 def test_its_motions_move_the_cameras_or_the_object() -> None:
-    room, scene = Room((80, 60)), demo_scene("dvct")
+    room, scene = Room((200, 150)), demo_scene("dvct")
     for motion in MOTIONS:
         (first, before), (then, after) = moments_of(motion, room, scene, 2)
         assert [each.pose is not None for each in (*before, *after)] == [True] * 6
@@ -27,7 +27,7 @@ def test_its_motions_move_the_cameras_or_the_object() -> None:
 def test_its_report_has_the_cost_of_each_number_of_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    job = ViewsJob(parse_variants(SMALL, RENDERED), 1, (80, 60), "depth")
+    job = ViewsJob(parse_variants(SMALL, RENDERED), 1, (200, 150), "depth")
     run_views(job, out=tmp_path / "views.json", as_json=False)
     report = ViewsReport.model_validate_json((tmp_path / "views.json").read_text())
     for found in report.methods[SMALL].values():

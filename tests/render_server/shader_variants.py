@@ -53,6 +53,7 @@ GLASS: dict[Case, dict[str, Any]] = {
     Case("dlpv", "model", "mirror"): {},
     Case("aroof", "depth", "mirror"): {},
 }
+SEVERAL = [Case(method, "depth", "plain") for method in ("exact", "paper", "differential", "dlpv")]
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume", "error"),
@@ -97,6 +98,15 @@ def maps_and_holes(edge_m: float) -> Plate:
         },
     }
     return plate
+
+
+def render_several(case: Case, gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame as that of two cameras."""
+    renderer = SceneRenderer(gpu, scene_of(case, Stage(folder)))
+    try:
+        renderer.render_views(frames_of(case)[:1] * 2)
+    finally:
+        renderer.release()
 
 
 def render_with(plate: Plate, case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
@@ -157,6 +167,7 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
+    **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
     "by device": by_device,
     "image-based shading": image_based,
     "precomputed transfer": precomputed_transfer,

@@ -3,22 +3,28 @@
 struct MeasuredView {
     mat4 view_from_world;
     vec4 pinhole;   // fx, fy, cx, cy (pixel centres at integers)
-    vec4 extent;    // width and height of the picture, pixels
+    vec2 extent;    // width and height of the picture, pixels
 };
 
-layout(std430) readonly buffer MeasuredViews { MeasuredView measured_views[]; };
+uniform sampler2D view_cameras;         // a row each: matrix by columns, pinhole, extent
 uniform sampler2DArray view_radiance;   // camera units, with mip levels
 uniform sampler2DArray view_depth;      // m along the optical axis, 0 unknown
 
 int seeing_view = -1;   // the one that showed the point largest when `camera_sees` was asked
 
+vec4 view_texel(int index, int column) { return texelFetch(view_cameras, ivec2(column, index), 0); }
+
+MeasuredView measured_view(int index) {
+    mat4 matrix = mat4(view_texel(index, 0), view_texel(index, 1), view_texel(index, 2), view_texel(index, 3));
+    return MeasuredView(matrix, view_texel(index, 4), view_texel(index, 5).xy);
+}
+
 vec2 view_pixel(MeasuredView view, vec3 c) { return view.pinhole.xy * c.xy / c.z + view.pinhole.zw + 0.5; }
 
-bool view_sees(int index, vec3 c) {
-    MeasuredView view = measured_views[index];
+bool view_sees(int index, MeasuredView view, vec3 c) {
     if (c.z <= 0.0) return false;
     vec2 pixel = view_pixel(view, c);
-    if (any(lessThan(pixel, vec2(0.0))) || any(greaterThanEqual(pixel, view.extent.xy))) return false;
+    if (any(lessThan(pixel, vec2(0.0))) || any(greaterThanEqual(pixel, view.extent))) return false;
     float seen = texelFetch(view_depth, ivec3(ivec2(pixel), index), 0).r;
     return seen > 0.0 && abs(seen - c.z) < depth_tolerance * c.z;
 }
@@ -28,12 +34,12 @@ bool view_sees(int index, vec3 c) {
 bool camera_sees(vec3 p, vec3 n) {
     float most = 0.0;
     seeing_view = -1;
-    for (int i = 0; i < measured_views.length(); ++i) {
-        MeasuredView view = measured_views[i];
+    for (int i = 0; i < textureSize(view_cameras, 0).y; ++i) {
+        MeasuredView view = measured_view(i);
         vec3 c = (view.view_from_world * vec4(p, 1.0)).xyz;
         float facing = n == vec3(0.0) ? length(c) : -dot(mat3(view.view_from_world) * n, c);
         float pixels = view.pinhole.x * view.pinhole.y * facing / (c.z * c.z * c.z);
-        if (pixels <= most || !view_sees(i, c)) continue;
+        if (pixels <= most || !view_sees(i, view, c)) continue;
         most = pixels;
         seeing_view = i;
     }
@@ -44,8 +50,8 @@ bool camera_sees(vec3 p) { return camera_sees(p, vec3(0.0)); }
 
 // After `camera_sees` found a view. Samples keep clear of what lies beside the picture in its layer.
 vec3 measured_radiance(vec3 p) {
-    MeasuredView view = measured_views[seeing_view];
+    MeasuredView view = measured_view(seeing_view);
     vec2 border = vec2(0.5 * exp2(picture_lod));
-    vec2 pixel = clamp(view_pixel(view, (view.view_from_world * vec4(p, 1.0)).xyz), border, view.extent.xy - border);
+    vec2 pixel = clamp(view_pixel(view, (view.view_from_world * vec4(p, 1.0)).xyz), border, view.extent - border);
     return textureLod(view_radiance, vec3(pixel / vec2(textureSize(view_radiance, 0).xy), float(seeing_view)), picture_lod).rgb;
 }
