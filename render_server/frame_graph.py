@@ -381,14 +381,16 @@ def frame_graphs(
 
     `timers` outlive the graphs and are passed in. `checks` is `Graph`'s.
     """
-    graph, buffers, resources = Graph(gpu, timers, checks=checks), [], []
-    for number, view in enumerate(views):
-        with graph.of_view(number):
-            buffers.append(PictureBuffers(gpu, view, method.settings.tier))
-            graph.own(buffers[-1])
-            resources.append(declare_frame(graph, buffers[-1]))
+    graph = Graph(gpu, timers, checks=checks)
+    buffers: list[PictureBuffers] = []
+    resources: list[FrameResources] = []
     made: list[FrameGraph] = []
     try:
+        for number, view in enumerate(views):
+            with graph.of_view(number):
+                buffers.append(PictureBuffers(gpu, view, method.settings.tier))
+                graph.own(buffers[-1])
+                resources.append(declare_frame(graph, buffers[-1]))
         parts = zip(buffers, together(graph, resources, views), strict=True)
         for number, (held, measured) in enumerate(parts):
             with graph.of_view(number):
