@@ -207,17 +207,14 @@ def run_views(job: ViewsJob, *, out: Path | None, as_json: bool) -> None:
 
 def _table(report: ViewsReport) -> Table:
     width, height = report.size
-    table = Table(title=f"{width} x {height}, {report.geometry}, {report.renderer}, {report.cpus} processors")
-    for name in (
-        "method",
-        "what changes",
-        "one camera, processor ms",
-        "two cameras",
-        "three",
-        "second adds",
-        "third",
-    ):
-        table.add_column(name, justify="left" if name in ("method", "what changes") else "right")
+    title = (
+        f"{width} x {height}, {report.geometry}, {report.renderer}, {report.cpus} processors; processor time"
+    )
+    table = Table(title=title)
+    for name in ("method", "moves"):
+        table.add_column(name)
+    for name in ("one, ms", "two", "three", "2nd adds", "3rd adds"):
+        table.add_column(name, justify="right")
     for method, motions in report.methods.items():
         for motion, found in motions.items():
             ratios = [f"x {ratio:.2f}" for ratio in found.ratios[1:]]
