@@ -66,6 +66,7 @@ COMMANDS = {
     "bench rest",
     "bench soak",
     "bench sweep",
+    "bench views",
     "gpu-check",
     "virtual-camera",
 }
