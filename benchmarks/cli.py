@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -16,6 +16,8 @@ DEFAULT_METHODS = "camera,none,paper,exact,path"
 
 # Those of `bench speed` and `bench counts`.
 TIMED_METHODS = "raster,none,exact,paper,dlpv"
+# Those of `bench views`; beams that smooth objects cast are traced for each camera.
+VIEWS_METHODS = "exact,exact:caustics=false,paper,dlpv"
 DEFAULT_MOTIONS = "camera,object,arm,lamps,still"
 
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")]
@@ -87,6 +89,29 @@ def counts(
     from deltalight.benchmarks.speed.command import run_counts
 
     run_counts(job, out=out, as_json=as_json)
+
+
+@bench.command()
+def views(
+    *,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of each camera's pictures.")] = "320x240",
+    methods: Annotated[str, typer.Option(help=METHODS_HELP)] = VIEWS_METHODS,
+    geometry: Annotated[
+        Literal["depth", "fused"], typer.Option(help="What the real scene is made of.")
+    ] = "depth",
+    moments: Annotated[int, typer.Option(min=1, max=1000, help="Moments of each measurement.")] = 8,
+    device: Device = None,
+    out: ReportFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Time pictures of one, two and three cameras in one room, by processor time and in turn."""
+    from deltalight.benchmarks.variants import RENDERED, parse_variants
+    from deltalight.services.commands.options import parse_size
+
+    variants, size_px = parse_variants(methods, RENDERED), parse_size(size)
+    from deltalight.benchmarks.views import ViewsJob, run_views
+
+    run_views(ViewsJob(variants, moments, size_px, geometry, device), out=out, as_json=as_json)
 
 
 @bench.command()

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from deltalight.render_server.graph import StageReport
+from deltalight.render_server.graph_report import StageReport
 from deltalight.services.frame_account import FrameAccount, account_frame
 from deltalight.services.graph_drawing import draw_graph
 

@@ -1,5 +1,6 @@
 """Relighting of frames in this process: no servers, no sockets."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
@@ -126,13 +127,29 @@ class Renderer:
             DeltalightError: an asset cannot be read, the scene needs more memory than it allows, or the renderer is
                 closed.
         """
+        return self.render_views([frame], scene)[0]
+
+    def render_views(self, frames: Sequence[ViewFrame], scene: Scene | SceneDocument) -> list[RelitPicture]:
+        """Relights a frame of each of several cameras in one room, taken at one moment; returns their pictures.
+
+        The cameras' poses must be of the same board. They share one real scene and its light: what one of them sees
+        lights what the others show, and a further picture costs what hangs on its pixels alone. Give the cameras in
+        the same order each time. Lights are estimated from the first one.
+
+        Raises:
+            DeltalightError: as `render`, or there are no frames.
+        """
         if self._is_closed:
             raise DeltalightError("The renderer is closed; make another one.")
         document = self._adjusted(scene.document if isinstance(scene, Scene) else scene)
         with self._gpu.ctx:  # another renderer's may be current
             renderer = self._prepared(document)
-            composite = renderer.render(frame, with_linear=True)
-            return RelitPicture.of(renderer.sized(frame), composite, renderer.layers())
+            composites = renderer.render_views(frames, with_linear=True)
+            pairs = zip(frames, composites, strict=True)
+            return [
+                RelitPicture.of(renderer.sized(frame), composite, renderer.layers(camera))
+                for camera, (frame, composite) in enumerate(pairs)
+            ]
 
     def _adjusted(self, document: SceneDocument) -> SceneDocument:
         """Returns the scene with the method and quality that were asked for; offline, no budget applies."""

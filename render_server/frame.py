@@ -1,7 +1,7 @@
 """The resources of one frame that all methods share, and the stages that compute them."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
@@ -22,6 +22,7 @@ from deltalight.render_server.passes.coverage import (
     SampleCoverage,
 )
 from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry
+from deltalight.render_server.passes.measured_views import MeasuredViews
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.scene.declared_surfaces import MAX_ROWS, SurfaceTable, plane_fits
@@ -59,6 +60,7 @@ class Observation:
     image: CameraImage
     surface: RealSurface
     scan: Scan
+    view: CameraView
     bindings: dict[str, Binding]
 
 
@@ -92,8 +94,10 @@ class FrameResources:
 
     This module's stages compute the rest. `observation` changes only when something moved, so a new picture of a
     scene at rest relights nothing. `measured` is the observation that lights the real scene's voxels and maps: the
-    same, or, where the world is kept while the camera moves, that of `measurement`. `geometry` holds the bindings of
-    both surfaces; `lit_area` requests light in a part of the picture, whatever the objects reach (for estimation).
+    same, or, where the world is kept while the camera moves, that of `measurement`; of several cameras in one room,
+    that of all of them together (`together`), and `own_measured` this camera's part of it. `geometry` holds the
+    bindings of both surfaces; `lit_area` requests light in a part of the picture, whatever the objects reach (for
+    estimation).
     """
 
     image: Resource[CameraImage]
@@ -108,6 +112,7 @@ class FrameResources:
     albedo: Resource[AlbedoTexture]
     observation: Resource[Observation]
     measured: Resource[Observation]
+    own_measured: Resource[Observation]
     object_surface: Resource[ObjectSurface]
     geometry: Resource[dict[str, Binding]]
 
@@ -157,7 +162,7 @@ class ObservationBuffers:
             "noise_sigma": scan.noise_sigma,
             "lens_bends": view.camera.has_distortion,
         }
-        return Observation(self.image, self.real_surface, scan, bindings)
+        return Observation(self.image, self.real_surface, scan, view, bindings)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -294,7 +299,7 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
     observation = graph.stage("real surface", buffers.observe, scan, real, camera, declared, surfaces)
     measurement, measured = None, observation
     if buffers.measured is not None:
-        measurement = graph.source("measurement", "world")
+        measurement = graph.source("measurement", "world", of_each_view=True)
         measured = graph.stage("measured surface", buffers.measure, measurement, real, declared, surfaces)
     surface = graph.stage("object surface", buffers.draw_objects, objects, observation, camera)
     geometry = graph.value("geometry", _geometry_bindings, observation, surface, objects)
@@ -311,9 +316,38 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
         albedo,
         observation,
         measured,
+        measured,
         surface,
         geometry,
     )
+
+
+def together(
+    graph: Graph, frames: Sequence[FrameResources], views: Sequence[CameraView]
+) -> list[FrameResources]:
+    """Declares what several cameras measure of one room, and lights its voxels and maps by all of them."""
+    if len(frames) == 1:
+        return list(frames)
+    joint = JointMeasurement(graph.gpu, [view.size for view in views])
+    measured = graph.stage("measured views", joint.join, *(each.own_measured for each in frames))
+    return [replace(each, measured=measured) for each in frames]
+
+
+class JointMeasurement:
+    """What all cameras of a room measure, as one observation: otherwise that of the first."""
+
+    def __init__(self, gpu: GpuContext, sizes: Sequence[tuple[int, int]]) -> None:
+        self._views = MeasuredViews(gpu, sizes)
+
+    def join(self, *seen: Observation) -> Observation:
+        """Copies the cameras' pictures and depths side by side; keeps the widest offset of real surfaces."""
+        self._views.write([each.view for each in seen], [each.bindings for each in seen])
+        scan = max((each.scan for each in seen), key=lambda each: each.bias_m)
+        return replace(seen[0], scan=scan, bindings={**seen[0].bindings, **self._views.bindings})
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._views.release()
 
 
 def _geometry_bindings(

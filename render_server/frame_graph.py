@@ -1,5 +1,6 @@
 """The graph of one scene's frames: shared stages, the method's own stages, and composition."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import eq, is_
 from typing import Any
@@ -17,6 +18,7 @@ from deltalight.render_server.frame import (
     PictureBuffers,
     Scan,
     declare_frame,
+    together,
 )
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
@@ -178,39 +180,30 @@ class Composition:
 class FrameGraph:
     """The frame graph of one method and picture size: declared once, then run for every frame.
 
-    `timers` outlive the graph and are passed in. `checks` is `Graph`'s.
+    Of several cameras in one room each has one (`frame_graphs`); they share the `graph`, in which what does not
+    depend on the camera runs once.
     """
 
     def __init__(
         self,
-        gpu: GpuContext,
-        view: CameraView,
+        graph: Graph,
+        buffers: PictureBuffers,
+        resources: FrameResources,
         method: MethodChoice,
         precomputed: Precomputed,
-        timers: PassTimers,
-        *,
-        checks: bool = False,
     ) -> None:
-        self.method = method
-        self.buffers = PictureBuffers(gpu, view, method.settings.tier)
-        self.graph = Graph(gpu, timers, checks=checks)
-        self.graph.own(self.buffers)
-        self.resources: FrameResources = declare_frame(self.graph, self.buffers)
-        try:
-            setup = method.setup(view.size, precomputed.fields)
-            layers = method.declare(self.graph, self.resources, setup)
-            self.layers: Layers = method.shaded(
-                self.graph, self.resources, layers, view.size, precomputed.transfers
-            )
-        except BaseException:
-            self.release()
-            raise
-        self._options: Resource[CompositeOptions] = self.graph.source("output", "scene")
-        self._linear: Resource[CameraImage] = self.graph.source("linear picture", "view")
+        self.method, self.graph = method, graph
+        self.buffers, self.resources = buffers, resources
+        size = buffers.key[0]
+        setup = method.setup(size, precomputed.fields)
+        layers = method.declare(graph, resources, setup)
+        self.layers: Layers = method.shaded(graph, resources, layers, size, precomputed.transfers)
+        self._options: Resource[CompositeOptions] = graph.source("output", "scene")
+        self._linear: Resource[CameraImage] = graph.source("linear picture", "view")
+        self._all: Sequence[FrameGraph] = (self,)  # of all cameras in the room
         self._others: tuple[int, ...] = ()  # versions of the other sources
-        self._gpu, self._timers = gpu, timers
         self._views: Composition | None = None  # made when somebody looks at another view
-        self._composite = self._declare_composition(Composition(gpu, view.size))
+        self._composite = self._declare_composition(Composition(graph.gpu, size))
         self._inputs: FrameInputs | None = None
 
     def _declare_composition(self, composition: Composition) -> Resource[Composite]:
@@ -243,7 +236,8 @@ class FrameGraph:
 
     def upload(self, frame: ViewFrame) -> None:
         """Begins a frame by uploading its picture, which is composed anew whatever it shows."""
-        self.graph.begin_frame()
+        if self is self._all[0]:
+            self.graph.begin_frame()
         self.buffers.image.upload(frame)
         self.resources.image.write(self.buffers.image)
 
@@ -338,25 +332,72 @@ class FrameGraph:
         if not image.is_linear:
             image.linearize()
         if self._views is None:
-            self._views = Composition(self._gpu, self.resources.view.value.size)
+            self._views = Composition(self.graph.gpu, self.resources.view.value.size)
             self.graph.own(self._views)
-        with self._timers.measure("other views"):
+        assert self.graph.timers is not None
+        with self.graph.timers.measure("other views"):
             return self._views.compose_layers(image, relit.scene, options, relit.layers).composite
 
     def _run(self, *targets: Resource[Any], until_s: float | None = None) -> bool:
-        """Runs the graph with the newest picture in linear radiance; a scene at rest does without."""
-        s, image = self.resources, self.buffers.image
+        """Runs the graph with the newest pictures in linear radiance; a scene at rest does without."""
+        others = *(version for each in self._all for version in each._versions()), self._options.version
+        for each in self._all:
+            each._linearize(others)
+        return self.graph.run(*targets, until_s=until_s)
+
+    def _versions(self) -> tuple[int, ...]:
+        """Returns those of all sources except picture and output."""
+        s = self.resources
         sources = s.view, s.scan, s.measurement, s.real, s.objects, s.surfaces, s.lights, s.lit_area, s.albedo
-        others = *(item.version for item in sources if item is not None), self._options.version
+        return tuple(item.version for item in sources if item is not None)
+
+    def _linearize(self, others: tuple[int, ...]) -> None:
+        """Computes the newest picture's linear radiance, unless versions of the `others` say that all is at rest."""
+        image = self.buffers.image
         options = self._options.value if self._options.version else None
-        reuses_ratio = options is not None and options.reuses_ratio and not s.surfaces.value.is_specular
+        is_specular = self.resources.surfaces.value.is_specular
+        reuses_ratio = options is not None and options.reuses_ratio and not is_specular
         is_at_rest = others == self._others and not self.graph.is_lagging
         if not image.is_linear and not (reuses_ratio and is_at_rest):
             image.linearize()
             self._linear.write(image)
         self._others = others
-        return self.graph.run(*targets, until_s=until_s)
 
     def release(self) -> None:
-        """Frees the GL objects."""
+        """Frees the GL objects, those of the other cameras in the room too."""
         self.graph.release()
+
+
+def frame_graphs(
+    gpu: GpuContext,
+    views: Sequence[CameraView],
+    method: MethodChoice,
+    precomputed: Precomputed,
+    timers: PassTimers,
+    *,
+    checks: bool = False,
+) -> list[FrameGraph]:
+    """Returns the frame graph of each camera's view of one room.
+
+    `timers` outlive the graphs and are passed in. `checks` is `Graph`'s.
+    """
+    graph = Graph(gpu, timers, checks=checks)
+    buffers: list[PictureBuffers] = []
+    resources: list[FrameResources] = []
+    made: list[FrameGraph] = []
+    try:
+        for number, view in enumerate(views):
+            with graph.of_view(number):
+                buffers.append(PictureBuffers(gpu, view, method.settings.tier))
+                graph.own(buffers[-1])
+                resources.append(declare_frame(graph, buffers[-1]))
+        parts = zip(buffers, together(graph, resources, views), strict=True)
+        for number, (held, measured) in enumerate(parts):
+            with graph.of_view(number):
+                made.append(FrameGraph(graph, held, measured, method, precomputed))
+    except BaseException:
+        graph.release()
+        raise
+    for each in made:
+        each._all = made
+    return made

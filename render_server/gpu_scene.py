@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64
 from deltalight.protocol import short_axis
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.depth_mesh import back_faces
+from deltalight.render_server.scene.depth_views import DepthViews
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
@@ -81,14 +82,20 @@ class GeometryState:
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
     upright_points: Float64[np.ndarray, "n 3"] | None = None  # of virtual objects
-    is_open: bool = False  # one camera's view of what is solid: backs are not in it
+    fronts_of: DepthViews | None = None  # what is solid as cameras see it: backs are not in it
 
     def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
-        """Returns `corners` for voxels of that edge (m), with coarse backs if one camera saw the scene."""
-        if not self.is_open:
+        """Returns `corners` for voxels of that edge (m), with coarse backs if cameras saw the fronts alone.
+
+        What is thinner than two voxels has none where another camera sees that nothing is there.
+        """
+        if self.fronts_of is None:
             return self.corners
-        fronts = self.corners if self.coarse_corners is None else self.coarse_corners
-        return np.concatenate([self.corners, back_faces(fronts, voxel_edge)])
+        backs = back_faces(self.corners if self.coarse_corners is None else self.coarse_corners, voxel_edge)
+        if len(self.fronts_of.frames) > 1:
+            middles = backs[..., :3].mean(axis=1, dtype=np.float64)
+            backs = backs[~self.fronts_of.in_free_space(middles)]
+        return np.concatenate([self.corners, backs])
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

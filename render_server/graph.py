@@ -5,23 +5,21 @@ clocks of all that it is computed from, so the graph shows what a moving camera 
 drawn.
 """
 
-import inspect
 import time
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from typing import Any, Final, Generic, Literal, TypeVar, get_args
+from typing import Any, Generic, TypeVar
 
 from deltalight.protocol.plugins import Plugin
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Dispatch, watched
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
 from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.graph_report import CLOCKS, Clock, SourceReport, StageReport, links, summary
 from deltalight.render_server.lag import Lag
 
-Clock = Literal["scene", "lights", "world", "objects", "view"]
-CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
 T = TypeVar("T")
 Same = Callable[[Any, Any], bool]
 
@@ -66,7 +64,8 @@ class Resource(Generic[T]):
 class Stage:
     """A function of resources.
 
-    `ran`: whether the last run of the graph called it; `plugin`: whose stage it is; `lag`: what it may wait for.
+    `ran`: whether the last run of the graph called it; `plugin`: whose stage it is; `lag`: what it may wait for;
+    `view`: which of the views declared it.
     """
 
     name: str
@@ -76,6 +75,7 @@ class Stage:
     same: Same | None
     plugin: Plugin | None = None
     lag: Lag | None = None
+    view: int = 0
     seen: tuple[int, ...] | None = None
     ran: bool = False
 
@@ -83,38 +83,6 @@ class Stage:
     def clocks(self) -> frozenset[Clock]:
         """The clocks that make it run."""
         return self.outputs[0].clocks
-
-
-@dataclass(frozen=True)
-class SourceReport:
-    """One source as the frame left it. `changed`: whether it did in this frame."""
-
-    name: str
-    clock: Clock
-    size_bytes: int
-    changed: bool
-
-
-@dataclass(frozen=True)
-class StageReport:
-    """One stage as the frame left it.
-
-    `size_bytes` is the GPU memory of what it writes, as far as no other stage or source has it by itself; `time_ms`
-    what it took when it last ran. `is_value`: it only puts values together. `summary` and `file` tell what its
-    function does, and where it stands.
-    """
-
-    name: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    clocks: tuple[Clock, ...]
-    size_bytes: int
-    time_ms: float | None
-    ran: bool
-    section: str
-    is_value: bool
-    summary: str
-    file: str
 
 
 class Graph:
@@ -138,16 +106,24 @@ class Graph:
         self._polled: list[tuple[Resource[Any], Callable[[], Any], Same]] = []
         self._owned: list[Any] = []
         self._plugin: Plugin | None = None
+        self._view = 0
+        self._shared: dict[str, Any] = {}
         self._lags: list[Lag] = []
         self._lag: Lag | None = None
 
-    def source(self, name: str, clock: Clock) -> Resource[Any]:
-        """Declares a resource that is set from outside (`Resource.write`)."""
-        return self._declare((name,), None, frozenset([clock]))[0]
+    def source(self, name: str, clock: Clock, *, of_each_view: bool | None = None) -> Resource[Any]:
+        """Declares a resource that is set from outside (`Resource.write`).
+
+        `of_each_view`: every view has its own; None: if it follows the clock `view`. The others are of all views.
+        """
+        own = clock == "view" if of_each_view is None else of_each_view
+        if self._view and not own and name in self._resources:
+            return self._resources[name]
+        return self._declare((_of_view(name, self._view),), None, frozenset([clock]))[0]
 
     def polled(self, name: str, clock: Clock, ask: Callable[[], Any], same: Same) -> Resource[Any]:
         """Declares a source that is asked for before every run that needs it."""
-        resource = self.source(name, clock)
+        resource = self.source(name, clock, of_each_view=True)
         self._polled.append((resource, ask, same))
         return resource
 
@@ -171,8 +147,10 @@ class Graph:
         """Declares a stage that only puts values together: it runs no kernel and is not timed, and pictures of the
         graph show it with the stage that it serves.
         """
-        self._values.add(name)
-        return self.stage(name, function, *inputs, same=same)
+        resource = self.stage(name, function, *inputs, same=same)
+        assert resource.stage is not None
+        self._values.add(resource.stage.name)
+        return resource
 
     def section(self, name: str) -> None:
         """Begins a section of the frame, for who reads the graph: what is declared from here on belongs to it."""
@@ -186,6 +164,26 @@ class Graph:
             yield
         finally:
             self._plugin = None
+
+    @contextmanager
+    def of_view(self, number: int) -> Iterator[None]:
+        """What is declared in here is of one of several views of one world, counted from 0.
+
+        The same stage (function and inputs) as the first view's is not declared again: it runs once for all views.
+        The others are told apart by the view's number, and names mean those of the view where it has them.
+        """
+        self._view = number
+        try:
+            yield
+        finally:
+            self._view = 0
+
+    def shared(self, name: str, make: Callable[[], T]) -> T:
+        """Returns what `make` made for the first view: what stages are methods of that serve all views."""
+        if not self._view:
+            self._shared[name] = make()
+        made: T = self._shared[name]
+        return made
 
     @contextmanager
     def lagging(self, turns: int, *behind: Resource[Any]) -> Iterator[None]:
@@ -224,6 +222,10 @@ class Graph:
         outputs: tuple[str, ...],
         same: Same | None,
     ) -> tuple[Resource[Any], ...]:
+        known = self._same_stage(name, function, inputs)
+        if known is not None:
+            return known.outputs
+        name, outputs = _of_view(name, self._view), tuple(_of_view(each, self._view) for each in outputs)
         if any(stage.name == name for stage in self._stages):
             raise GraphError(f"There is a stage `{name}` already; give this one another name.")
         if not outputs:
@@ -231,13 +233,32 @@ class Graph:
         for item in inputs:
             if isinstance(item, Resource) and item is not self._resources.get(item.name):
                 raise GraphError(f"Stage `{name}` reads `{item.name}` of another graph.")
-        stage = Stage(name, function, (), (), same, self._plugin, self._lag)
+        stage = Stage(name, function, (), (), same, self._plugin, self._lag, self._view)
         stage.outputs = self._declare(outputs, stage)
         self._stages.append(stage)
         self._named[stage] = [item if isinstance(item, str) else item.name for item in inputs]
         self._order = None
         self.own(getattr(function, "__self__", None))
         return stage.outputs
+
+    def _same_stage(
+        self, name: str, function: Callable[..., Any], inputs: Sequence[Resource[Any] | str]
+    ) -> Stage | None:
+        """Returns the first view's stage that computes the same as one that another view is about to declare."""
+        if not self._view:
+            return None
+        named = [
+            self._name_in_view(item, self._view) if isinstance(item, str) else item.name for item in inputs
+        ]
+        found = (stage for stage in self._stages if stage.name == name and not stage.view)
+        return next(
+            (stage for stage in found if stage.function == function and self._named[stage] == named), None
+        )
+
+    def _name_in_view(self, name: str, view: int) -> str:
+        """Returns a resource's name, that of the view's own if it has one."""
+        own = _of_view(name, view)
+        return own if own in self._resources else name
 
     def _declare(
         self, names: tuple[str, ...], stage: Stage | None, clocks: frozenset[Clock] = frozenset()
@@ -265,6 +286,7 @@ class Graph:
         Raises:
             GraphError: there is none.
         """
+        name = self._name_in_view(name, self._view)
         if name not in self._resources:
             raise GraphError(f"There is no resource `{name}`{self._nearest(name)}.")
         return self._resources[name]
@@ -320,15 +342,14 @@ class Graph:
         if stage in order:
             return
         if stage in waiting:
-            raise GraphError(
-                f"Stages read each other in a circle: {_links(waiting[waiting.index(stage) :])}."
-            )
+            raise GraphError(f"Stages read each other in a circle: {links(waiting[waiting.index(stage) :])}.")
         for item in stage.inputs:
             if item.stage is not None:
                 self._place(item.stage, order, [*waiting, stage])
         order.append(stage)
 
     def _read(self, stage: Stage, name: str) -> Resource[Any]:
+        name = self._name_in_view(name, stage.view)
         if name not in self._resources:
             raise GraphError(
                 f"Stage `{stage.name}` reads `{name}`, which no stage writes{self._nearest(name)}."
@@ -439,7 +460,7 @@ class Graph:
                 stage.ran or stage.seen is not seen.get(stage, stage.seen),
                 self._section_of(stage),
                 stage.name in self._values,
-                _summary(stage.function),
+                summary(stage.function),
                 stage.function.__module__.removeprefix("deltalight.").replace(".", "/") + ".py",
             )
             for stage in self._sorted()
@@ -473,16 +494,6 @@ class Graph:
         self._owned.clear()
 
 
-def _links(circle: Sequence[Stage]) -> str:
-    """What each stage of a circle reads of the next."""
-    links = []
-    for stage, writer in zip(circle, [*circle[1:], circle[0]], strict=True):
-        item = next(item for item in stage.inputs if item.stage is writer)
-        links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
-    return ", ".join(links)
-
-
-def _summary(function: Callable[..., Any]) -> str:
-    """First sentence of a function's documentation, without its full stop."""
-    text = " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
-    return text.split(". ")[0].rstrip(".")
+def _of_view(name: str, view: int) -> str:
+    """Returns the name of a stage or resource of a view; that of the first is plain."""
+    return f"{name} (view {view + 1})" if view else name

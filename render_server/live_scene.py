@@ -16,7 +16,13 @@ from deltalight.protocol.scene_output import Output
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
 from deltalight.render_server.estimation.lighting import LightEstimator
 from deltalight.render_server.frame_budget import FrameBudget, Level
-from deltalight.render_server.frame_graph import CompositeOptions, FrameGraph, FrameInputs, ShownBuffers
+from deltalight.render_server.frame_graph import (
+    CompositeOptions,
+    FrameGraph,
+    FrameInputs,
+    ShownBuffers,
+    frame_graphs,
+)
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
@@ -125,10 +131,10 @@ class LiveScene:
         self._real: RealGeometry | None = None
         self._surfaces: SurfaceTable | None = None
         self._albedo = AlbedoEstimator(gpu)
-        self.graph: FrameGraph | None = None
-        self._best: FrameGraph | None = None
-        self._spare: FrameGraph | None = None  # of the picture size before, which a budget may choose again
-        self._refused: tuple[tuple[MethodChoice, tuple[int, int]], str] | None = None
+        self._graphs: list[FrameGraph] = []  # of each camera
+        self._best: list[FrameGraph] = []
+        self._spare: list[FrameGraph] = []  # of the picture size before, which a budget may choose again
+        self._refused: tuple[tuple[MethodChoice, list[tuple[int, int]]], str] | None = None
         self._enlarge: Enlarge | None = None
         self._crossfade: Crossfade | None = None
         self._refined_ns: int | None = None  # the refined picture has shown since
@@ -139,7 +145,7 @@ class LiveScene:
         self._precomputed = Precomputed(self._notify, waits=waits)
         self._waits = waits
         self._unobserved = False  # the real scene moved while its lights were provisional
-        self._accumulated: ViewFrame | None = None  # last frame already accumulated
+        self._accumulated: tuple[ViewFrame, ...] = ()  # last frames already accumulated
         self._budget = self._new_budget(scene)
         self._plan = self._planned(scene)
         self._waits = True  # from now on, what is shown already would change twice
@@ -199,17 +205,17 @@ class LiveScene:
                 self._real.release()
             self._real = real
             self._albedo.reset(plan.scene.real.unseen_albedo)
-            self._surfaces = self._accumulated = None
+            self._surfaces, self._accumulated = None, ()
         if plan.method != old.method:
             self._drop_graph()
         if plan.scene.lights != old.scene.lights:
             self.lighting = plan.lighting
-            self._accumulated = None
+            self._accumulated = ()
         self._plan = plan
 
     def _drop_graph(self) -> None:
-        release_all(self.graph, self._best, self._spare)
-        self.graph = self._best = self._spare = None
+        release_all(*self._graphs[:1], *self._best[:1], *self._spare[:1])
+        self._graphs, self._best, self._spare = [], [], []
 
     def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""
@@ -222,6 +228,11 @@ class LiveScene:
         self._apply(plan)
 
     @property
+    def graph(self) -> FrameGraph | None:
+        """The first camera's graph of the newest frame; None before the first."""
+        return self._graphs[0] if self._graphs else None
+
+    @property
     def model(self) -> Sequence[TriangleMesh]:
         """The real scene's meshes, if a model is given."""
         return () if self._real is None else self._real.model
@@ -232,60 +243,78 @@ class LiveScene:
         state = None if self._real is None else self._real.state
         return None if state is None else state.corners[..., :3]
 
-    def relight(self, frame: ViewFrame, view: CameraView, *, whole: bool = False) -> RelitFrame | None:
-        """Prepares a frame for composition; returns None if no object is visible or there is no light yet.
+    def relight(self, taken: Sequence[PosedFrame], *, whole: bool = False) -> list[RelitFrame]:
+        """Prepares a frame of each camera in the room for composition; returns none if there is nothing to compose.
 
-        `whole`: at the camera's size, whatever the budget.
+        That is: no object is visible, or there is no light yet. `whole`: at the camera's size, whatever the budget.
+        Boards on objects, and the lights, are those of the first camera.
 
-        Relighting the same frame again, in another view or by another method, adds nothing to averages over
+        Relighting the same frames again, in another view or by another method, adds nothing to averages over
         frames.
         """
         if self._plan.method.document.quality != self._budget.level.quality:
             self._apply(self._planned(self._plan.scene))
-        again, self._accumulated = frame is self._accumulated, None
-        lit = again or self.lighting.update(frame)
-        objects = self._objects.update(self._plan.scene.objects, frame.board, frame.timestamp_ns)
+        frames, first = tuple(each.frame for each in taken), taken[0].frame
+        again, self._accumulated = _same_objects(frames, self._accumulated), ()
+        lit = again or self.lighting.update(first)
+        objects = self._objects.update(self._plan.scene.objects, first.board, first.timestamp_ns)
         if objects is None or self._real is None or not lit:
-            return None
-        taken, level = PosedFrame(frame, view), self._level(whole=whole)
-        size = _scaled(view.size, level.scale)
-        graph = self._graph_for(taken.at(size).view)
+            return []
+        level = self._level(whole=whole)
+        sized = [each.at(_scaled(each.view.size, level.scale)) for each in taken]
+        self._fit_graphs([each.view for each in sized])
         with self.timers.measure("upload"):
-            graph.upload(taken.at(size).frame)
+            for graph, each in zip(self._graphs, sized, strict=True):
+                graph.upload(each.frame)
         moved = not again and self._real.update(taken)
         if self._real.state is None:
             self._notify(
                 "Depth showed no surface in some frames; they are passed through as the camera saw them."
             )
-            return None
-        assert self.lighting.lights is not None
-        surfaces = self._surface_table(frame, moved=moved)
-        inputs = self._inputs(self._real, taken, size, objects, surfaces)
-        graph.set_inputs(inputs)
-        changed = self._note_change(objects, frame, moved=moved)
+            return []
+        surfaces = self._surface_table(first, moved=moved)
+        self._set_inputs(self._graphs, self._real, sized, objects, surfaces)
+        changed = self._note_change(objects, first, moved=moved)
+        self._estimate_lights(self._real, first, moved=moved)
+        self._accumulated = frames
+        changed |= self._note_change(objects, first, moved=False)
+        relit = self._relit(taken, level, changed=changed)
+        best: list[FrameGraph] = []
+        if self._is_at_rest(first):
+            best = self._refined(self._real, taken, objects, surfaces)
+        if not best:
+            self._refined_ns = None
+            return relit
+        pairs = zip(relit, best, strict=True)
+        return [self._fading(each, graph, is_whole=whole or again) for each, graph in pairs]
+
+    def _relit(self, taken: Sequence[PosedFrame], level: Level, *, changed: bool) -> list[RelitFrame]:
+        options = self._options(self._plan.scene.output)
+        return [
+            RelitFrame(
+                each.frame,
+                graph,
+                options,
+                level,
+                changed,
+                self._enlarged_to(each.view.size, level.scale),
+            )
+            for graph, each in zip(self._graphs, taken, strict=True)
+        ]
+
+    def _estimate_lights(self, real: RealGeometry, frame: ViewFrame, *, moved: bool) -> None:
+        """Estimates light, and the albedo of what may go out of sight, by the first camera's graph."""
+        graph = self._graphs[0]
         graph.set_lights(self.lighting.estimate(graph, moved=moved, is_at_rest=self._is_at_rest(frame)))
         self._unobserved |= moved
         is_due = self._unobserved and not self.lighting.is_provisional
         self._unobserved &= not is_due
-        if is_due and self._real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
-            graph.renew_albedo()
+        assert self.lighting.lights is not None
+        if is_due and real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
             graph.set_lights(self.lighting.lights)
-            if self._best is not None:
-                self._best.renew_albedo()
-            if self._spare is not None:
-                self._spare.renew_albedo()
-        self._accumulated = frame
-        changed |= self._note_change(objects, frame, moved=False)
-        options = self._options(self._plan.scene.output)
-        enlarge = None if size == view.size else self._enlarged_to(view.size)
-        relit = RelitFrame(frame, graph, options, level, changed, enlarge)
-        best = None
-        if self._is_at_rest(frame):
-            best = self._refined(self._inputs(self._real, taken, view.size, objects, surfaces))
-        if best is None:
-            self._refined_ns = None
-            return relit
-        return self._fading(relit, best, is_whole=whole or again)
+            for graphs in (self._graphs, self._best, self._spare):
+                if graphs:
+                    graphs[0].renew_albedo()
 
     def _note_change(self, objects: GeometryState, frame: ViewFrame, *, moved: bool) -> bool:
         """Returns whether anything differs from what the newest picture was made from, and notes when it did."""
@@ -305,42 +334,51 @@ class LiveScene:
         whole = whole or self._plan.scene.output.view != "composite"
         return replace(level, scale=1.0) if whole else level
 
-    def _inputs(
+    def _set_inputs(
         self,
+        graphs: Sequence[FrameGraph],
         real: RealGeometry,
-        taken: PosedFrame,
-        size: tuple[int, int],
+        taken: Sequence[PosedFrame],
         objects: GeometryState,
         surfaces: SurfaceTable,
-    ) -> FrameInputs:
-        """Returns what a graph of this picture size renders the frame from."""
-        assert real.seen is not None
+    ) -> None:
+        """Sets what graphs of these frames' sizes render them from."""
         assert real.state is not None
         assert self.lighting.lights is not None
-        view = real.seen.at(
-            size
-        ).view  # while nothing moves, the pose's own jitter must not shake the picture
-        return FrameInputs(
-            taken.at(size).frame,
-            view.with_antialiasing if self._plan.scene.output.antialiasing else view,
-            real.scan(size),
-            real.measurement(size),
-            real.state,
-            objects,
-            surfaces,
-            self.lighting.lights,
-            self._albedo.texture,
-        )
+        for graph, camera, each in zip(graphs, real.cameras, taken, strict=True):
+            size = each.view.size
+            # While nothing moves, the pose's own jitter must not shake the picture.
+            view = camera.seen.at(size).view
+            graph.set_inputs(
+                FrameInputs(
+                    each.frame,
+                    view.with_antialiasing if self._plan.scene.output.antialiasing else view,
+                    camera.scan(size),
+                    camera.measurement(size),
+                    real.state,
+                    objects,
+                    surfaces,
+                    self.lighting.lights,
+                    self._albedo.texture,
+                )
+            )
 
-    def _refined(self, inputs: FrameInputs) -> FrameGraph | None:
-        """Works on the frame in the best quality for REFINE_S; returns its graph once it is ready."""
-        best = self._plan.method.in_best_quality(software=self._gpu.is_software)
-        before, self._best = self._best, None
-        self._best = self._fitting(before, inputs.view, best)
-        self._best.upload(inputs.frame)
-        self._best.set_inputs(inputs)
-        options = self._options(self._plan.scene.output)
-        return self._best if self._best.advance(options, time.monotonic() + REFINE_S) else None
+    def _refined(
+        self,
+        real: RealGeometry,
+        taken: Sequence[PosedFrame],
+        objects: GeometryState,
+        surfaces: SurfaceTable,
+    ) -> list[FrameGraph]:
+        """Works on the frames in the best quality for REFINE_S; returns their graphs once all are ready."""
+        method = self._plan.method.in_best_quality(software=self._gpu.is_software)
+        before, self._best = self._best, []
+        self._best = self._fitting(before, [each.view for each in taken], method)
+        for graph, each in zip(self._best, taken, strict=True):
+            graph.upload(each.frame)
+        self._set_inputs(self._best, real, taken, objects, surfaces)
+        options, until_s = self._options(self._plan.scene.output), time.monotonic() + REFINE_S
+        return self._best if all(graph.advance(options, until_s) for graph in self._best) else []
 
     def _fading(self, before: RelitFrame, best: FrameGraph, *, is_whole: bool) -> RelitFrame:
         """Returns the refined frame, which takes the place of the one before within FADE_NS unless `is_whole`."""
@@ -356,7 +394,10 @@ class LiveScene:
             self._crossfade = Crossfade(self._gpu, size)
         return replace(refined, level=before.level, fade=Fade(before, share, self._crossfade))
 
-    def _enlarged_to(self, size: tuple[int, int]) -> Enlarge:
+    def _enlarged_to(self, size: tuple[int, int], scale: float) -> Enlarge | None:
+        """Returns what brings pictures of that scale to the size; None if they have it."""
+        if _scaled(size, scale) == size:
+            return None
         if self._enlarge is None or self._enlarge.size != size:
             release_all(self._enlarge)
             self._enlarge = Enlarge(self._gpu, size)
@@ -379,31 +420,32 @@ class LiveScene:
                 self._surfaces = found
         return self._surfaces
 
-    def _graph_for(self, view: CameraView) -> FrameGraph:
-        """Returns the graph for this picture size; a new one if lens or size changed.
+    def _fit_graphs(self, views: Sequence[CameraView]) -> None:
+        """Provides the graphs for these pictures' sizes; new ones if lens or size changed.
 
-        In software the one before is kept: a GPU builds what it holds in no time, and its memory is scarcer.
+        In software those before are kept: a GPU builds what it holds in no time, and its memory is scarcer.
         """
-        if self._gpu.is_software and self.graph is not None and not self.graph.fits(view):
-            self.graph, self._spare = self._spare, self.graph
-        before, self.graph = self.graph, None
-        self.graph = self._fitting(before, view, self._plan.method)
-        return self.graph
+        if self._gpu.is_software and self._graphs and not _fit(self._graphs, views):
+            self._graphs, self._spare = self._spare, self._graphs
+        before, self._graphs = self._graphs, []
+        self._graphs = self._fitting(before, views, self._plan.method)
 
-    def _fitting(self, graph: FrameGraph | None, view: CameraView, method: MethodChoice) -> FrameGraph:
-        """Returns this graph if it fits, else a new one in its place.
+    def _fitting(
+        self, graphs: list[FrameGraph], views: Sequence[CameraView], method: MethodChoice
+    ) -> list[FrameGraph]:
+        """Returns these graphs if they fit, else new ones in their place.
 
         Raises:
             DeltalightError: something is larger than this GPU allows; it is not tried again for every frame.
         """
-        if graph is not None and graph.fits(view):
-            return graph
-        release_all(graph)
-        wanted = method, view.size
+        if _fit(graphs, views):
+            return graphs
+        release_all(*graphs[:1])
+        wanted = method, [view.size for view in views]
         if self._refused is not None and self._refused[0] == wanted:
             raise DeltalightError(self._refused[1])
         try:
-            return FrameGraph(self._gpu, view, method, self._precomputed, self.timers, checks=self._checks)
+            return frame_graphs(self._gpu, views, method, self._precomputed, self.timers, checks=self._checks)
         except DeltalightError as refusal:
             self._refused = wanted, str(refusal)
             raise
@@ -417,9 +459,9 @@ class LiveScene:
         release_all(
             self._objects,
             self._real,
-            self.graph,
-            self._best,
-            self._spare,
+            *self._graphs[:1],
+            *self._best[:1],
+            *self._spare[:1],
             self._enlarge,
             self._crossfade,
             self._albedo,
@@ -430,6 +472,13 @@ class LiveScene:
 def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
     """Returns a picture size at that scale."""
     return max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
+
+
+def _fit(graphs: Sequence[FrameGraph], views: Sequence[CameraView]) -> bool:
+    """Returns whether there is a graph for each view's pictures."""
+    return len(graphs) == len(views) and all(
+        graph.fits(view) for graph, view in zip(graphs, views, strict=True)
+    )
 
 
 def _same_objects(some: Sequence[object], others: Sequence[object]) -> bool:

@@ -6,7 +6,8 @@ No sockets, no files except the scene's assets.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,6 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView, View
 from deltalight.render_server.frame_budget import Level
-from deltalight.render_server.frame_graph import ShownBuffers
 from deltalight.render_server.gpu.context import GpuContext, GpuMemoryError
 from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
@@ -26,10 +26,11 @@ from deltalight.render_server.live_scene import LiveScene, RelitFrame
 from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
 from deltalight.render_server.post_effects.bloom import bloomed
-from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts, FrameArtifacts
+from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
 from deltalight.render_server.room_mesh import RoomMesh, room_mesh
 from deltalight.render_server.scene.depth_mesh import depth_mesh
-from deltalight.render_server.view import CameraView, output_size, resized_frame
+from deltalight.render_server.started_frame import CameraState, FrameSource, PassTimes, StartedView
+from deltalight.render_server.view import CameraView, PosedFrame, output_size, resized_frame
 
 MEMORY_RETRY_S = 10.0  # after which a scene is built anew that the GPU had no memory for
 
@@ -119,10 +120,7 @@ class SceneRenderer:
         self._live = self._build(scene, waits=waits)
         self._full: tuple[GpuMemoryError, float] | None = None  # and when to try again
         self._readback = AsyncReadback(gpu)
-        self._sized: tuple[ViewFrame, ViewFrame] | None = None
-        self._shown: ShownFrame | None = None
-        self._relit: RelitFrame | None = None
-        self._artifacts = CameraArtifacts()
+        self._cameras: list[CameraState] = [CameraState()]
         self.scene = scene
 
     def _build(self, scene: SceneDocument, *, waits: bool) -> LiveScene:
@@ -142,13 +140,16 @@ class SceneRenderer:
 
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
-        self._shown = self._sized = None
-        self._artifacts.forget()
+        self._cameras = [CameraState()]
         self._live.forget_frames()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
         """Renders one frame; without a pose or visible object, returns the camera's picture byte for byte."""
         return self.submit(frame, with_linear=with_linear).finish()
+
+    def render_views(self, frames: Sequence[ViewFrame], *, with_linear: bool = False) -> list[CompositeFrame]:
+        """Renders a frame of each of several cameras in one room, taken at one moment (`submit_views`)."""
+        return [each.finish() for each in self.submit_views(frames, with_linear=with_linear)]
 
     def submit(
         self,
@@ -167,32 +168,68 @@ class SceneRenderer:
             DeltalightError: the frame or the scene cannot be rendered, or the GPU's memory is full.
             GpuResetError: the GPU was reset; this process renders nothing any more. `finish` raises the same.
         """
+        return self.submit_views([frame], with_linear=with_linear, whole=whole, others=others)[0]
+
+    def submit_views(
+        self,
+        frames: Sequence[ViewFrame],
+        *,
+        with_linear: bool = False,
+        whole: bool = False,
+        others: Sequence[ShownView] = (),
+    ) -> list[PendingComposite]:
+        """Starts a frame of each camera in one room, taken at one moment; otherwise as `submit`.
+
+        The cameras share one real scene and its light, so what one of them sees lights what the others show. Give
+        them in the same order each time: each is compared with its own earlier frames. Where a camera has lost its
+        pose, its picture stays as it is, and the room holds what it saw before. The first camera counts for
+        animations, boards on objects, and estimates of light. Times are those of all pictures together.
+        """
+        if not frames:
+            raise DeltalightError("No frames were given; give one of each camera.")
         self._find_faults()
         started_s = time.perf_counter()
         with_linear = with_linear or self._with_linear
-        source = self._source(self.sized(frame), whole=whole or with_linear or self.scene.output.has_bloom)
-        main = self._start(source, self.scene.output.view, with_linear=with_linear)
-        rest = [self._start_other(source, view) for view in others]
-        cameras = next((each.seen for each in (main, *rest) if each.seen is not None), None)
-        self._shown = ShownFrame(source.frame, cameras, source.buffers, self._live.model)
-        times = self._end_frame(source)
+        if len(frames) != len(self._cameras):
+            self._cameras = [CameraState() for _ in frames]
+        sized = [self._resized(camera, frame) for camera, frame in zip(self._cameras, frames, strict=True)]
+        sources = self._sources(sized, whole=whole or with_linear or self.scene.output.has_bloom)
+        started = [self._start_all(source, others, with_linear=with_linear) for source in sources]
+        times = self._end_frame(sources)
         submitted_ms = 1e3 * (time.perf_counter() - started_s)
 
-        def finish() -> CompositeFrame:
-            if main.composed is not None:
+        def finish(source: FrameSource, views: Sequence[StartedView], *, accounts: bool) -> CompositeFrame:
+            main, *rest = views
+            if accounts and main.composed is not None:
                 self._live.account(main.composed, max(submitted_ms, sum(times.ran.values())))
             done = self._finished(source, main, rest, times, with_linear=with_linear)
             self._find_faults()
             return done
 
-        is_immediate = all(each.composed is None for each in (main, *rest))
-        return PendingComposite(finish, is_immediate or self._gpu.is_software)
+        is_immediate = all(each.composed is None for views in started for each in views)
+        return [
+            PendingComposite(
+                partial(finish, source, views, accounts=source is sources[0]),
+                is_immediate or self._gpu.is_software,
+            )
+            for source, views in zip(sources, started, strict=True)
+        ]
 
-    def _end_frame(self, source: "_Source") -> "_PassTimes":
-        if source.relit is None or self.graph is None:
-            return _PassTimes({}, {})
+    def _start_all(
+        self, source: FrameSource, others: Sequence[ShownView], *, with_linear: bool
+    ) -> list[StartedView]:
+        """Starts a frame in the document's view and the others, and notes what it shows."""
+        main = self._start(source, self.scene.output.view, with_linear=with_linear)
+        views = [main, *(self._start_other(source, view) for view in others)]
+        cameras = next((each.seen for each in views if each.seen is not None), None)
+        source.camera.shown = ShownFrame(source.frame, cameras, source.buffers, self._live.model)
+        return views
+
+    def _end_frame(self, sources: Sequence[FrameSource]) -> PassTimes:
+        if self.graph is None or all(source.relit is None for source in sources):
+            return PassTimes({}, {})
         ran = dict(self._live.timers.end_frame())
-        return _PassTimes(ran, self.graph.reused_times_ms(ran))
+        return PassTimes(ran, self.graph.reused_times_ms(ran))
 
     def _find_faults(self) -> None:
         """Finds faults of the device since the last call; builds the scene anew where its memory was full.
@@ -206,7 +243,8 @@ class SceneRenderer:
             self._gpu.check()
         except GpuMemoryError as fault:
             self._full = fault, time.monotonic() + MEMORY_RETRY_S
-            self._shown = self._relit = None
+            for camera in self._cameras:
+                camera.shown = camera.relit = None
         if self._full is not None:
             self._rebuild(*self._full)
         if sum(self._gpu.errors.values()) > known:
@@ -223,16 +261,26 @@ class SceneRenderer:
         self._live = self._build(self.scene, waits=False)
         self._full = None
 
-    def _source(self, frame: ViewFrame, *, whole: bool) -> "_Source":
-        """Relights a frame; without a pose there is nothing but the camera's picture."""
-        self._shown = self._relit = None
-        if frame.pose is None:
-            return _Source(frame, None, None, None, [])
-        view = CameraView(frame.camera, frame.pose.world_from_camera)
-        relit = self._relit = self._live.relight(frame, view, whole=whole)
-        buffers = None if relit is None else relit.shown()
-        seen = view if buffers is None else buffers.view
-        return _Source(frame, relit, buffers, seen, self._live.describe_lights())
+    def _sources(self, frames: Sequence[ViewFrame], *, whole: bool) -> list[FrameSource]:
+        """Relights the frames together; without a pose there is nothing but a camera's picture."""
+        for camera, frame in zip(self._cameras, frames, strict=True):
+            camera.shown = camera.relit = None
+            if frame.pose is not None:
+                camera.posed = PosedFrame(frame, CameraView(frame.camera, frame.pose.world_from_camera))
+        known = [camera for camera in self._cameras if camera.posed is not None]
+        if any(frame.pose is not None for frame in frames):
+            relit = self._live.relight([each.posed for each in known if each.posed is not None], whole=whole)
+            for camera, found in zip(known, relit, strict=False):
+                camera.relit = found
+        return [self._source(camera, frame) for camera, frame in zip(self._cameras, frames, strict=True)]
+
+    def _source(self, camera: CameraState, frame: ViewFrame) -> FrameSource:
+        if frame.pose is None or camera.posed is None:
+            camera.relit = None
+            return FrameSource(camera, frame, None, None, None, [])
+        buffers = None if camera.relit is None else camera.relit.shown()
+        seen = camera.posed.view if buffers is None else buffers.view
+        return FrameSource(camera, frame, camera.relit, buffers, seen, self._live.describe_lights())
 
     @property
     def graph(self) -> Graph | None:
@@ -241,25 +289,31 @@ class SceneRenderer:
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size; the same object for the same frame."""
+        holder = next((each for each in self._cameras if each.holds(frame)), self._cameras[0])
+        return self._resized(holder, frame)
+
+    def _resized(self, camera: CameraState, frame: ViewFrame) -> ViewFrame:
+        """Returns a camera's frame at the composite's size; the same object for the same frame."""
         size = output_size(frame, self.scene.output)
         if size == (frame.camera.width, frame.camera.height):
             return frame
-        if self._sized is not None and self._sized[0] is frame:
-            camera = self._sized[1].camera
-            if (camera.width, camera.height) == size:
-                return self._sized[1]
-        self._sized = frame, resized_frame(frame, *size)
-        return self._sized[1]
+        if camera.sized is not None and camera.holds(frame):
+            known = camera.sized[1].camera
+            if (known.width, known.height) == size:
+                return camera.sized[1]
+        camera.sized = frame, resized_frame(frame, *size)
+        return camera.sized[1]
 
     def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
-        """Picks what the newest picture shows at a pixel, looking through the object `ignore`.
+        """Picks what the newest picture (the first camera's) shows at a pixel, looking through the object `ignore`.
 
         Raises:
             DeltalightError: there is no picture yet, it has no pose, or the pixel lies outside.
         """
-        if self._shown is None:
+        shown = self._cameras[0].shown
+        if shown is None:
             raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
-        return self._shown.pick(x, y, ignore)
+        return shown.pick(x, y, ignore)
 
     def room(self) -> RoomMesh:
         """Returns the real scene as last built, else of the newest frame's depth, with the newest picture on it.
@@ -267,7 +321,7 @@ class SceneRenderer:
         Raises:
             DeltalightError: there is no picture of a known pose, or no surface in it.
         """
-        shown = self._shown
+        shown = self._cameras[0].shown
         if shown is None or shown.frame.pose is None:
             raise DeltalightError("The camera's place is not known yet; ask again when the board is in view.")
         view = CameraView(shown.frame.camera, shown.frame.pose.world_from_camera)
@@ -279,58 +333,60 @@ class SceneRenderer:
             raise DeltalightError("No surface of the room is known yet; ask again when depth shows some.")
         return room_mesh(corners, shown.frame, view)
 
-    def layers(self) -> PictureLayers:
-        """Reads back the layers of the newest picture, which is the camera's and at full size.
+    def layers(self, number: int = 0) -> PictureLayers:
+        """Reads back the layers of a camera's newest picture, which is the camera's and at full size.
 
         Raises:
             DeltalightError: nothing was rendered yet.
         """
-        if self._shown is None:
+        camera = self._cameras[number]
+        if camera.shown is None:
             raise DeltalightError("Nothing was rendered yet; render a frame first.")
-        frame = self._shown.frame
-        if self._relit is None:
+        frame = camera.shown.frame
+        if camera.relit is None:
             nothing = np.zeros(frame.color.shape, np.float32)
             depth_m = nothing[..., 0] if frame.depth is None else frame.depth.depth_m * frame.depth.valid
             return PictureLayers(nothing[..., 0], nothing, depth_m.astype(np.float32))
-        shown = self._relit.shown()
+        shown = camera.relit.shown()
         coverage = read_texture(shown.object_coverage)[..., 0]
-        radiance = np.where(coverage[..., None] > 0, self._relit.radiance(), 0)
+        radiance = np.where(coverage[..., None] > 0, camera.relit.radiance(), 0)
         column, row = raster_texels(shown.view)
         of_objects = read_texture(shown.object_buffer.position)[row, column, 3]
         real = read_texture(shown.real_surface.position)[..., 3]
         depth_m = np.where(coverage >= SHOWN_FRACTION, of_objects, np.maximum(real, 0))
         return PictureLayers(*(values.astype(np.float32) for values in (coverage, radiance, depth_m)))
 
-    def _start(self, source: "_Source", view: View, *, with_linear: bool) -> "_StartedView":
+    def _start(self, source: FrameSource, view: View, *, with_linear: bool) -> StartedView:
         """Starts the picture of the document's own view, and its linear radiance if `with_linear`."""
         relit = source.relit
         if relit is None or (view == "lights" and source.is_lit):
             return self._start_other(source, view)
         composite = relit.compose(with_linear=with_linear or self.scene.output.has_bloom)
         with self._live.timers.measure("readback"):
-            take = self._begin_reading(source.frame, relit, view, composite)
+            take = self._begin_reading(source, relit, view, composite)
             if isinstance(composite, Composite) and with_linear:
                 self._readback.push(composite.linear, "f2")
-        return _StartedView(view, source.seen_in(view), take, relit)
+        return StartedView(view, source.seen_in(view), take, relit)
 
-    def _start_other(self, source: "_Source", view: ShownView) -> "_StartedView":
+    def _start_other(self, source: FrameSource, view: ShownView) -> StartedView:
         """Starts the frame in a view that was asked for beside the document's own."""
         frame, relit, seen = source.frame, source.relit, source.seen_in(view)
         if view == "lights" and source.is_lit:
             lights = self._live.lighting.picture(frame)
-            return _StartedView(view, seen, lambda: lights, None)
+            return StartedView(view, seen, lambda: lights, None)
         if view == "camera" or relit is None:
-            return _StartedView(view, seen, lambda: frame.color, None)
+            return StartedView(view, seen, lambda: frame.color, None)
         composite = relit.compose_view(view)
         with self._live.timers.measure("readback"):
-            take = self._begin_reading(frame, relit, view, composite)
-        return _StartedView(view, seen, take, relit)
+            take = self._begin_reading(source, relit, view, composite)
+        return StartedView(view, seen, take, relit)
 
     def _begin_reading(
-        self, frame: ViewFrame, relit: RelitFrame, view: ShownView, composite: Picture
+        self, source: FrameSource, relit: RelitFrame, view: ShownView, composite: Picture
     ) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
         """Begins to read a picture, and what the camera's artifacts on it need; returns what takes both."""
-        artifacts, output = self._artifacts_of(frame, relit, view), self.scene.output
+        frame, output = source.frame, self.scene.output
+        artifacts = self._artifacts_of(source, relit, view)
         self._readback.push(composite.code, "u1")
         linear = None
         if output.has_bloom and view == "composite" and isinstance(composite, Composite):
@@ -353,10 +409,10 @@ class SceneRenderer:
 
     def _finished(
         self,
-        source: "_Source",
-        main: "_StartedView",
-        rest: Sequence["_StartedView"],
-        times: "_PassTimes",
+        source: FrameSource,
+        main: StartedView,
+        rest: Sequence[StartedView],
+        times: PassTimes,
         *,
         with_linear: bool,
     ) -> CompositeFrame:
@@ -385,62 +441,18 @@ class SceneRenderer:
         size = frame.camera.width, frame.camera.height
         return np.asarray(color if color.shape[1::-1] == size else cv2.resize(color, size))
 
-    def _artifacts_of(self, frame: ViewFrame, relit: RelitFrame, view: ShownView) -> FrameArtifacts | None:
+    def _artifacts_of(self, source: FrameSource, relit: RelitFrame, view: ShownView) -> FrameArtifacts | None:
         """Learns from the camera's frame; returns what it puts on the objects if the scene asks for that."""
-        output = self.scene.output
+        frame, output = source.frame, self.scene.output
         if not output.camera_artifacts or view != "composite" or output.tone != "camera":
             return None
         shown = relit.shown()
         if shown.object_coverage.size != frame.color.shape[1::-1]:
             return None
         low, high = shown.objects.bounds
-        return self._artifacts.observe(frame, shown.view.world_from_camera, (low + high) / 2)
+        return source.camera.artifacts.observe(frame, shown.view.world_from_camera, (low + high) / 2)
 
     def release(self) -> None:
         """Frees all GL objects."""
         self._live.release()
         self._readback.release()
-
-
-class _PassTimes(NamedTuple):
-    """Milliseconds by pass: of those that the frame ran, and of the others when they last ran."""
-
-    ran: dict[str, float]
-    reused: dict[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """What all views of a frame are made from; `lights` are plain values."""
-
-    frame: ViewFrame
-    relit: RelitFrame | None
-    buffers: ShownBuffers | None
-    seen: CameraView | None
-    lights: list[dict[str, Any]]
-
-    @property
-    def is_lit(self) -> bool:
-        """Whether there are lights to show."""
-        return bool(self.lights)
-
-    def seen_in(self, view: ShownView) -> CameraView | None:
-        """Returns the camera's view; None if the picture is not the camera's, or there is no pose."""
-        if view == "lights" and self.is_lit:
-            return self.seen if self.frame.radiance_map is None else None
-        return None if view == "rsm" and self.relit is not None else self.seen
-
-
-@dataclass(frozen=True, eq=False)
-class _StartedView:
-    """A picture of one view; `take` returns it, and waits for the GPU if it was `composed` there."""
-
-    view: ShownView
-    seen: CameraView | None
-    take: Callable[[], UInt8[np.ndarray, "h w 3"]]
-    composed: RelitFrame | None
-
-    @property
-    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
-        """The pose that the picture was made with; None if there is none, or it is not the camera's."""
-        return None if self.seen is None else self.seen.world_from_camera

@@ -14,7 +14,7 @@ from deltalight.protocol.frames import BoardPose, ViewFrame
 from deltalight.protocol.method_names import with_method
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext, create_context
-from deltalight.render_server.graph import SourceReport, StageReport
+from deltalight.render_server.graph_report import SourceReport, StageReport
 from deltalight.render_server.renderer import SceneRenderer
 
 SIZE = (320, 240)

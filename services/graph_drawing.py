@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 from xml.etree import ElementTree
 
-from deltalight.render_server.graph import CLOCKS, Clock, SourceReport, StageReport
+from deltalight.render_server.graph_report import CLOCKS, Clock, SourceReport, StageReport
 from deltalight.services.graph_layout import Arrow, Box, Layout, lay_out
 from deltalight.services.svg import (
     BOLD_LETTER,

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from deltalight.render_server.graph import StageReport
+from deltalight.render_server.graph_report import StageReport
 
 LEAST_COLUMNS = 7  # that sections may share a band for
 

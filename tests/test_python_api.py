@@ -147,6 +147,20 @@ def test_scenes_change_while_a_renderer_lives_and_renderers_live_beside_each_oth
     assert again.color.astype(int) == pytest.approx(before.color.astype(int), abs=2)
 
 
+def test_cameras_in_one_room_are_relit_together(take: dl.Take, scene: dl.Scene) -> None:
+    """The second camera here is the first, a moment later: both pictures are those of one camera, but for noise."""
+    with dl.Renderer() as renderer:
+        first, second = renderer.render_views([take[0], take[15]], scene)
+        renderer.forget()
+        alone = renderer.render(take[0], scene)
+    assert first.composite.frame_id == take[0].frame_id
+    assert second.composite.frame_id == take[15].frame_id
+    assert first.coverage == pytest.approx(alone.coverage)
+    differs = np.abs(first.color.astype(int) - alone.color) > 4
+    assert differs.mean() < 1e-3
+    assert second.depth[second.coverage == 1] == pytest.approx(first.depth[second.coverage == 1], abs=0.02)
+
+
 def test_objects_are_named_changed_and_saved(scene: dl.Scene, cube: Path, tmp_path: Path) -> None:
     assert [scene.add(cube), scene.add(cube), scene.add(cube, name="mine", scale=2)] == [
         "cube",

@@ -8,7 +8,8 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.gpu.textures import gpu_objects, release_all, sizes_bytes
 from deltalight.render_server.gpu.timers import PassTimers
-from deltalight.render_server.graph import Graph, StageReport
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.graph_report import StageReport
 
 SHADERS = Path(__file__).parent / "shaders"
 RUNS = 5  # the fastest counts: whatever disturbs a run makes it slower

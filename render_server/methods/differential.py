@@ -6,6 +6,7 @@ and the reference for `dvct`.
 """
 
 from copy import copy
+from dataclasses import dataclass
 from operator import eq
 
 import moderngl
@@ -156,17 +157,10 @@ def solution_stages(
 
 
 class SolutionLights:
-    """The lights' maps and direct light, of the real scene alone (mu) and with the objects (rho)."""
+    """The lights' maps of the real scene alone (mu) and with the objects (rho)."""
 
-    def __init__(
-        self,
-        gpu: GpuContext,
-        settings: DifferentialMethod,
-        resolved: ResolvedSettings,
-        size: tuple[int, int],
-    ) -> None:
+    def __init__(self, gpu: GpuContext, settings: DifferentialMethod, resolved: ResolvedSettings) -> None:
         self.mu, self.rho = (LightBuffers(gpu, resolved.rsm_size, settings.shadow_samples) for _ in range(2))
-        self.direct = DirectLightPair(gpu, size)
         self._maps = ShadowMaps(gpu)
 
     def set_environment(self, lights: LightSet) -> tuple[moderngl.TextureArray, ...]:
@@ -198,17 +192,25 @@ class SolutionLights:
         self._maps.run(buffers.real_atlas, meshes, buffers.real_views)
         return buffers
 
-    def light_directly(
-        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap | None
-    ) -> DirectLightPair:
-        """Lights the real surfaces under each solution's own maps."""
-        self.direct.run_both(self.mu, self.rho, grid, scene)
-        return self.direct
-
     def release(self) -> None:
         """Frees the GL objects."""
         for item in (self.mu, self.rho, self._maps):
             item.release()
+
+
+@dataclass(frozen=True, eq=False)
+class SolutionDirectLight:
+    """Direct light at one camera's pixels in both solutions."""
+
+    lights: SolutionLights
+    pair: DirectLightPair
+
+    def light_directly(
+        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap | None
+    ) -> DirectLightPair:
+        """Lights the real surfaces under each solution's own maps."""
+        self.pair.run_both(self.lights.mu, self.lights.rho, grid, scene)
+        return self.pair
 
 
 class SolutionCones:
@@ -247,7 +249,8 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     """E_rho - E_mu and S_rho - S_mu of two full solutions; everything shared uses the maps of rho."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     g.section("lights")
-    lights = SolutionLights(g.gpu, settings, resolved, size)
+    lights = g.shared("lights", lambda: SolutionLights(g.gpu, settings, resolved))
+    direct = SolutionDirectLight(lights, DirectLightPair(g.gpu, size))
     environment = g.stage("environment", lights.set_environment, s.lights)
     fitted = s.lights, s.real, object_extent(g, s), s.lit_area
     views = g.stage("light views", lights.fit_views, *fitted, same=eq)
@@ -255,14 +258,14 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     rho_maps = g.stage("shadow maps rho", lights.draw_rho, views, s.real, s.objects)
     g.section("voxels")
     placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
-    voxels = SolutionVoxels(g.gpu, settings, resolved.volume_size)
+    voxels = g.shared("voxels", lambda: SolutionVoxels(g.gpu, settings, resolved.volume_size))
     lit_voxels = solution_stages(g, s, voxels, placement, mu_maps, rho_maps, environment)
     options = ShadingOptions(
         screen_space=settings.screen_space,
         mirror_gather="gather" if settings.reflections == "rays" else None,
         march=march_defines(settings),
     )
-    shading = Shading(g.gpu, size, resolved, lights.rho, lights.direct, options)
+    shading = Shading(g.gpu, size, resolved, lights.rho, direct.pair, options)
     shading.normal_offset = lights.rho.real_texel_m
     shading.is_everywhere = True
     cones = SolutionCones(g.gpu, settings, voxels, shading.cones)
@@ -283,7 +286,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
         trace,
         voxels=joint,
         marching=marching,
-        light_directly=lights.light_directly,
+        light_directly=direct.light_directly,
     )
 
 

@@ -207,7 +207,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         g, s, resolved, settings.shadow_samples, settings.tier, mirrors=settings.mirrored_lights
     )
     g.section("voxels")
-    voxels = DeltaVoxels(g.gpu, settings, resolved.volume_size)
+    voxels = g.shared("voxels", lambda: DeltaVoxels(g.gpu, settings, resolved.volume_size))
     with bounced_later(g, s, lit, settings.tier):
         placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
         mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
@@ -281,7 +281,7 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("voxels")
-    voxels = InjectedVoxels(g.gpu, resolved.volume_size)
+    voxels = g.shared("voxels", lambda: InjectedVoxels(g.gpu, resolved.volume_size))
     with bounced_later(g, s, lit, settings.tier):
         placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
         injected = injection_stages(g, s, lit, voxels, placement)

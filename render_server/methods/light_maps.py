@@ -145,8 +145,12 @@ def light_stages(
 ) -> LitScene:
     """Declares environment, light views, depth maps of both geometries, and mirror images of the lights."""
     g.section("lights")
-    stages = LightStages(
-        g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors, keeps_views=tier.refresh_tiles > 0
+    keeps_views = tier.refresh_tiles > 0
+    stages = g.shared(
+        "lights",
+        lambda: LightStages(
+            g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors, keeps_views=keeps_views
+        ),
     )
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)

@@ -58,7 +58,8 @@ def volume_placement(
             placed = wanted
         return placed
 
-    return g.value("volume placement", place, object_extent(g, s), same=eq)
+    placing = g.shared("volume placement", lambda: place)
+    return g.value("volume placement", placing, object_extent(g, s), same=eq)
 
 
 def bounced_later(
@@ -86,6 +87,7 @@ def surfel_scene(
 ) -> dict[str, Binding]:
     """Returns the bindings for lighting real surfels; without `measured`, none counts as seen by the camera."""
     return {
+        "SEVERAL_VIEWS": False,
         **seen.bindings,
         **lights.bindings,
         **albedo.bindings,
@@ -393,7 +395,7 @@ def shading_stages(
     bvh = g.stage("object bvh", shading.set_objects, s.objects)
     with bounced_later(g, s, lit, shading.tier, bvh):
         beams = g.stage(
-            "caustic beams", shading.trace_beams, s.objects, bvh, s.measured, volume, s.lights, *lit.all
+            "caustic beams", shading.trace_beams, s.objects, bvh, s.own_measured, volume, s.lights, *lit.all
         )
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     if shading.reuses_light:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import moderngl
 import numpy as np
@@ -374,8 +375,8 @@ def difference_stages(
     g: Graph, s: FrameResources, lit: LitScene, settings: DlpvMethod, cube: Resource[VolumePlacement]
 ) -> LitCells:
     """V_mu is subtracted from V_rho."""
-    cells = LpvCells(g.gpu, settings, settings.volume_size)
-    volumes = DifferenceVolumes(g.gpu, settings, cells)
+    cells = g.shared("cells", lambda: LpvCells(g.gpu, settings, settings.volume_size))
+    volumes = g.shared("volumes", lambda: DifferenceVolumes(g.gpu, settings, cells))
     mu = g.stage("propagate mu", volumes.propagate_mu, "inject real", "geometry volume real")
     c = cell_stages(g, s, lit, cells, cube)
     first = g.stage("propagate rho", volumes.propagate_rho, c.real_light, c.change, c.through)
@@ -405,11 +406,10 @@ def printed_stages(
     """The change alone is propagated, direct light after and apart from the indirect one ([P2] 4.3)."""
     size = settings.volume_size
     sizes = PrintedSizes(settings.objects_volume_size or size, size, settings.direct_volume_size or size)
-    volumes = PrintedVolumes(g.gpu, settings, sizes)
-    stages = {
-        n: cell_stages(g, s, lit, LpvCells(g.gpu, settings, n), cube, "" if n == size else f" {n}")
-        for n in sorted({sizes.objects, sizes.indirect, sizes.direct})
-    }
+    volumes = g.shared("volumes", lambda: PrintedVolumes(g.gpu, settings, sizes))
+    counts = sorted({sizes.objects, sizes.indirect, sizes.direct})
+    cells = {n: g.shared(f"cells {n}", partial(LpvCells, g.gpu, settings, n)) for n in counts}
+    stages = {n: cell_stages(g, s, lit, cells[n], cube, "" if n == size else f" {n}") for n in counts}
     own, indirect, direct = stages[sizes.objects], stages[sizes.indirect], stages[sizes.direct]
     rho = g.stage("propagate rho", volumes.propagate_rho, own.real_light, own.change, own.through)
     delta = g.stage("propagate delta", volumes.propagate_delta, indirect.change, indirect.through)

@@ -106,9 +106,14 @@ def jump_threshold(
 
 def jump_terms(depth: DepthImage, camera: CameraModel) -> tuple[float, float]:
     """Returns the terms of `jump_threshold`: by w and pixel, and the constant one (1/m)."""
+    return jump_terms_of(noise_sigma(depth), camera)
+
+
+def jump_terms_of(sigma: float, camera: CameraModel) -> tuple[float, float]:
+    """Returns the terms of `jump_threshold` for depth with noise of `sigma` m at 1 m."""
     focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
     slope = float(np.tan(np.radians(MAX_SLOPE_DEG))) / focal
-    return slope, float(NOISE_SIGMAS * np.sqrt(2) * noise_sigma(depth))
+    return slope, float(NOISE_SIGMAS * np.sqrt(2) * sigma)
 
 
 def window_radius(depth: DepthImage, camera: CameraModel) -> int:

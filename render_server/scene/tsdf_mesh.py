@@ -1,5 +1,6 @@
 """Mesh of the real scene's TSDF: surface nets (Gibson 1998), decimated by clustering vertices."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from deltalight.protocol import short_axis
 from deltalight.render_server.scene.depth_mesh import REAL_MATERIAL
 from deltalight.render_server.scene.depth_surface import DepthSurface
+from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.scene.tsdf_volume import (
     BLOCK,
@@ -217,9 +219,9 @@ def _only_used(
 
 
 class TsdfScene:
-    """Near and far TSDF volume of the real scene, laid out for the first frame, and their meshes.
+    """Near and far TSDF volume of the real scene, laid out for the first frames, and their meshes.
 
-    `view` is the view from which the last frame's depth fits the field.
+    `view` is the view from which the newest depth of the first camera fits the field.
     """
 
     def __init__(self) -> None:
@@ -233,40 +235,38 @@ class TsdfScene:
         """Voxel edge of the near volume, m; 0 before the first frame."""
         return self.volumes[0].placement.voxel_m if self.volumes else 0.0
 
-    def add(
-        self,
-        surface: DepthSurface,
-        view: CameraView,
-        noise_sigma: float,
-        *,
-        align: bool = False,
-        settle: bool = False,
-    ) -> bool:
-        """Integrates a frame; returns whether the meshes changed.
+    def add(self, *frames: PosedSurface, settle: bool = False) -> bool:
+        """Integrates a frame of each camera; returns whether the meshes changed.
 
         Args:
-            surface: the frame's depth; without any known pixel nothing changes.
-            view: camera and pose of the frame.
-            noise_sigma: depth noise at 1 m, m.
-            align: refine the pose against the field (for poses by a marker board).
+            frames: the depth of a moment; those without any known pixel change nothing. Poses by a marker board are
+                refined against the field.
             settle: extract the meshes however little changed.
         """
-        self.view = view
-        if not (surface.inverse_depth > 0).any():
+        self.view = frames[0].view
+        known = [frame for frame in frames if (frame.surface.inverse_depth > 0).any()]
+        if not known:
             return False
         if not self.volumes:
-            self.volumes = [TsdfVolume(place) for place in place_volumes(surface, view, noise_sigma)]
+            self.volumes = [TsdfVolume(place) for place in place_volumes(known)]
             self._meshed = [volume.known_distance() for volume in self.volumes]
-        if align:
-            self.view = aligned_view(self.volumes, surface, view, noise_sigma)
-        planes = PixelPlanes.of(surface, view.camera, noise_sigma)
-        for volume in self.volumes:
-            volume.integrate(planes, self.view)
+        for frame in known:
+            self._integrate(frame, is_first=frame is frames[0])
         if not settle and self._moved_fraction() <= MOVED_FRACTION:
             return False
         self._meshed = [volume.known_distance() for volume in self.volumes]
         self._meshes = [extract_mesh(volume) for volume in self.volumes]
         return True
+
+    def _integrate(self, frame: PosedSurface, *, is_first: bool) -> None:
+        view = frame.view
+        if frame.aligns:
+            view = aligned_view(self.volumes, frame.surface, view, frame.noise_sigma)
+        if is_first:
+            self.view = view
+        planes = PixelPlanes.of(frame.surface, view.camera, frame.noise_sigma)
+        for volume in self.volumes:
+            volume.integrate(planes, view)
 
     def meshes(self, *triangle_budgets: int) -> list[list[TriangleMesh]]:
         """Returns near and far mesh within each triangle budget (in falling order); none before the first frame."""
@@ -305,17 +305,26 @@ class _SeenPoints(NamedTuple):
         return _SeenPoints(*(values[chosen] for values in self))
 
 
-def place_volumes(
-    surface: DepthSurface, view: CameraView, noise_sigma: float
-) -> tuple[TsdfPlacement, TsdfPlacement]:
-    """Places a cube around the near points of a frame, and a coarser one around all of them."""
-    shown = _seen_points(surface, view)
+def place_volumes(frames: Sequence[PosedSurface]) -> tuple[TsdfPlacement, TsdfPlacement]:
+    """Places a cube around the near points of the cameras' frames, and a coarser one around all of them."""
+    shown = _all_seen_points(frames)
     near = shown.z <= NEAR_MEDIANS * np.median(shown.z)
-    details_1m = noise_sigma, 1 / float(view.camera.matrix[0, 0])
+    pixel = max(1 / float(frame.view.camera.matrix[0, 0]) for frame in frames)
+    details_1m = max(frame.noise_sigma for frame in frames), pixel
     inside = _placement(shown.only(near), shown.only(near), details_1m, FINE_TRIANGLES[0])
     beyond = shown if near.all() else shown.only(~near)
     around = _placement(shown, beyond, details_1m, FINE_TRIANGLES[1])
     return inside, replace(around, hole=inside.box)
+
+
+def _all_seen_points(frames: Sequence[PosedSurface]) -> _SeenPoints:
+    """Returns the points of all frames; the area of a surface that several show is divided among them."""
+    parts = [_seen_points(frame.surface, frame.view) for frame in frames]
+    if len(parts) == 1:
+        return parts[0]
+    together = _SeenPoints(*map(np.concatenate, zip(*parts, strict=True)))
+    showing = DepthViews(tuple(frames)).count_showing(together.points)
+    return together._replace(area=together.area / np.maximum(showing, 1))
 
 
 def _placement(

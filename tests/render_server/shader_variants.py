@@ -61,6 +61,7 @@ MEASURED = (
     Case("paper", "depth", "mirror"),
     Case("dlpv", "model", "mirror"),
 )
+SEVERAL = [Case(method, "depth", "plain") for method in ("exact", "paper", "differential", "dlpv")]
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume", "error"),
@@ -119,6 +120,15 @@ def maps_and_holes(edge_m: float) -> Plate:
         },
     }
     return plate
+
+
+def render_several(case: Case, gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame as that of two cameras."""
+    renderer = SceneRenderer(gpu, scene_of(case, Stage(folder)))
+    try:
+        renderer.render_views(frames_of(case)[:1] * 2)
+    finally:
+        renderer.release()
 
 
 def render_with(
@@ -186,6 +196,7 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
     **{f"{case} measured": partial(render_measured, case, {}) for case in MEASURED},
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
+    **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
     "by device": by_device,
     "image-based shading": image_based,
     "precomputed transfer": precomputed_transfer,

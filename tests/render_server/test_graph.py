@@ -455,3 +455,37 @@ def test_the_graph_releases_what_its_stages_are_methods_of_once_and_in_reverse(g
     assert released == [given, second, first]
     graph.release()
     assert len(released) == 3
+
+
+def test_views_share_the_stages_that_do_not_follow_them(gpu: GpuContext) -> None:
+    graph, ran = Graph(gpu), list[str]()
+
+    class World:
+        def double(self, value: int) -> int:
+            ran.append("double")
+            return 2 * value
+
+    def shown(world: int, view: int) -> int:
+        ran.append("shown")
+        return world + view
+
+    sources, results = [], []
+    for number in range(2):
+        with graph.of_view(number):
+            world, view = graph.source("world", "world"), graph.source("view", "view")
+            doubled = graph.stage("double", graph.shared("world", World).double, world)
+            results.append(graph.stage("shown", shown, "double", view))
+            sources.append(view)
+            assert graph.resource("shown") is results[-1]
+            assert graph.resource("double") is doubled
+    assert [stage.name for stage in graph.report()] == ["double", "shown", "shown (view 2)"]
+    world.write(10)
+    for number, source in enumerate(sources):
+        source.write(number)
+    graph.run()
+    assert ran == ["double", "shown", "shown"]
+    assert [result.value for result in results] == [20, 21]
+    sources[1].write(5)
+    graph.run()
+    assert ran[3:] == ["shown"]
+    assert results[1].value == 25

@@ -9,6 +9,7 @@ import pytest
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.scene.depth_surface import DepthSurface, depth_surface
+from deltalight.render_server.scene.depth_views import PosedSurface
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.scene.tsdf_mesh import TsdfScene, decimated, extract_mesh
 from deltalight.render_server.scene.tsdf_volume import aligned_view, interpolate
@@ -55,7 +56,7 @@ def seen(boxes: tuple[Box, ...], at: CameraView, noise: float = 0.0, seed: int =
 def fused(boxes: tuple[Box, ...], views: list[CameraView], noise: float = 0.0) -> TsdfScene:
     scene = TsdfScene()
     for number, at in enumerate(views):
-        scene.add(seen(boxes, at, noise, number), at, max(noise, SIGMA), settle=True)
+        scene.add(PosedSurface(seen(boxes, at, noise, number), at, max(noise, SIGMA)), settle=True)
     return scene
 
 
@@ -122,11 +123,11 @@ def test_what_went_away_is_carved_and_what_came_is_there() -> None:
     with_box = inside(near_mesh(scene), shell, 0).sum()
     assert with_box > 500
     for number, at in enumerate(views[:4]):
-        scene.add(seen(ROOM, at, 0, number), at, SIGMA, settle=True)
+        scene.add(PosedSurface(seen(ROOM, at, 0, number), at, SIGMA), settle=True)
     # Only what lies beyond the floor's visible part may keep a trace of it.
     assert inside(near_mesh(scene), shell, 0).sum() < 0.02 * with_box
     for number, at in enumerate(views[:4]):
-        scene.add(seen((*ROOM, BOX), at, 0, number), at, SIGMA, settle=True)
+        scene.add(PosedSurface(seen((*ROOM, BOX), at, 0, number), at, SIGMA), settle=True)
     assert inside(near_mesh(scene), shell, 0).sum() > 0.9 * with_box
 
 
@@ -168,7 +169,7 @@ def test_a_far_wall_goes_to_the_coarse_volume_and_joins_the_near_one() -> None:
 
 def test_a_still_scene_settles() -> None:
     scene, at = TsdfScene(), view()
-    renewed = [scene.add(seen(ROOM, at), at, SIGMA) for _ in range(4)]
+    renewed = [scene.add(PosedSurface(seen(ROOM, at), at, SIGMA)) for _ in range(4)]
     assert renewed == [True, False, False, False]
 
 
@@ -195,7 +196,7 @@ def test_a_pose_that_errs_is_corrected_by_what_the_shape_tells(boxes: tuple[Box,
 def test_without_anything_known_a_pose_stays() -> None:
     at = view()
     first = TsdfScene()
-    assert first.add(seen(ROOM, at), at, SIGMA, align=True)
+    assert first.add(PosedSurface(seen(ROOM, at), at, SIGMA, aligns=True))
     assert first.view is at
     scene = TsdfScene()
     nothing = DepthSurface(
@@ -203,7 +204,7 @@ def test_without_anything_known_a_pose_stays() -> None:
         np.zeros((2, 120, 160), np.float32),
         np.zeros((120, 160, 3), np.float32),
     )
-    assert not scene.add(nothing, at, SIGMA)
+    assert not scene.add(PosedSurface(nothing, at, SIGMA))
     assert scene.meshes(1000) == [[]]
 
 
@@ -223,7 +224,7 @@ def test_a_real_room_is_where_the_frame_left_out_sees_it(shared_data: Path) -> N
             depth_surface(DepthImage(depth, depth > 0, camera, noise), camera),
         )
         if number != 2:
-            scene.add(surface, at, noise)
+            scene.add(PosedSurface(surface, at, noise))
     rays = np.dstack([camera.rays(), np.ones((480, 640))])[::4, ::4].reshape(-1, 3)
     z = depth[::4, ::4].reshape(-1, 1)
     found, distance, _ = interpolate(scene.volumes[0], (rays * z @ pose[:3, :3].T + pose[:3, 3])[z[:, 0] > 0])

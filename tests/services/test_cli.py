@@ -67,6 +67,7 @@ COMMANDS = {
     "bench rest",
     "bench soak",
     "bench sweep",
+    "bench views",
     "gpu-check",
     "virtual-camera",
     "stream",

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import pytest
 
 from deltalight.benchmarks import frame_docs
-from deltalight.render_server.graph import CLOCKS
+from deltalight.render_server.graph_report import CLOCKS
 from deltalight.services import frame_account
 from deltalight.services.frame_account import FrameAccount, account_frame
 from deltalight.services.graph_drawing import draw_graph

@@ -1,0 +1,135 @@
+"""What one camera saw of the real scene: when something last moved, and when the scene was built from it."""
+
+from functools import partial
+
+import numpy as np
+
+from deltalight.render_server.frame import Measurement, Scan
+from deltalight.render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
+from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
+from deltalight.render_server.view import PosedFrame
+
+# A voxel's surface cuts the corner where two surfaces meet at a right angle, by up to sqrt(2) / 4 of its edge.
+ROUNDED_VOXELS = 0.35
+# A kept world that explains the picture no longer is renewed no more often than this,
+RENEWAL_NS = 400_000_000
+# one that does once all has been at rest for so long: a camera that only pauses must not wait for it.
+SETTLING_NS = 1_500_000_000
+
+
+class CameraHistory:
+    """Frames of one camera, as far as the real scene depends on them.
+
+    With `keeps_world`, the real scene is built only when it no longer explains what the camera sees (KeptWorld), and
+    once more from the frame in which everything comes to rest. `has_depth`: it is built from depth, not given as a
+    model.
+    """
+
+    def __init__(self, *, keeps_world: bool, has_depth: bool) -> None:
+        self._motion = MotionDetector()
+        self._kept = KeptWorld() if keeps_world else None
+        self._has_depth = has_depth
+        self._newest: FrameSamples | None = None
+        self._last: FrameSamples | None = None  # in which anything moved
+        self._seen: PosedFrame | None = None
+        self.moved = False  # in the newest frame
+        self._built_from: PosedFrame | None = None
+        self._surfaces: dict[PosedFrame, DepthSurface] = {}
+        self._scans: dict[PosedFrame, Scan] = {}
+        self._measurements: dict[tuple[int, int], Measurement] = {}
+        self.voxel_m: float | None = None  # of the surface that depth is fused to; None: nothing is fused
+
+    def update(self, taken: PosedFrame, *, is_unknown: bool) -> bool:
+        """Takes a frame; returns whether anything moved in it. `is_unknown`: there is no real scene yet."""
+        self._newest = samples = FrameSamples.of(taken.frame)
+        # Depth without a surface (a camera that starts) explains nothing: the next frame counts as another scene.
+        self.moved = self._motion.update(samples) or is_unknown
+        if self.moved:
+            self._last, self._seen = samples, taken
+            self._surfaces.clear()
+            self._scans.clear()
+        return self.moved
+
+    def is_due(self, *, is_unknown: bool) -> bool:
+        """Returns whether the real scene must be built.
+
+        That is: it is not kept, it explains the frame no longer, or everything came to rest.
+        """
+        if self._kept is None:
+            return True
+        kept, samples, last, built = self._kept, self._newest, self._last, self._kept.built_from
+        assert samples is not None
+        if built is None or is_unknown:
+            return True
+        if self.moved:
+            too_soon = abs(samples.frame.timestamp_ns - built.frame.timestamp_ns) < RENEWAL_NS
+            return not too_soon and not kept.explains(samples)
+        if built is last:
+            return self.voxel_m is not None  # whose average takes some more frames
+        assert last is not None
+        wait_ns = SETTLING_NS if kept.explains(last) else RENEWAL_NS
+        return samples.frame.timestamp_ns - last.frame.timestamp_ns >= wait_ns
+
+    def renew(self, taken: PosedFrame) -> PosedFrame:
+        """Returns the frame to build the real scene from: `taken`, or the last that moved if it was not used yet."""
+        if self._kept is not None and self._kept.built_from is not self._last:
+            taken, self.moved = self.seen, True
+            self._kept.built_from = self._last
+        return taken
+
+    def set_built(self) -> None:
+        """Notes that the real scene was built from what was seen."""
+        self._built_from = self.seen
+        self._scans.clear()
+        self._measurements.clear()
+
+    @property
+    def seen(self) -> PosedFrame:
+        """The frame in which anything last moved, the camera included; there was one."""
+        assert self._seen is not None
+        return self._seen
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether a kept world was built from the frame in which everything came to rest."""
+        return self._kept is not None and self._kept.built_from is self._last
+
+    def measurement(self, size: tuple[int, int]) -> Measurement:
+        """Returns the frame that the real scene was last built from, at a picture's size, always the same object."""
+        if size not in self._measurements:
+            assert self._built_from is not None
+            taken = self._built_from.at(size)
+            self._measurements[size] = Measurement(taken.frame, taken.view, self._scan_of(taken))
+        return self._measurements[size]
+
+    def scan(self, size: tuple[int, int]) -> Scan:
+        """Returns the camera's measurement from when something last moved, at a picture's size."""
+        return self._scan_of(self.seen.at(size))
+
+    def _scan_of(self, taken: PosedFrame) -> Scan:
+        if taken not in self._scans:
+            self._scans[taken] = self._scanned(taken)
+        return self._scans[taken]
+
+    def _scanned(self, taken: PosedFrame) -> Scan:
+        """Collects depth, its noise, and the tolerance of the fused surface. A model has no noise.
+
+        Three standard deviations of the noise cover at least what voxels round off.
+        """
+        depth, fitted = taken.frame.depth if self._has_depth else None, partial(self.surface_of, taken)
+        if depth is None:
+            return Scan(None, fitted, 0.0, 1.0, None)
+        known = depth.depth_m[depth.valid]
+        typical_depth = float(np.median(known)) if known.size else 1.0
+        rounded_m = ROUNDED_VOXELS * (self.voxel_m or 0.0)
+        sigma = max(noise_sigma(depth), rounded_m / (3 * typical_depth**2))
+        # The fused surface agrees with depth up to half a voxel, and three standard deviations of the depth's noise.
+        tolerance = None if self.voxel_m is None else (0.5 * self.voxel_m, 3 * sigma)
+        return Scan(depth, fitted, sigma, typical_depth, tolerance)
+
+    def surface_of(self, taken: PosedFrame) -> DepthSurface:
+        """Returns the surface fitted to a frame's depth."""
+        if taken not in self._surfaces:
+            assert taken.frame.depth is not None
+            self._surfaces[taken] = depth_surface(taken.frame.depth, taken.view.camera)
+        return self._surfaces[taken]

@@ -1,0 +1,61 @@
+"""What several cameras measure of one room: surfels take their radiance from the one that shows them largest."""
+
+from collections.abc import Sequence
+
+import moderngl
+import numpy as np
+
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.view import CameraView
+
+VIEW_TEXELS = 6  # of a MeasuredView in shaders/common/measured_views.glsl
+
+
+class MeasuredViews:
+    """Linear pictures (RGBA16F, camera units, with mip levels) and depth (R32F, m) of all cameras, a layer each.
+
+    Pictures smaller than the largest fill the upper left corner of their layer.
+    """
+
+    def __init__(self, gpu: GpuContext, sizes: Sequence[tuple[int, int]]) -> None:
+        width, height = (max(size[axis] for size in sizes) for axis in (0, 1))
+        shape = width, height, len(sizes)
+        self._radiance = gpu.ctx.texture_array(shape, 4, dtype="f2")
+        self._radiance.build_mipmaps()
+        self._radiance.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        self._depth = gpu.ctx.texture_array(shape, 1, dtype="f4")
+        self._depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._cameras = texture_2d(gpu, (VIEW_TEXELS, len(sizes)), 4, "f4")
+        self._copy = Kernel(gpu, "measured_view")
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """What real_radiance.glsl reads instead of one camera's picture."""
+        return {
+            "SEVERAL_VIEWS": True,
+            "view_cameras": self._cameras,
+            "view_radiance": self._radiance,
+            "view_depth": self._depth,
+        }
+
+    def write(self, views: Sequence[CameraView], scenes: Sequence[Bindings]) -> None:
+        """Copies the pictures and depths that the `scenes` bind, one for each view."""
+        self._cameras.write(b"".join(_packed(view) for view in views), alignment=1)
+        for layer, (view, scene) in enumerate(zip(views, scenes, strict=True)):
+            self._copy.run(view.size, scene, radiance_out=self._radiance, depth_out=self._depth, layer=layer)
+        self._radiance.build_mipmaps()
+        self._radiance.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._radiance, self._depth, self._cameras, self._copy)
+
+
+def _packed(view: CameraView) -> bytes:
+    """Returns the texels of a MeasuredView: matrix by columns, pinhole, extent."""
+    matrix = view.camera.matrix
+    pinhole = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    values = np.concatenate([view.camera_from_world.T.ravel(), pinhole, view.size, (0.0, 0.0)])
+    return values.astype(np.float32).tobytes()
