@@ -317,12 +317,12 @@ class LiveScene:
         assert real.seen is not None
         assert real.state is not None
         assert self.lighting.lights is not None
-        view = real.seen.at(
-            size
-        ).view  # while nothing moves, the pose's own jitter must not shake the picture
+        # While nothing moves, the pose's own jitter must not shake the picture.
+        view, output = real.seen.at(size).view, self._plan.scene.output
+        view = view.with_antialiasing if output.antialiasing else view
         return FrameInputs(
             taken.at(size).frame,
-            view.with_antialiasing if self._plan.scene.output.antialiasing else view,
+            view.with_matting(output.matting_px),
             real.scan(size),
             real.measurement(size),
             real.state,
