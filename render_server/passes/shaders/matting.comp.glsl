@@ -13,6 +13,7 @@ layout(local_size_x = 64) in;
 uniform int sight;         // pixels, length of the rays
 
 const int RAYS = 12;
+const int STEP = 3;        // pixels from sample to sample along a ray
 const int TAKEN = 4;       // samples of either kind along a ray, the nearest
 const int FRACTIONS = 17;  // at which the posterior is evaluated
 const float TURN = 6.28318530718 / float(RAYS);
@@ -20,11 +21,12 @@ const float TURN = 6.28318530718 / float(RAYS);
 // Samples along one ray.
 void look_along(ivec2 pixel, float z, vec3 ray, vec2 direction, inout Side front, inout Side back) {
     int fronts = 0, backs = 0;
-    for (int t = 1; t <= sight && min(fronts, backs) < TAKEN; ++t) {
+    for (int t = STEP; t <= sight && min(fronts, backs) < TAKEN; t += STEP) {
         ivec2 offset = ivec2(round(float(t) * direction)), at = pixel + offset;
         if (!in_picture(at)) return;
-        if (texelFetch(real_surface_position, at, 0).w <= 0.0) continue;
-        if (in_front(at, z) > 0.0) {
+        float real = texelFetch(real_surface_position, at, 0).w;
+        if (real <= 0.0) continue;
+        if (real >= hides_before(z)) {
             if (backs < TAKEN && !near_front(at, z)) { add(back, pixel, offset, ray); ++backs; }
         } else if (fronts < TAKEN && inside_front(at, z)) { add(front, pixel, offset, ray); ++fronts; }
     }
