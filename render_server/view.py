@@ -53,7 +53,11 @@ class CameraView:
         if not isinstance(other, CameraView):
             return NotImplemented
         same_kind = self.antialiased == other.antialiased and self.matting_px == other.matting_px
-        return same_kind and self.camera == other.camera and np.array_equal(self.world_from_camera, other.world_from_camera)
+        return (
+            same_kind
+            and self.camera == other.camera
+            and np.array_equal(self.world_from_camera, other.world_from_camera)
+        )
 
     def __hash__(self) -> int:
         return hash((self.camera, self.world_from_camera.tobytes(), self.antialiased, self.matting_px))

@@ -99,7 +99,11 @@ class Composite:
         self._ratio = texture_2d(gpu, size, 4, "f4")
         self._again = Kernel(gpu, "recompose")
         self._kernel = Kernel(
-            gpu, "composite", FILL_RADIUS=FILL_RADIUS, SURFACE_REACH=SURFACE_REACH, RAY_ROUGHNESS=RAY_ROUGHNESS
+            gpu,
+            "composite",
+            FILL_RADIUS=FILL_RADIUS,
+            SURFACE_REACH=SURFACE_REACH,
+            RAY_ROUGHNESS=RAY_ROUGHNESS,
         )
 
     def run(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:

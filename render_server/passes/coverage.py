@@ -22,7 +22,7 @@ RIM_SIGHT = 6
 Behind the two pixels that may be mixed there are four more on either side.
 """
 SURFACE_REACH = 22
-"""Pixels within which the surface that represents a mixed pixel may lie: half floats hold that many offsets exactly."""
+"""Pixels within which the surface that represents a mixed pixel may lie: half floats hold so many offsets exactly."""
 
 
 class SampleCoverage:

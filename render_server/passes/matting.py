@@ -9,8 +9,7 @@ from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing
 from deltalight.render_server.view import Rectangle
 
 BLOCK = 4  # pixels an edge, at which nearest depths are kept
-# Length of rays per pixel of reach: a pixel at the thing's edge finds the background beyond reach on the far side of a
-# strand or a gap, too.
+# Length of rays per pixel of reach: from one edge of the band they find the surface beyond the other, slanted ones too.
 SIGHT_PER_REACH = 4
 
 
@@ -51,7 +50,12 @@ class Matting:
         sight = SIGHT_PER_REACH * reach_px
         self._find_nearest(scene, rectangle, sight, -(-reach_px // BLOCK))
         self._band_kernel.run(
-            rectangle[2:], scene, own, rectangle=rectangle, nearest_depth=self._within_reach, Texels=self._band
+            rectangle[2:],
+            scene,
+            own,
+            rectangle=rectangle,
+            nearest_depth=self._within_reach,
+            Texels=self._band,
         )
         self._kernel.run(
             (self._threads,),

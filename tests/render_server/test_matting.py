@@ -1,6 +1,6 @@
 """Soft mattes: hair that depth does not show, before an object, against mattes that are known.
 
-`pytest -s` prints the errors in the band around the thing, beside those of the hard matte and of OpenCV's guided filter.
+`pytest -s` prints the errors in the band around the thing, beside those by depth alone and of OpenCV's guided filter.
 """
 
 from pathlib import Path
@@ -45,8 +45,8 @@ def matted(document: SceneDocument, reach_px: int = REACH_PX, **output: object) 
     return document.replaced(output=document.output.replaced(matting_px=reach_px, **output))
 
 
-def guided(thing: HairyThing, radius: int = 16, epsilon: float = 1e-4) -> np.ndarray:
-    """The hard matte after the guided filter of He et al. (2013); the best of radii 4 to 16, epsilons 1e-4 to 1e-2."""
+def guided(thing: HairyThing, radius: int = 32, epsilon: float = 1e-4) -> np.ndarray:
+    """The matte by depth after the guided filter of He et al. (2013); best of radii 4 to 32, epsilons 1e-6 to 1e-2."""
     hard = 255 * thing.by_depth.astype(np.uint8)
     return np.asarray(cv2.ximgproc.guidedFilter(thing.color, hard, radius, epsilon * 255**2) / 255.0)
 
@@ -84,7 +84,7 @@ def test_hair_is_nearer_to_the_truth_than_by_depth_or_by_a_guided_filter(
     found = objects.linear(matted(document), thing.view(pose=ABOVE))
     rms, psnr = errors(f"matting_px: {REACH_PX}", thing, 1 - objects.newest_coverage(), found)
     assert rms < 0.65 * filtered[0]
-    assert psnr > filtered[1] + 6
+    assert psnr > filtered[1] + 5
 
 
 @pytest.mark.parametrize("distortion", [0.0, -0.3])
@@ -105,7 +105,10 @@ def test_hair_is_lit_like_the_thing_and_not_like_the_shaded_background(gpu: GpuC
 
 
 def test_equal_colours_leave_the_choice_to_depth(objects: ObjectsRenderer, stage: Stage) -> None:
-    document, view = unlit(glowing(stage)), frame(plain(), pose=ABOVE, depth=hairy_thing("plain").view().depth)
+    document, view = (
+        unlit(glowing(stage)),
+        frame(plain(), pose=ABOVE, depth=hairy_thing("plain").view().depth),
+    )
     by_depth = objects.coverage(document, view)
     assert np.abs(objects.coverage(matted(document), view) - by_depth).max() < 0.2
 
