@@ -9,7 +9,7 @@ from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing
 from deltalight.render_server.view import Rectangle
 
 BLOCK = 4  # pixels an edge, at which nearest depths are kept
-# Length of rays per pixel of reach: from one edge of the band they find the surface beyond the other, slanted ones too.
+# Length of rays per pixel of reach: at one edge of the band even slanted ones get to what lies beyond the other.
 SIGHT_PER_REACH = 4
 
 

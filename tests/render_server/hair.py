@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
+from deltalight.sensor_node.depth import DepthSettings, clean_depth
 from tests.render_server.scenes import HEIGHT, WIDTH, depth_image, frame
 
 OVERSAMPLING = 8
 NEAR_M, FAR_M = 0.5, 3.0  # of the thing and the background; objects stand between
 SENSOR_NOISE = 0.004  # of sensor white
+RIM_PX = 4  # within which stereo gives no depth
 HAIR = (0.10, 0.06, 0.035)
 PATTERNS = ("plain", "wood", "checks")
 
@@ -19,23 +21,23 @@ PATTERNS = ("plain", "wood", "checks")
 class HairyThing:
     """`alpha` (h, w): the thing's true fraction; `front`, `back` (h, w, 3): linear colours of thing and background.
 
-    `color` (h, w, 3; uint8) is the camera's picture, `depth_m` (h, w) what the depth camera sees: no hair, an outline
-    that is off by a pixel (r.m.s.), holes along it.
+    `color` (h, w, 3; uint8) is the camera's picture, `depth` what the node makes of a depth camera that sees no hair,
+    an outline that is off by a pixel (r.m.s.), and nothing within four pixels of it.
     """
 
     alpha: np.ndarray
     front: np.ndarray
     back: np.ndarray
     color: np.ndarray
-    depth_m: np.ndarray
+    depth: DepthImage
 
     def view(self, **changes: object) -> ViewFrame:
-        return frame(self.color, depth=depth_image(self.depth_m), **changes)
+        return frame(self.color, depth=self.depth, **changes)
 
     @property
     def by_depth(self) -> np.ndarray:
-        """The hard matte, 0 or 1."""
-        return (self.depth_m > 0) & (self.depth_m < (NEAR_M + FAR_M) / 2)
+        """Where depth shows the thing."""
+        return np.asarray(self.depth.valid & (self.depth.depth_m < (NEAR_M + FAR_M) / 2))
 
     def band(self, reach_px: int) -> np.ndarray:
         """Pixels within reach of the thing by depth, but for those well inside of it."""
@@ -54,7 +56,8 @@ def hairy_thing(pattern: str, seed: int = 0) -> HairyThing:
     linear = np.clip(linear + SENSOR_NOISE * random.standard_normal(linear.shape), 0, 1)
     lut = decode_lut(None)[:, 0]
     color = np.searchsorted((lut[1:] + lut[:-1]) / 2, linear).astype(np.uint8)
-    return HairyThing(alpha, front, back, color, _depth(alpha, random))
+    depth = clean_depth(depth_image(_depth(alpha, random)), color, DepthSettings())
+    return HairyThing(alpha, front, back, color, depth)
 
 
 def _outline(random: np.random.Generator) -> np.ndarray:
@@ -102,5 +105,4 @@ def _depth(alpha: np.ndarray, random: np.random.Generator) -> np.ndarray:
     off = inside + _smooth(random, 2.0, 1.0)
     depth = np.where(off > 0.5, NEAR_M, FAR_M)
     depth = depth + 0.001 * depth**2 * random.standard_normal(depth.shape)
-    holes = (np.abs(off) < 1.5) & (_smooth(random, 1.5, 1.0) > 0.5)
-    return np.where(holes, 0, depth).astype(np.float32)
+    return np.where(np.abs(off) < RIM_PX, 0, depth).astype(np.float32)
