@@ -81,8 +81,7 @@ vec2 fraction_by_colour(ivec2 pixel, Side front, Side back) {
     float variance = noise + stray, smoothed = KERNEL_NOISE * noise + stray + BEND;
     float a = (clamp(own, 0.0, 1.0) * smoothed + clamp(along, 0.0, 1.0) * variance) / (variance + smoothed);
     variance = variance * smoothed / (variance + smoothed);
-    float deviation = min(sqrt(variance), 0.45);
-    return vec2(clamp((a - deviation) / (1.0 - 2.0 * deviation), 0.0, 1.0), variance);
+    return settled(a, variance);
 }
 
 void unmix(ivec2 pixel) {

@@ -4,7 +4,7 @@
 // F, B of linear colour. The pixel's colour is a F + (1 - a) B + noise, as in Bayesian matting (Chuang et al. 2001), but F
 // and B are integrated out in place of being chosen, which is a normal distribution again:
 //     C | a ~ N(a mean F + (1 - a) mean B, a^2 cov F + (1 - a)^2 cov B + noise).
-// The fraction is the mean of the posterior of a. A third each is the prior of a = 0, a = 1, and all between.
+// A third each is the prior of a = 0, a = 1, and all between.
 #include "common/edge_sides.glsl"
 #include "common/matting_band.glsl"
 #include "common/work_list.glsl"
@@ -58,7 +58,7 @@ mat3 covariance(float a, Side front, Side back) {
     return a * a * front.squares + (1.0 - a) * (1.0 - a) * back.squares + NOISE * mat3(1.0);
 }
 
-// Mean and variance of the posterior of the thing's fraction.
+// The thing's fraction by its posterior, and the variance of that.
 vec2 posterior(vec3 colour, Side front, Side back) {
     float likelihoods[FRACTIONS], greatest = -1e30;
     for (int i = 0; i < FRACTIONS; ++i) {
@@ -75,7 +75,7 @@ vec2 posterior(vec3 colour, Side front, Side back) {
         sum += prior * exp(likelihoods[i] - greatest) * vec3(1.0, a, a * a);
     }
     float mean = sum.y / sum.x;
-    return vec2(mean, max(sum.z / sum.x - mean * mean, 0.0));
+    return settled(mean, max(sum.z / sum.x - mean * mean, 0.0));
 }
 
 // The pixel's own F - B, given its colour and fraction.

@@ -55,6 +55,12 @@ bool has_step(Side front, Side back, float z) {
     return front.inverse_depth > 1.0 / z && front.inverse_depth - back.inverse_depth > least;
 }
 
+// A fraction and its variance. Within a standard deviation of 0 or 1 it is 0 or 1, and others are moved apart by as much.
+vec2 settled(float a, float variance) {
+    float deviation = min(sqrt(variance), 0.45);
+    return vec2(clamp((a - deviation) / (1.0 - 2.0 * deviation), 0.0, 1.0), variance);
+}
+
 // The thing's fraction of the pixel, `a`: by colour, found with mean and variance `by_colour`, else by the coverage so
 // far; `known` is the weight of the former.
 float combined_fraction(ivec2 pixel, float covered, vec2 by_colour, out float known) {
