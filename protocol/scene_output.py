@@ -80,8 +80,8 @@ class Output(StrictModel):
         default=0,
         ge=0,
         le=16,
-        description="Pixels from real things in front of objects within which hair and the like that depth does not "
-        "show is found by colour; 0 = edges alone.",
+        description="Pixels from real things in front of objects within which hair and fingers that depth does not "
+        "show are found by colour; 0 = edges alone.",
     )
     camera_artifacts: bool = Field(
         default=False,

@@ -41,7 +41,7 @@ class CameraView:
 
     `world_from_camera` is (4, 4), optical frame (+x right, +y down, +z forward). `antialiased`: the objects'
     geometry buffer is resolved from several samples per pixel, on the picture's own grid. `matting_px`: pixels from
-    real things within which hair and the like before objects are found by colour.
+    real things within which hair and fingers before objects are found by colour.
     """
 
     camera: CameraModel

@@ -9,8 +9,8 @@ from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing
 from deltalight.render_server.view import Rectangle
 
 BLOCK = 4  # pixels an edge, at which nearest depths are kept
-# Length of rays per pixel of reach: at one edge of the band even slanted ones get to what lies beyond the other.
-SIGHT_PER_REACH = 4
+# Length of rays per pixel of reach: between spread fingers the nearest certain background lies beyond the hand.
+SIGHT_PER_REACH = 8
 
 
 class Matting:
@@ -65,7 +65,7 @@ class Matting:
             object_coverage=coverage.texture,
             edge_correction=unmixing.texture,
             Texels=self._band,
-            sight=sight,
+            sight=float(sight),
         )
 
     def _find_nearest(self, scene: Bindings, rectangle: Rectangle, sight: int, reach: int) -> None:

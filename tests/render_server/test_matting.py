@@ -1,4 +1,4 @@
-"""Soft mattes: hair that depth does not show, before an object, against mattes that are known.
+"""Soft mattes: hair and fingers that depth does not show, before an object, against mattes that are known.
 
 `pytest -s` prints the errors in the band around the thing, beside those by depth alone and of OpenCV's guided filter.
 """
@@ -12,7 +12,7 @@ import pytest
 from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
-from tests.render_server.hair import FAR_M, NEAR_M, PATTERNS, HairyThing, hairy_thing
+from tests.render_server.matted_things import FAR_M, NEAR_M, PATTERNS, Thing, hairy_head, hand
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,
@@ -47,7 +47,7 @@ def matted(document: SceneDocument, reach_px: int = REACH_PX, **output: object) 
     return document.replaced(output=document.output.replaced(matting_px=reach_px, **output))
 
 
-def guided(thing: HairyThing, radius: int = 32, epsilon: float = 1e-4) -> np.ndarray:
+def guided(thing: Thing, radius: int = 32, epsilon: float = 1e-4) -> np.ndarray:
     """The matte by depth after the guided filter of He et al. (2013), at its best of radii 8 to 32, 1e-5 to 1e-3."""
     hard = 255 * thing.by_depth.astype(np.uint8)
     return np.asarray(cv2.ximgproc.guidedFilter(thing.color, hard, radius, epsilon * 255**2) / 255.0)
@@ -61,7 +61,7 @@ def coded(linear: np.ndarray) -> np.ndarray:
     return np.searchsorted(decode_lut(None)[:, 0], np.clip(linear, 0, 1)) / 255
 
 
-def errors(name: str, thing: HairyThing, alpha: np.ndarray, linear: np.ndarray) -> tuple[float, float]:
+def errors(name: str, thing: Thing, alpha: np.ndarray, linear: np.ndarray) -> tuple[float, float]:
     """Of the matte (r.m.s.), and of the coded picture before an object that glows (dB), within the band."""
     band = thing.band(REACH_PX)
     off = (alpha - thing.alpha)[band]
@@ -75,7 +75,7 @@ def errors(name: str, thing: HairyThing, alpha: np.ndarray, linear: np.ndarray) 
 def test_hair_is_nearer_to_the_truth_than_by_depth_or_by_a_guided_filter(
     objects: ObjectsRenderer, stage: Stage, pattern: str
 ) -> None:
-    thing, document = hairy_thing(pattern), unlit(glowing(stage))
+    thing, document = hairy_head(pattern), unlit(glowing(stage))
     linear = decode_lut(None)[thing.color, 0]
     print(f"\n{pattern}, {np.count_nonzero(thing.band(REACH_PX))} pixels")
     hard, smooth = thing.by_depth.astype(float), guided(thing)
@@ -89,9 +89,21 @@ def test_hair_is_nearer_to_the_truth_than_by_depth_or_by_a_guided_filter(
     assert psnr > filtered[1] + 4
 
 
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_fingers_that_depth_misses_are_found(objects: ObjectsRenderer, stage: Stage, pattern: str) -> None:
+    thing, document = hand(pattern), unlit(glowing(stage))
+    print(f"\nhand, {pattern}, {np.count_nonzero(thing.band(REACH_PX))} pixels")
+    edges = objects.linear(document, thing.view(pose=ABOVE))
+    before = errors("matting_px: 0", thing, 1 - objects.newest_coverage(), edges)
+    found = objects.linear(matted(document), thing.view(pose=ABOVE))
+    after = errors(f"matting_px: {REACH_PX}", thing, 1 - objects.newest_coverage(), found)
+    assert after[0] < 0.4 * before[0]
+    assert after[1] > before[1] + 8
+
+
 @pytest.mark.parametrize("distortion", [0.0, -0.3])
 def test_through_a_lens_with_antialiasing(objects: ObjectsRenderer, stage: Stage, distortion: float) -> None:
-    lens, thing = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0)), hairy_thing("plain")
+    lens, thing = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0)), hairy_head("plain")
     document = matted(unlit(glowing(stage, size=250)), antialiasing=True)
     alpha = 1 - objects.coverage(document, thing.view(pose=ABOVE, camera=lens))
     off = (alpha - thing.alpha)[thing.band(REACH_PX)]
@@ -100,7 +112,7 @@ def test_through_a_lens_with_antialiasing(objects: ObjectsRenderer, stage: Stage
 
 def test_hair_is_lit_like_the_thing_and_not_like_the_shaded_background(gpu: GpuContext, stage: Stage) -> None:
     """The object shades all of the background; hair has the light of the thing that depth shows."""
-    thing = hairy_thing("plain")
+    thing = hairy_head("plain")
     document = matted(glowing(stage, directional((0.0, 0.0, -1.0), 2.0)))
     found = lit_picture(gpu, document, thing.view(pose=ABOVE))
     off = found - before_glow(thing.alpha, thing.front)
@@ -110,7 +122,7 @@ def test_hair_is_lit_like_the_thing_and_not_like_the_shaded_background(gpu: GpuC
 def test_equal_colours_leave_the_choice_to_depth(objects: ObjectsRenderer, stage: Stage) -> None:
     document, view = (
         unlit(glowing(stage)),
-        frame(plain(), pose=ABOVE, depth=hairy_thing("plain").depth),
+        frame(plain(), pose=ABOVE, depth=hairy_head("plain").depth),
     )
     by_depth = objects.coverage(document, view)
     assert np.abs(objects.coverage(matted(document), view) - by_depth).max() < 0.2
@@ -126,7 +138,7 @@ def test_the_floor_has_no_matte_where_an_object_stands_on_it(objects: ObjectsRen
 
 
 def test_the_cameras_bytes_where_no_object_lies_behind(objects: ObjectsRenderer, stage: Stage) -> None:
-    thing = hairy_thing("checks")
+    thing = hairy_head("checks")
     result = objects.draw(matted(unlit(glowing(stage, size=60))), thing.view(pose=ABOVE))
     shown = objects.newest_coverage() > 0
     assert 0 < np.count_nonzero(shown) < 60 * 60

@@ -10,10 +10,11 @@
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
-uniform int sight;         // pixels, length of the rays
+uniform float sight;        // pixels, length of the rays
 
 const int RAYS = 12;
-const int STEP = 3;        // pixels from sample to sample along a ray
+const float STEP = 3.0;    // pixels from sample to sample along a ray; farther on, GROWTH of the way so far
+const float GROWTH = 0.125;
 const int TAKEN = 4;       // samples of either kind along a ray, the nearest
 const int FRACTIONS = 17;  // at which the posterior is evaluated
 const float TURN = 6.28318530718 / float(RAYS);
@@ -21,8 +22,8 @@ const float TURN = 6.28318530718 / float(RAYS);
 // Samples along one ray.
 void look_along(ivec2 pixel, float z, vec3 ray, vec2 direction, inout Side front, inout Side back) {
     int fronts = 0, backs = 0;
-    for (int t = STEP; t <= sight && min(fronts, backs) < TAKEN; t += STEP) {
-        ivec2 offset = ivec2(round(float(t) * direction)), at = pixel + offset;
+    for (float t = STEP; t <= sight && min(fronts, backs) < TAKEN; t += max(STEP, GROWTH * t)) {
+        ivec2 offset = ivec2(round(t * direction)), at = pixel + offset;
         if (!in_picture(at)) return;
         float real = texelFetch(real_surface_position, at, 0).w;
         if (real <= 0.0) continue;

@@ -1,4 +1,4 @@
-"""A thing with hair of known mattes before a background, as a colour camera and a depth camera see them."""
+"""Things with known mattes before a background, hair and a hand, as a colour camera and a depth camera see them."""
 
 from dataclasses import dataclass
 
@@ -13,12 +13,12 @@ OVERSAMPLING = 8
 NEAR_M, FAR_M = 0.5, 3.0  # of the thing and the background; objects stand between
 SENSOR_NOISE = 0.004  # of sensor white
 RIM_PX = 4  # within which stereo gives no depth
-HAIR = (0.10, 0.06, 0.035)
+HAIR, SKIN = (0.10, 0.06, 0.035), (0.45, 0.27, 0.19)
 PATTERNS = ("plain", "wood", "checks")
 
 
 @dataclass(frozen=True)
-class HairyThing:
+class Thing:
     """`alpha` (h, w): the thing's true fraction; `front`, `back` (h, w, 3): linear colours of thing and background.
 
     `color` (h, w, 3; uint8) is the camera's picture, `depth` what the node makes of a depth camera that sees no hair,
@@ -46,21 +46,37 @@ class HairyThing:
         return (near > 0) & (inside == 0)
 
 
-def hairy_thing(pattern: str, seed: int = 0) -> HairyThing:
+def hairy_head(pattern: str, seed: int = 0) -> Thing:
     """A head with 100 hairs, 0.3 to 1.6 pixels wide and up to 10 long beyond its outline, before `pattern`."""
     random = np.random.default_rng(seed)
-    alpha = _outline(random)
-    front = np.array(HAIR) * (1 + _smooth(random, 2.0, 0.25))[..., None]
+    return _before(pattern, _head(random), HAIR, random)
+
+
+def hand(pattern: str, seed: int = 0) -> Thing:
+    """A hand whose four fingers are 9 pixels wide, with gaps of 6, before `pattern`."""
+    picture = np.zeros((HEIGHT * OVERSAMPLING, WIDTH * OVERSAMPLING), np.uint8)
+    left, top, right, bottom = np.array([50, 75, 106, HEIGHT]) * OVERSAMPLING
+    picture[top:bottom, left : right + 1] = 255
+    for finger in range(4):
+        ends = np.array([[55 + 15 * finger, 80], [53 + 17 * finger, 30 + 5 * abs(finger - 1)]])
+        cv2.polylines(picture, [ends * OVERSAMPLING], False, 255, 9 * OVERSAMPLING)
+    return _before(pattern, _averaged(picture), SKIN, np.random.default_rng(seed))
+
+
+def _before(
+    pattern: str, alpha: np.ndarray, color_linear: tuple[float, float, float], random: np.random.Generator
+) -> Thing:
+    front = np.array(color_linear) * (1 + _smooth(random, 2.0, 0.25))[..., None]
     back = _background(pattern, random)
     linear = alpha[..., None] * front + (1 - alpha[..., None]) * back
     linear = np.clip(linear + SENSOR_NOISE * random.standard_normal(linear.shape), 0, 1)
     lut = decode_lut(None)[:, 0]
     color = np.searchsorted((lut[1:] + lut[:-1]) / 2, linear).astype(np.uint8)
     depth = clean_depth(depth_image(_depth(alpha, random)), color, DepthSettings())
-    return HairyThing(alpha, front, back, color, depth)
+    return Thing(alpha, front, back, color, depth)
 
 
-def _outline(random: np.random.Generator) -> np.ndarray:
+def _head(random: np.random.Generator) -> np.ndarray:
     picture = np.zeros((HEIGHT * OVERSAMPLING, WIDTH * OVERSAMPLING), np.uint8)
     middle, radius = np.array([80.0, 68.0]), 34.0
     _draw_disc(picture, middle, radius)
@@ -72,6 +88,10 @@ def _outline(random: np.random.Generator) -> np.ndarray:
         ends = np.stack([root, root + random.uniform(4, 12) * turned])
         places = np.rint(ends * OVERSAMPLING).astype(np.int32)
         cv2.polylines(picture, [places], False, 255, max(1, round(random.uniform(0.3, 1.6) * OVERSAMPLING)))
+    return _averaged(picture)
+
+
+def _averaged(picture: np.ndarray) -> np.ndarray:
     return cv2.resize(picture.astype(np.float32) / 255, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
 
 
