@@ -76,6 +76,13 @@ class Output(StrictModel):
         "give way (docs/speed.md); null = no limit.",
     )
     antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
+    matting_px: int = Field(
+        default=0,
+        ge=0,
+        le=16,
+        description="Pixels from real things in front of objects within which hair and fingers that depth does not "
+        "show are found by colour; 0 = edges alone.",
+    )
     camera_artifacts: bool = Field(
         default=False,
         description="Put the camera's noise, sharpness, vignetting, JPEG compression and motion blur on the virtual "

@@ -22,6 +22,7 @@ from deltalight.render_server.passes.coverage import (
     SampleCoverage,
 )
 from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry
+from deltalight.render_server.passes.matting import Matting
 from deltalight.render_server.passes.measured_views import MeasuredViews
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
@@ -187,6 +188,7 @@ class PictureBuffers:
         self._samples: SampleCoverage | None = None
         self._interior_edges: InteriorEdgeAA | None = None
         self._unmixing = EdgeUnmixing(gpu, size)
+        self._matting: Matting | None = None
         self._surfaces = gpu.ctx.buffer(reserve=MAX_ROWS * 80)
 
     @property
@@ -239,6 +241,17 @@ class PictureBuffers:
         covered = None if surface.samples is None else surface.samples.texture
         self.coverage.run(rectangle, scene, covered)
         self._unmixing.run(self.coverage, scene, covered)
+        if view.matting_px:
+            if self._matting is None:
+                self._matting = Matting(self._gpu, view.size)
+            self._matting.run(
+                self.coverage,
+                self._unmixing,
+                view.matting_px,
+                rectangle=rectangle,
+                scene=scene,
+                sample_coverage=covered,
+            )
         return surface
 
     def _draw_samples(
@@ -271,6 +284,7 @@ class PictureBuffers:
         """Frees the GL objects."""
         release_all(
             self._unmixing,
+            self._matting,
             self._observed,
             self.measured,
             self.coverage,

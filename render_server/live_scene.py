@@ -345,14 +345,16 @@ class LiveScene:
         """Sets what graphs of these frames' sizes render them from."""
         assert real.state is not None
         assert self.lighting.lights is not None
+        output = self._plan.scene.output
         for graph, camera, each in zip(graphs, real.cameras, taken, strict=True):
             size = each.view.size
             # While nothing moves, the pose's own jitter must not shake the picture.
             view = camera.seen.at(size).view
+            view = view.with_antialiasing if output.antialiasing else view
             graph.set_inputs(
                 FrameInputs(
                     each.frame,
-                    view.with_antialiasing if self._plan.scene.output.antialiasing else view,
+                    view.with_matting(output.matting_px),
                     camera.scan(size),
                     camera.measurement(size),
                     real.state,

@@ -40,21 +40,27 @@ class CameraView:
     """Pose and lens of a picture.
 
     `world_from_camera` is (4, 4), optical frame (+x right, +y down, +z forward). `antialiased`: the objects'
-    geometry buffer is resolved from several samples per pixel, on the picture's own grid.
+    geometry buffer is resolved from several samples per pixel, on the picture's own grid. `matting_px`: pixels from
+    real things within which hair and fingers before objects are found by colour.
     """
 
     camera: CameraModel
     world_from_camera: Float64[np.ndarray, "4 4"]
     antialiased: bool = False
+    matting_px: int = 0
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, CameraView):
             return NotImplemented
-        same_kind = self.camera == other.camera and self.antialiased == other.antialiased
-        return same_kind and np.array_equal(self.world_from_camera, other.world_from_camera)
+        same_kind = self.antialiased == other.antialiased and self.matting_px == other.matting_px
+        return (
+            same_kind
+            and self.camera == other.camera
+            and np.array_equal(self.world_from_camera, other.world_from_camera)
+        )
 
     def __hash__(self) -> int:
-        return hash((self.camera, self.world_from_camera.tobytes(), self.antialiased))
+        return hash((self.camera, self.world_from_camera.tobytes(), self.antialiased, self.matting_px))
 
     @cached_property
     def with_antialiasing(self) -> "CameraView":
@@ -65,6 +71,10 @@ class CameraView:
     def without_antialiasing(self) -> "CameraView":
         """Returns the view for passes that raster the objects, or sample such a raster through the lens."""
         return replace(self, antialiased=False)
+
+    def with_matting(self, reach_px: int) -> "CameraView":
+        """Returns the view for stages that find mattes within `reach_px` pixels of real things; 0 = none."""
+        return replace(self, matting_px=reach_px) if reach_px != self.matting_px else self
 
     @property
     def size(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
-from deltalight.render_server.passes.coverage import RIM_SIGHT
+from deltalight.render_server.passes.coverage import SURFACE_REACH
 from deltalight.render_server.passes.gbuffer import CameraImage, rgba_bytes
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
@@ -99,7 +99,11 @@ class Composite:
         self._ratio = texture_2d(gpu, size, 4, "f4")
         self._again = Kernel(gpu, "recompose")
         self._kernel = Kernel(
-            gpu, "composite", FILL_RADIUS=FILL_RADIUS, RIM_SIGHT=RIM_SIGHT, RAY_ROUGHNESS=RAY_ROUGHNESS
+            gpu,
+            "composite",
+            FILL_RADIUS=FILL_RADIUS,
+            SURFACE_REACH=SURFACE_REACH,
+            RAY_ROUGHNESS=RAY_ROUGHNESS,
         )
 
     def run(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:

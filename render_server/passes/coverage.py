@@ -21,6 +21,8 @@ RIM_SIGHT = 6
 
 Behind the two pixels that may be mixed there are four more on either side.
 """
+SURFACE_REACH = 22
+"""Pixels within which the surface that represents a mixed pixel may lie: half floats hold so many offsets exactly."""
 
 
 class SampleCoverage:
@@ -146,7 +148,7 @@ class EdgeUnmixing:
         self._threads = list_threads(gpu)
         self.texture = texture_2d(gpu, size, 4, "f2")
         self._target = gpu.ctx.framebuffer(color_attachments=[self.texture])
-        self._kernel = Kernel(gpu, "edge_unmixing", RIM_SIGHT=RIM_SIGHT)
+        self._kernel = Kernel(gpu, "edge_unmixing", RIM_SIGHT=RIM_SIGHT, SURFACE_REACH=SURFACE_REACH)
 
     def run(
         self, coverage: ObjectCoverage, scene: Bindings, sample_coverage: moderngl.Texture | None = None

@@ -15,6 +15,7 @@ from deltalight.render_server.passes.caustics import TILE
 from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.cones import reuse_define
 from deltalight.render_server.passes.lpv import LpvPropagate
+from deltalight.render_server.passes.matting import Matting
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.material_file import write_material
@@ -191,6 +192,11 @@ def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     RasterKernel(gpu, "transfer_raster").release()
 
 
+def soft_mattes(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
+    """Compiles matting."""
+    Matting(gpu, (16, 16)).release()
+
+
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
@@ -200,4 +206,5 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     "by device": by_device,
     "image-based shading": image_based,
     "precomputed transfer": precomputed_transfer,
+    "soft mattes": soft_mattes,
 }

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import parse_scene
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_objects import Pose
@@ -185,6 +186,35 @@ def test_real_surface_in_front_hides_the_object_but_not_its_shadow(gpu: GpuConte
     found = solve(gpu, document, frame(pose=above))
     assert found.matte.max() == 1
     assert (found.direct_mu - found.direct_rho).max() > 0.5
+
+
+def hand_above(first_column: int) -> ViewFrame:
+    """A hand 0.4 m above the floor, 40 pixels wide and high, seen from 1 m above."""
+    depth = np.full((HEIGHT, WIDTH), 1.05, np.float32)
+    depth[40:80, first_column : first_column + 40] = 0.6
+    return frame(plain(), pose=look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), depth=depth_image(depth))
+
+
+def test_what_the_depth_camera_sees_casts_its_shadow_on_objects(gpu: GpuContext, stage: Stage) -> None:
+    """And the shadow goes with it. The light slants by half its height towards +x: by 0.2 m, 30 pixels.
+
+    Within three pixels: the mesh of the depth is coarse here.
+    """
+    slab = shifted(trimesh.creation.box((0.9, 0.6, 0.02)), 0, 0, -0.01)
+    lights = [directional((0.5, 0.0, -1.0)), ambient(0.05)]
+    renderer = SceneRenderer(gpu, stage.document([stage.virtual(slab)], lights), with_linear=True)
+    for number, first_column in enumerate((20, 5)):
+        view = replace(hand_above(first_column), frame_id=number, timestamp_ns=number * 50_000_000)
+        linear = renderer.render(view).linear
+        assert linear is not None
+        row = linear[HEIGHT // 2, first_column + 42 : 140, 0]  # right of the hand, on the slab
+        dark = np.flatnonzero(row < (row.min() + row.max()) / 2) + first_column + 42
+        middle = (WIDTH - 1) / 2
+        left, right = (np.array([first_column, first_column + 40]) - 0.5 - middle) * 0.6 + 30 + middle
+        assert dark.min() == pytest.approx(left, abs=3)
+        assert dark.max() == pytest.approx(right, abs=3)
+        assert row.min() < 0.25 * row.max()
+    renderer.release()
 
 
 def test_pixels_beyond_every_influence_are_the_cameras(gpu: GpuContext, stage: Stage) -> None:

@@ -26,7 +26,7 @@ uniform sampler2D cone_specular_mu;
 uniform sampler2D cone_specular_rho;
 uniform sampler2D change_ratio;
 uniform sampler2D reflection;         // of objects in smooth surfaces, by rays; a: fraction of the lobe
-uniform sampler2D edge_correction;    // edge_unmixing.comp.glsl
+uniform sampler2D edge_correction;    // common/edge_sides.glsl
 #pragma switch bool has_reflection
 uniform float exposure_scale;
 #include "common/camera.glsl"
@@ -154,8 +154,8 @@ vec3 aces(vec3 x) { return clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) 
 
 // The pixel that represents a pixel's surface: another one at the rims of real things in front of objects.
 ivec2 surface_pixel(ivec2 pixel) {
-    int code = int(texelFetch(edge_correction, pixel, 0).a) - 1, width = 2 * RIM_SIGHT + 1;
-    return code < 0 ? pixel : pixel + ivec2(code % width, code / width) - RIM_SIGHT;
+    int code = int(texelFetch(edge_correction, pixel, 0).a) - 1, width = 2 * SURFACE_REACH + 1;
+    return code < 0 ? pixel : pixel + ivec2(code % width, code / width) - SURFACE_REACH;
 }
 
 void compose(ivec2 pixel) {

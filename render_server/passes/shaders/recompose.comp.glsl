@@ -8,7 +8,7 @@ layout(rgba8ui) writeonly uniform uimage2D code_out;
 layout(rgba32f) readonly uniform image2D relit_ratio;
 layout(rgba16f) readonly uniform image2D virtual_radiance;
 uniform sampler2D object_coverage;
-uniform sampler2D edge_correction;   // edge_unmixing.comp.glsl
+uniform sampler2D edge_correction;   // common/edge_sides.glsl
 uniform isampler2D sample_pixels;
 uniform int scale;
 uniform float exposure_scale;

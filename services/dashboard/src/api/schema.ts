@@ -2875,6 +2875,12 @@ export interface components {
              */
             readonly height?: number | null;
             /**
+             * Matting Px
+             * @description Pixels from real things in front of objects within which hair and fingers that depth does not show are found by colour; 0 = edges alone.
+             * @default 0
+             */
+            readonly matting_px: number;
+            /**
              * Tone
              * @description The camera's own response, or ACES.
              * @default camera

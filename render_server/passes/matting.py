@@ -1,0 +1,99 @@
+"""Soft mattes of real things in front of objects: hair and the like, found by colour where depth does not show it."""
+
+import moderngl
+
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing, ObjectCoverage
+from deltalight.render_server.view import Rectangle
+
+BLOCK = 4  # pixels an edge, at which nearest depths are kept
+# Length of rays per pixel of reach: between spread fingers the nearest certain background lies beyond the hand.
+SIGHT_PER_REACH = 8
+
+
+class Matting:
+    """Finds by colour which fraction of a pixel real things fill, within reach of their edges by depth.
+
+    Corrects the coverage and the unmixing of edges, which stay as they are where colours do not tell.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._threads = list_threads(gpu)
+        blocks = -(-size[0] // BLOCK), -(-size[1] // BLOCK)
+        self._size = size
+        self._nearest, self._within_reach = (texture_2d(gpu, blocks, 4, "f4") for _ in range(2))
+        self._band = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
+        self._nearest_kernel = Kernel(gpu, "nearest_depth")
+        self._band_kernel = Kernel(gpu, "matting_band", BLOCK=BLOCK)
+        self._kernel = Kernel(gpu, "matting", BLOCK=BLOCK, SURFACE_REACH=SURFACE_REACH)
+
+    def run(
+        self,
+        coverage: ObjectCoverage,
+        unmixing: EdgeUnmixing,
+        reach_px: int,
+        *,
+        rectangle: Rectangle,
+        scene: Bindings,
+        sample_coverage: moderngl.Texture | None,
+    ) -> None:
+        """Corrects what both hold of the pixels of `rectangle`, which encloses the objects.
+
+        `reach_px` is rounded up to whole blocks; the other arguments are those of `ObjectCoverage.run`.
+        """
+        self._band.write(bytes(4))
+        if rectangle[2] <= 0 or rectangle[3] <= 0:
+            return
+        own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}
+        sight = SIGHT_PER_REACH * reach_px
+        self._find_nearest(scene, rectangle, sight, -(-reach_px // BLOCK))
+        self._band_kernel.run(
+            rectangle[2:],
+            scene,
+            own,
+            rectangle=rectangle,
+            nearest_depth=self._within_reach,
+            Texels=self._band,
+        )
+        self._kernel.run(
+            (self._threads,),
+            scene,
+            own,
+            nearest_depth=self._within_reach,
+            object_coverage=coverage.texture,
+            edge_correction=unmixing.texture,
+            Texels=self._band,
+            sight=float(sight),
+        )
+
+    def _find_nearest(self, scene: Bindings, rectangle: Rectangle, sight: int, reach: int) -> None:
+        """Keeps the least depth within `reach` blocks of each block that rays from the rectangle meet."""
+        for source, margin, stride, window, target in (
+            (scene["real_surface_position"], sight + reach * BLOCK, BLOCK, (0, BLOCK), self._nearest),
+            (self._nearest, sight, 1, (-reach, 2 * reach + 1), self._within_reach),
+        ):
+            blocks = self._blocks_around(rectangle, margin)
+            self._nearest_kernel.run(
+                blocks[2:], source=source, blocks=blocks, stride=stride, window=window, nearest_out=target
+            )
+
+    def _blocks_around(self, rectangle: Rectangle, margin: int) -> Rectangle:
+        """Returns the blocks within `margin` pixels of a rectangle of pixels."""
+        x, y, width, height = rectangle
+        left, top = max(x - margin, 0) // BLOCK, max(y - margin, 0) // BLOCK
+        right = -(-min(x + width + margin, self._size[0]) // BLOCK)
+        bottom = -(-min(y + height + margin, self._size[1]) // BLOCK)
+        return left, top, right - left, bottom - top
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(
+            self._nearest,
+            self._within_reach,
+            self._band,
+            self._nearest_kernel,
+            self._band_kernel,
+            self._kernel,
+        )

@@ -1,0 +1,16 @@
+// Lists the pixels of objects whose matte is unknown for matting.comp.glsl.
+#include "common/matting_band.glsl"
+#define APPENDS_TEXELS
+#include "common/work_list.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+uniform ivec4 rectangle;   // that may show an object: first column and row, width and height
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, rectangle.zw))) return;
+    pixel += rectangle.xy;
+    float z = depth_shown(pixel);
+    if (z > 0.0 && near_front(pixel, z) && !inside_front(pixel, z))
+        append_texel(pixel, textureSize(real_surface_position, 0).x);
+}

@@ -1,0 +1,155 @@
+"""Soft mattes: hair and fingers that depth does not show, before an object, against mattes that are known.
+
+`pytest -s` prints the errors in the band around the thing, beside those by depth alone and of OpenCV's guided filter.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from tests.render_server.matted_things import FAR_M, NEAR_M, PATTERNS, Thing, hairy_head, hand
+from tests.render_server.scenes import (
+    HEIGHT,
+    WIDTH,
+    ObjectsRenderer,
+    Stage,
+    ambient,
+    ball,
+    camera,
+    cube,
+    depth_image,
+    directional,
+    floor_depth,
+    frame,
+    look_at,
+    noisy,
+    plain,
+    unlit,
+)
+from tests.render_server.test_antialiasing import ABOVE, GLOW
+from tests.render_server.test_edge_unmixing import corrections, glowing, lit_picture
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+REACH_PX = 8
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    return Stage(tmp_path)
+
+
+def matted(document: SceneDocument, reach_px: int = REACH_PX, **output: object) -> SceneDocument:
+    return document.replaced(output=document.output.replaced(matting_px=reach_px, **output))
+
+
+def guided(thing: Thing, radius: int = 32, epsilon: float = 1e-4) -> np.ndarray:
+    """The matte by depth after the guided filter of He et al. (2013), at its best of radii 8 to 32, 1e-5 to 1e-3."""
+    hard = 255 * thing.by_depth.astype(np.uint8)
+    return np.asarray(cv2.ximgproc.guidedFilter(thing.color, hard, radius, epsilon * 255**2) / 255.0)
+
+
+def before_glow(alpha: np.ndarray, color: np.ndarray) -> np.ndarray:
+    return np.asarray(alpha[..., None] * color + (1 - alpha[..., None]) * GLOW)
+
+
+def coded(linear: np.ndarray) -> np.ndarray:
+    return np.searchsorted(decode_lut(None)[:, 0], np.clip(linear, 0, 1)) / 255
+
+
+def errors(name: str, thing: Thing, alpha: np.ndarray, linear: np.ndarray) -> tuple[float, float]:
+    """Of the matte (r.m.s.), and of the coded picture before an object that glows (dB), within the band."""
+    band = thing.band(REACH_PX)
+    off = (alpha - thing.alpha)[band]
+    picture = (coded(linear) - coded(before_glow(thing.alpha, thing.front)))[band]
+    rms, psnr = float(np.sqrt(np.mean(off**2))), float(-10 * np.log10(np.mean(picture**2)))
+    print(f"{name:16} SAD {np.abs(off).sum():6.1f}  rms {rms:.3f}  {psnr:5.2f} dB")
+    return rms, psnr
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_hair_is_nearer_to_the_truth_than_by_depth_or_by_a_guided_filter(
+    objects: ObjectsRenderer, stage: Stage, pattern: str
+) -> None:
+    thing, document = hairy_head(pattern), unlit(glowing(stage))
+    linear = decode_lut(None)[thing.color, 0]
+    print(f"\n{pattern}, {np.count_nonzero(thing.band(REACH_PX))} pixels")
+    hard, smooth = thing.by_depth.astype(float), guided(thing)
+    errors("depth", thing, hard, before_glow(hard, linear))
+    filtered = errors("guided filter", thing, smooth, before_glow(smooth, linear))
+    edges = objects.linear(document, thing.view(pose=ABOVE))
+    errors("matting_px: 0", thing, 1 - objects.newest_coverage(), edges)
+    found = objects.linear(matted(document), thing.view(pose=ABOVE))
+    rms, psnr = errors(f"matting_px: {REACH_PX}", thing, 1 - objects.newest_coverage(), found)
+    assert rms < 0.8 * filtered[0]
+    assert psnr > filtered[1] + 4
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_fingers_that_depth_misses_are_found(objects: ObjectsRenderer, stage: Stage, pattern: str) -> None:
+    thing, document = hand(pattern), unlit(glowing(stage))
+    print(f"\nhand, {pattern}, {np.count_nonzero(thing.band(REACH_PX))} pixels")
+    edges = objects.linear(document, thing.view(pose=ABOVE))
+    before = errors("matting_px: 0", thing, 1 - objects.newest_coverage(), edges)
+    found = objects.linear(matted(document), thing.view(pose=ABOVE))
+    after = errors(f"matting_px: {REACH_PX}", thing, 1 - objects.newest_coverage(), found)
+    assert after[0] < 0.4 * before[0]
+    assert after[1] > before[1] + 8
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.3])
+def test_through_a_lens_with_antialiasing(objects: ObjectsRenderer, stage: Stage, distortion: float) -> None:
+    lens, thing = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0)), hairy_head("plain")
+    document = matted(unlit(glowing(stage, size=250)), antialiasing=True)
+    alpha = 1 - objects.coverage(document, thing.view(pose=ABOVE, camera=lens))
+    off = (alpha - thing.alpha)[thing.band(REACH_PX)]
+    assert np.sqrt(np.mean(off**2)) < 0.03
+
+
+def test_hair_is_lit_like_the_thing_and_not_like_the_shaded_background(gpu: GpuContext, stage: Stage) -> None:
+    """The object shades all of the background; hair has the light of the thing that depth shows."""
+    thing = hairy_head("plain")
+    document = matted(glowing(stage, directional((0.0, 0.0, -1.0), 2.0)))
+    found = lit_picture(gpu, document, thing.view(pose=ABOVE))
+    off = found - before_glow(thing.alpha, thing.front)
+    assert np.sqrt(np.mean(off[thing.band(REACH_PX)] ** 2)) < 0.02
+
+
+def test_equal_colours_leave_the_choice_to_depth(objects: ObjectsRenderer, stage: Stage) -> None:
+    document, view = (
+        unlit(glowing(stage)),
+        frame(plain(), pose=ABOVE, depth=hairy_head("plain").depth),
+    )
+    by_depth = objects.coverage(document, view)
+    assert np.abs(objects.coverage(matted(document), view) - by_depth).max() < 0.2
+
+
+def test_the_floor_has_no_matte_where_an_object_stands_on_it(objects: ObjectsRenderer, stage: Stage) -> None:
+    things = [stage.virtual(cube()), stage.virtual(ball(at=(0.1, 0, 0.03)))]
+    document = unlit(stage.document(things, [ambient(0.2)]))
+    view = frame(noisy(), depth=depth_image(floor_depth(look_at())))
+    by_depth = objects.coverage(document, view)
+    assert np.array_equal(objects.coverage(matted(document), view), by_depth)
+    assert not corrections(objects).any()
+
+
+def test_the_cameras_bytes_where_no_object_lies_behind(objects: ObjectsRenderer, stage: Stage) -> None:
+    thing = hairy_head("checks")
+    result = objects.draw(matted(unlit(glowing(stage, size=60))), thing.view(pose=ABOVE))
+    shown = objects.newest_coverage() > 0
+    assert 0 < np.count_nonzero(shown) < 60 * 60
+    assert np.array_equal(result.color[~shown], thing.color[~shown])
+
+
+def test_what_ends_at_the_border_of_the_picture(objects: ObjectsRenderer, stage: Stage) -> None:
+    """Nothing is read or written beyond it, and nothing is made up where there is no background."""
+    near = np.full((HEIGHT, WIDTH), NEAR_M, np.float32)
+    near[:, 3:] = FAR_M
+    document, view = unlit(glowing(stage)), frame(plain(), pose=ABOVE, depth=depth_image(near))
+    found = objects.linear(matted(document, 16), view)
+    assert np.isfinite(found).all()
+    assert found[:, 20:] == pytest.approx(GLOW, abs=1e-3)
