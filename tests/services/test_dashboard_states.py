@@ -171,7 +171,7 @@ def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk)
     expect(page.page.locator(".skeleton").first).to_be_visible()
     page.photograph("connecting")
     shown = page.page.locator("body").inner_text()
-    for false in ("None yet", "No scene", "No lamps", "Given model", "No object", "Voxel cone", "view only"):
+    for false in ("None yet", "No scene", "No lights", "Given model", "No object", "Voxel cone", "view only"):
         assert false not in shown, false
     for route in answered:
         route.continue_()
