@@ -64,7 +64,7 @@ def render(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Render a recording to pictures, OUT/000000.png and so on, and their facts in OUT/frames.jsonl; or to a video."""
+    """Render a recording to pictures, OUT/000000.png and so on, with facts in OUT/frames.jsonl; or to a video."""
     from deltalight.protocol.method_names import with_method
     from deltalight.protocol.source import open_source
     from deltalight.services.commands.options import parse_frames, parse_size
