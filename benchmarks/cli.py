@@ -20,15 +20,15 @@ TIMED_METHODS = "raster,none,exact,paper,dlpv"
 VIEWS_METHODS = "exact,exact:caustics=false,paper,dlpv"
 DEFAULT_MOTIONS = "camera,object,arm,lamps,still"
 
-Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")]
+Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default: the demo's.")]
 Device = Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")]
-ReportFile = Annotated[Path | None, typer.Option(help="File for the report as JSON.")]
+ReportFile = Annotated[Path | None, typer.Option("--out", "-o", help="File for the report as JSON.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 
 METHODS_HELP = (
     "dvct (the scene's own), raster (objects without shadows: a floor), none (objects without relighting), exact, "
     "paper, dlpv, dlpv-paper, aroof, differential, a plugin's; or exact:KEY=VALUE[,KEY=VALUE], likewise for the "
-    "others but none."
+    "others except none."
 )
 MOTIONS_HELP = "What moves: camera, object, arm, lamps, still; separated by commas."
 
@@ -43,7 +43,7 @@ def speed(
     size: Size = None,
     methods: Annotated[str, typer.Option(help=METHODS_HELP)] = TIMED_METHODS,
     motions: Annotated[str, typer.Option(help=MOTIONS_HELP)] = DEFAULT_MOTIONS,
-    frames: Annotated[int, typer.Option(min=1, max=10_000, help="Frames of each measurement.")] = 30,
+    frames: Annotated[int, typer.Option(min=1, max=10_000, help="Frames per measurement.")] = 30,
     budget_ms: Annotated[
         float, typer.Option(min=0.1, help="Frames that take longer are counted as late, ms.")
     ] = 100.0,
@@ -59,7 +59,7 @@ def speed(
     out: ReportFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Time every stage of a frame while camera, object, real scene or light moves, and camera to viewer."""
+    """Time each stage of a frame while camera, object, real scene or light moves, and the delay to the viewer."""
     if compare is not None:
         from deltalight.benchmarks.speed.command import run_comparison
 
@@ -78,7 +78,7 @@ def counts(
     methods: Annotated[str, typer.Option(help=METHODS_HELP)] = TIMED_METHODS,
     motions: Annotated[str, typer.Option(help=MOTIONS_HELP)] = DEFAULT_MOTIONS,
     frames: Annotated[
-        int, typer.Option(min=1, max=1000, help="Frames that are counted, and as many timed without the GPU.")
+        int, typer.Option(min=1, max=1000, help="Frames to count, and as many again to time without the GPU.")
     ] = 8,
     device: Device = None,
     out: ReportFile = None,
@@ -119,12 +119,10 @@ def sweep(
     *,
     full: Annotated[
         bool,
-        typer.Option(
-            "--full", help="All sizes, for a GPU: up to 512 voxels an edge; default what two CPUs do."
-        ),
+        typer.Option("--full", help="All sizes, up to 512 voxels along each edge: for a GPU."),
     ] = False,
     size: Size = None,
-    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames of each size.")] = 8,
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames per size.")] = 8,
     device: Device = None,
     out: ReportFile = None,
     as_json: AsJson = False,
@@ -142,7 +140,7 @@ def sweep(
 def quality(
     *,
     scenes: Annotated[
-        str | None, typer.Option(help="Benchmark scenes, separated by commas; default all.")
+        str | None, typer.Option(help="Benchmark scenes, separated by commas; default: all.")
     ] = None,
     methods: Annotated[
         str,
@@ -153,14 +151,17 @@ def quality(
         ),
     ] = DEFAULT_METHODS,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="Compare the paper's operator with ours, one switch a row.")
+        bool, typer.Option("--ablation", help="Compare the paper's operator with ours, one switch per row.")
     ] = False,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the pictures.")] = "320x240",
     volume: Annotated[
-        int | None, typer.Option(min=32, max=512, help="Voxels an edge; default as the machine can.")
+        int | None,
+        typer.Option(min=32, max=512, help="Voxels along each edge; default: what this machine can do."),
     ] = None,
-    spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel of the truth; a multiple of 8.")] = 512,
-    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("quality"),
+    spp: Annotated[
+        int, typer.Option(min=1, help="Light paths per pixel of the truth; a multiple of 8.")
+    ] = 512,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path("quality"),
     device: Device = None,
     as_json: AsJson = False,
 ) -> None:
@@ -183,11 +184,11 @@ def quality(
 def real(
     *,
     data: Annotated[Path, typer.Option(help="Folder of real pairs: carton_table and robot_bins.")],
-    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("real"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path("real"),
     device: Device = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare relit tables with photographs taken with and without things: lights fitted in one, tested in others."""
+    """Compare relit tables with photographs with and without things: lights are fitted in one, tested in others."""
     try:
         from deltalight.benchmarks.real.command import run_real
     except ModuleNotFoundError as missing:
@@ -203,14 +204,14 @@ def plot(
     speed: Annotated[
         list[Path],
         typer.Option(
-            help="Report of `bench speed`; may be given again: of a method in several the first counts."
+            help="Report of `bench speed`; may be given more than once: the first report that has a method counts."
         ),
     ],
     quality: Annotated[Path, typer.Option(help="quality.json in a report folder of `bench quality`.")],
-    out: Annotated[Path, typer.Option(metavar="FILE.svg", help="File for the picture.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.svg", help="File for the picture.")],
     motion: Annotated[str, typer.Option(help="What moves while frames are timed.")] = "camera",
 ) -> None:
-    """Draw speed against quality: every method that both reports hold is a point."""
+    """Plot speed against quality, a point for each method that both reports have."""
     from deltalight.benchmarks.plot import draw_plot, read_plot
     from deltalight.protocol.files import write_bytes
 
@@ -224,7 +225,9 @@ def plot(
 @bench.command()
 def rest(
     *,
-    seconds: Annotated[float, typer.Option(min=0.2, max=3600, help="Length of each measurement.")] = 20.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.2, max=3600, help="Duration of each measurement, s.")
+    ] = 20.0,
     size: Size = None,
     device: Device = None,
     out: ReportFile = None,
@@ -253,7 +256,8 @@ def rest(
 def soak(
     *,
     minutes: Annotated[
-        float, typer.Option(min=0, max=7 * 24 * 60, help="Length; each fault is run at least once.")
+        float,
+        typer.Option(min=0, max=7 * 24 * 60, help="Duration in minutes; each fault happens at least once."),
     ] = 2.0,
     profile: Annotated[
         str,
@@ -270,11 +274,11 @@ def soak(
         ),
     ] = "all",
     seed: Annotated[
-        int, typer.Option(min=0, help="What the order of faults and all chance in them follow.")
+        int, typer.Option(min=0, help="Seed of the order of the faults and of all that is random in them.")
     ] = 0,
-    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("soak"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path("soak"),
 ) -> None:
-    """Run a station of real processes under faults, and report what became of age, rate, memory and handles."""
+    """Run a station of real processes under faults, and report delay, rate, memory and open files."""
     from deltalight.benchmarks.soak.command import SoakJob, print_report, run_soak
     from deltalight.benchmarks.soak.faults import parse_faults
     from deltalight.benchmarks.soak.profiles import choose_profile
@@ -297,14 +301,14 @@ def _speed_job(methods: str, motions: str, frames: int, size: str | None, device
 
 def gpu_check(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for the report and pictures that differ.")] = Path(
-        "gpu-check"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for the report and pictures that differ.")
+    ] = Path("gpu-check"),
     steps: Annotated[
         str | None,
         typer.Option(
             help="Steps, separated by commas: doctor, shaders, pictures, speed, memory, leaks, quality, tests, "
-            "slow-tests; default all."
+            "slow-tests; default: all."
         ),
     ] = None,
 ) -> None:

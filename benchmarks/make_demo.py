@@ -105,9 +105,9 @@ def write_truth(out: Path, spp: int, progress: Progress) -> None:
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for demo.mcap, object.glb and scene.json.")],
-    spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel of the recording.")] = 192,
+    spp: Annotated[int, typer.Option(min=1, help="Light paths per pixel of the recording.")] = 192,
     truth: Annotated[Path | None, typer.Option(help="Folder for noise-free pictures of frame 0.")] = None,
-    truth_spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel of these.")] = 1024,
+    truth_spp: Annotated[int, typer.Option(min=1, help="Light paths per pixel of these.")] = 1024,
 ) -> None:
     """Render the demo recording and its virtual object."""
     try:

@@ -198,7 +198,7 @@ class EnvironmentLights(StrictModel):
     map: Asset | None = Field(default=None, description=f"Radiance map: {ASSET_TEXT}")
     up: Direction = Field(default=(0.0, 0.0, 1.0), description="The map's up axis in world axes; normalised.")
     rotation_deg: float = Field(
-        default=0.0, ge=-360, le=360, description="Turn of the map about up, degrees."
+        default=0.0, ge=-360, le=360, description="Rotation of the map about its up axis, degrees."
     )
     intensity: NonNegative = Field(default=1.0, description="Factor on the map's radiance.")
 

@@ -17,7 +17,7 @@ VolumeEdge = Annotated[
 ]
 ShadowMapSize = Annotated[
     Annotated[int, Field(ge=128, le=4096)] | None,
-    Field(description="Texels an edge of a shadow map; null = 1024 GPU, 512 software."),
+    Field(description="Texels along each edge of a shadow map; null = 1024 GPU, 512 software."),
 ]
 TriangleBudget = Annotated[
     Annotated[int, Field(ge=1000, le=4_000_000)] | None,
@@ -74,7 +74,7 @@ class VoxelConeSettings(MethodSettings):
         ge=32,
         le=512,
         multiple_of=8,
-        description="Voxels an edge; null = 256 on a GPU, 64 in software.",
+        description="Voxels along each edge; null = 256 on a GPU, 64 in software.",
     )
     volume_edge_m: VolumeEdge = None
     cone_scale: Literal[1, 2, 4] | None = Field(
@@ -93,7 +93,7 @@ class VoxelConeSettings(MethodSettings):
     triangle_budget: TriangleBudget = None
     voxels: Literal["directional", "isotropic"] = Field(
         default="directional",
-        description="Of the exact operator: six one-sided directions a voxel, or one for all (as in the paper).",
+        description="Of the exact operator: six one-sided directions per voxel, or one for all (as in the paper).",
     )
     coverage: Literal["summed", "multiplied"] = Field(
         default="summed",
@@ -176,7 +176,7 @@ class DlpvMethod(MethodSettings):
         ge=16,
         le=64,
         multiple_of=8,
-        description="Cells an edge; more make it costlier, not better.",
+        description="Cells along each edge; more make it costlier, not better.",
     )
     volume_edge_m: VolumeEdge = None
     steps: int | None = Field(
@@ -187,7 +187,7 @@ class DlpvMethod(MethodSettings):
     )
     objects_volume_size: PrintedCells = Field(
         default=None,
-        description="Of operator paper: cells an edge of the volume that lights the objects; "
+        description="Of operator paper: cells along each edge of the volume that lights the objects; "
         "null = volume_size.",
     )
     objects_steps: int | None = Field(
@@ -198,7 +198,7 @@ class DlpvMethod(MethodSettings):
     )
     direct_volume_size: PrintedCells = Field(
         default=None,
-        description="Of shadow lobe: cells an edge of the volume of direct light; null = volume_size.",
+        description="Of shadow lobe: cells along each edge of the volume of direct light; null = volume_size.",
     )
     direct_steps: int | None = Field(
         default=None,
@@ -359,7 +359,7 @@ class AroofMethod(MethodSettings):
         default=4,
         ge=3,
         le=5,
-        description="Bands of spherical harmonics of what an object hides: 9, 16 or 25 coefficients a sample.",
+        description="Bands of spherical harmonics of what an object hides: 9, 16 or 25 coefficients per sample.",
     )
     shells: int = Field(
         default=4, ge=2, le=6, description="Grids of samples around an object, each within the next."
@@ -369,7 +369,7 @@ class AroofMethod(MethodSettings):
         ge=12,
         le=48,
         multiple_of=4,
-        description="Samples an edge of each shell.",
+        description="Samples along each edge of each shell.",
     )
     reach: float = Field(
         default=8.0,

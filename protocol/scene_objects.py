@@ -109,7 +109,7 @@ class Animation(StrictModel):
         default=1.0,
         ge=-100,
         le=100,
-        description="Clip seconds a second; 0 holds `offset_s`, below 0 backwards.",
+        description="Clip seconds per second; 0 holds it at `offset_s`, below 0 plays it backwards.",
     )
     offset_s: float = Field(
         default=0.0, ge=-1e12, le=1e12, description="Clip time at capture time 0, seconds."

@@ -23,7 +23,7 @@ class Shading(StrictModel):
         default=40,
         ge=1,
         le=64,
-        description="Of image_based and precomputed: samples a pixel of what a surface mirrors.",
+        description="Of image_based and precomputed: samples per pixel of what a surface mirrors.",
     )
     occlusion_radius_m: float | None = Field(
         default=None,

@@ -312,6 +312,7 @@ def _libigl(positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, 
     def cast(origins: Float32[np.ndarray, "r 3"], directions: Float32[np.ndarray, "r 3"]) -> FirstHits:
         rays = zip(origins, directions, strict=True)
         found = np.array([scene.intersectRay_first(*ray) for ray in rays]).reshape(-1, 4)
-        return FirstHits(found[:, 0].astype(np.int32), *found[:, 2:].astype(np.float32).T)
+        with np.errstate(over="ignore"):  # rays that meet nothing have any u and v
+            return FirstHits(found[:, 0].astype(np.int32), *found[:, 2:].astype(np.float32).T)
 
     return cast

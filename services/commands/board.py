@@ -69,12 +69,14 @@ def board(
     first_id: Annotated[int, typer.Option(min=0, help="Id of the first marker.")] = 0,
     lamp_marker: Annotated[
         list[int] | None,
-        typer.Option(help="Id of a marker to fix to a lamp, on a page of its own; repeat it."),
+        typer.Option(
+            help="Id of a marker to fix to a lamp, on a page of its own; may be given more than once."
+        ),
     ] = None,
     lamp_marker_mm: Annotated[float, typer.Option(help="Outer edge of the lamps' markers, mm.")] = 40.0,
-    force: Annotated[bool, typer.Option("--force", help="Write over older files.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite older files.")] = False,
 ) -> None:
-    """Write a marker board as true-scale PDF, with its board.yaml."""
+    """Write a marker board as a true-scale PDF, and its board.yaml."""
     from deltalight.protocol.board import save_board_yaml
     from deltalight.protocol.files import replacing
     from deltalight.services.board_pdf import choose_page, margins_m, write_board_pdf

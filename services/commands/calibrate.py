@@ -139,7 +139,12 @@ def _calibrate_lens(job: _LensJob, *, force: bool, as_json: bool) -> None:
 def extrinsics(
     source: RecordedSource,
     *,
-    what: Annotated[Transform, typer.Option(help="Transform to find; world_from_fisheye: a fixed probe.")],
+    what: Annotated[
+        Transform,
+        typer.Option(
+            help="Transform to find; world_from_fisheye is for a fish-eye camera that stands still."
+        ),
+    ],
     out: Out,
     target: Annotated[Path | None, typer.Option(help="board.yaml; default: the source's board.")] = None,
     force: Force = False,

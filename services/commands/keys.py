@@ -8,7 +8,7 @@ import typer
 
 from deltalight.protocol.errors import DeltalightError
 
-keys = typer.Typer(no_args_is_help=True, help="Manage keys for connections to other machines.")
+keys = typer.Typer(no_args_is_help=True, help="Manage keys for connections to other hosts.")
 
 Folder = Annotated[
     Path | None, typer.Option(help="Folder of the keys; default: from [keys] in the configuration.")
@@ -20,7 +20,7 @@ def create(
     name: Annotated[str, typer.Argument(help="Name of the key pair, for example this host's.")],
     folder: Folder = None,
 ) -> None:
-    """Create a key pair; the public file is for other machines, the secret one stays here."""
+    """Create a key pair; the public file is for other hosts, the secret one stays here."""
     from deltalight.protocol.keys import create_keys
 
     public, secret = create_keys(name, _folder(folder))
@@ -34,7 +34,7 @@ def list_keys(
     folder: Folder = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the keys as JSON.")] = False,
 ) -> None:
-    """List this machine's key pairs and the keys it trusts."""
+    """List this host's key pairs and the keys it trusts."""
     from deltalight.protocol.keys import load_keys, own_keys, trusted_keys
     from deltalight.protocol.rights import allowed
 
@@ -65,11 +65,11 @@ def trust(
     ] = None,
     folder: Folder = None,
 ) -> None:
-    """Trust the machine with this public key; takes effect at once, without a restart."""
+    """Trust the host with this public key; takes effect at once, without a restart."""
     from deltalight.protocol.keys import trust as keep
 
     kept = keep(file, _folder(folder), name)
-    typer.echo(f"Trusted from now on: {kept} (remove that file to end it)")
+    typer.echo(f"Trusted from now on: {kept} (delete that file to stop trusting it)")
 
 
 @keys.command(name="allow")
@@ -79,14 +79,14 @@ def allow_host(
         list[str] | None,
         typer.Argument(
             metavar="[STREAM]...",
-            help="What its machine may send: streams (color), topics (color.desk), and control for commands.",
+            help="What that host may send: streams (color), topics (color.desk), and control for commands.",
         ),
     ] = None,
     *,
-    everything: Annotated[bool, typer.Option("--everything", help="No limit any more.")] = False,
+    everything: Annotated[bool, typer.Option("--everything", help="Remove the limit.")] = False,
     folder: Folder = None,
 ) -> None:
-    """Limit what a trusted machine may send here: nothing but the named streams; holds within a second."""
+    """Limit what a trusted host may send here: nothing but the named streams; takes effect within a second."""
     from deltalight.protocol.keys import trusted_keys
     from deltalight.protocol.rights import allow
 
@@ -94,7 +94,7 @@ def allow_host(
     if name not in trusted_keys(place):
         raise DeltalightError(f"no key of `{name}` is trusted in {place}: see `deltalight keys list`")
     if everything == bool(words):
-        raise DeltalightError("name the streams that the machine may send, or give --everything.")
+        raise DeltalightError("name the streams that the host may send, or give --everything.")
     allow(place, name, None if everything else words)
     typer.echo(f"{name} may send {'everything' if everything else ', '.join(sorted(words or []))}.")
 

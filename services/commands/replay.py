@@ -20,7 +20,9 @@ def replay(
         typer.Option(help="Control endpoint of the render server whose clock the timestamps follow."),
     ] = None,
     loop: Annotated[bool, typer.Option("--loop", help="Start again when the recording ends.")] = False,
-    rate: Annotated[float | None, typer.Option(help="Speed, as a factor. Default: 1.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Playback speed: 2 is twice as fast. Default: 1.")
+    ] = None,
     start: Annotated[
         float | None, typer.Option(min=0, help="Where to start, in seconds from the first frame.")
     ] = None,

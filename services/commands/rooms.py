@@ -20,7 +20,7 @@ rooms = typer.Typer(
 )
 
 Room = Annotated[str, typer.Argument(help="Name of the room, as in the rooms file.")]
-Host = Annotated[str, typer.Argument(help="Name of a host, as `rooms list` prints it behind its slots.")]
+Host = Annotated[str, typer.Argument(help="Name of a host, as `rooms list` prints it beside its slots.")]
 Directory = Annotated[str, typer.Option(help="Endpoint of the directory of rooms.")]
 HERE = endpoint(ROOMS_PORT)
 
@@ -60,13 +60,13 @@ def move(
     directory: Directory = HERE,
     config_file: ConfigFile = None,
 ) -> None:
-    """Move a room to another slot; it is shown from where it was until its pictures come from there."""
+    """Move a room to another slot; the old one shows it until the new one has pictures."""
     _print_rooms(_directory(directory, config_file).command("move", room, slot))
 
 
 @rooms.command("drain-host")
 def drain_host(host: Host, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
-    """Move the rooms of a host to other hosts, one after another; those without a slot there end and wait."""
+    """Move the rooms of a host to other hosts, one after another; rooms that find no slot end and wait."""
     _print_rooms(_directory(directory, config_file).host_command("drain-host", host))
 
 

@@ -26,14 +26,16 @@ def server(
     ] = None,
     node: NodeName = None,
     publish: Annotated[
-        str | None, typer.Option(help="Endpoint for composites. Default: tcp://127.0.0.1:5602.")
+        str | None, typer.Option(help="Endpoint for the relit pictures. Default: tcp://127.0.0.1:5602.")
     ] = None,
     control: Annotated[
         str | None, typer.Option(help="Endpoint for commands. Default: tcp://127.0.0.1:5603.")
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name in its messages. Default: render-server.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the render server in its messages. Default: render-server.")
+    ] = None,
     epoch: Annotated[
-        int | None, typer.Option(min=1, help="Which start of its room's render server this is.")
+        int | None, typer.Option(min=1, help="Number of this start among those of its room's render server.")
     ] = None,
     device: Annotated[
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")

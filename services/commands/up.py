@@ -41,7 +41,7 @@ def up(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the dashboard.")] = PAGE_PORT,
     node_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the node's streams.")] = NODE_PORT,
     composite_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of the composites.")
+        int, typer.Option(min=1, max=65535, help="Port of the relit pictures.")
     ] = COMPOSITE_PORT,
     control_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the commands.")] = CONTROL_PORT,
     device: Annotated[

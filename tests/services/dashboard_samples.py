@@ -49,7 +49,7 @@ AXE = DASHBOARD.parent / "node_modules" / "axe-core" / "axe.min.js"  # comes wit
 GRIP_AT = 0.4  # where the gizmo's arrow is taken, in its own lengths
 GIZMO_SIZE = 1.35  # as the page sets it
 BOX_TOP_M = np.array([-0.06, 0.18, 0.134])  # of the green box, on the cardboard one
-JPEG_QUALITY = 82  # keeps each below 200 kB
+JPEG_QUALITY = 75  # keeps most below 100 kB
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -353,9 +353,9 @@ def magenta(picture: np.ndarray) -> int:
     return int(((red > 1.6 * green) & (blue > 1.4 * green)).sum())
 
 
-def box_glb() -> bytes:
-    """A magenta box of 12 cm, a colour that the room does not have."""
-    box = trimesh.creation.box((0.12, 0.12, 0.12))
+def box_glb(edge: float = 0.12) -> bytes:
+    """A magenta box, 12 cm where its file is in metres; the room does not have its colour."""
+    box = trimesh.creation.box((edge, edge, edge))
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 200, 255], metallicFactor=0.0)
     box.visual = trimesh.visual.TextureVisuals(material=material)
     content: bytes = box.export(file_type="glb")

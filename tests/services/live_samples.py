@@ -27,6 +27,7 @@ from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera
 
 PERIOD_S = 0.02
 AGE_S = 0.005
+NOISE = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
 LIGHT = {"type": "sphere", "position_m": [0.0, 0.0, 2.0], "intensity": [2.0, 1.0, 1.0], "radius_m": 0.1}
 AROUND = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
 
@@ -39,13 +40,14 @@ class StandInStream:
     returns the views that are wanted beside the picture: `shade` tells them apart.
     """
 
-    def __init__(self, port: int, period_s: float = PERIOD_S) -> None:
+    def __init__(self, port: int, period_s: float = PERIOD_S, picture: np.ndarray = NOISE) -> None:
         self.sent, self._period_s = 0, period_s
         self.scene: tuple[str | None, int | None] = (None, None)
         self.is_busy = False
         self.camera_fps: float | None = None
         self.ages_s: tuple[float, ...] = (AGE_S,)
         self.watched: Callable[[], Sequence[ShownView]] = tuple
+        self._picture = picture
         self._stop = threading.Event()
         self.publisher = Publisher(ports.endpoint(port))
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -57,7 +59,8 @@ class StandInStream:
         self.publisher.close()
 
     def _run(self) -> None:
-        jpeg = encode_color(np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
+        shape, jpeg = self._picture.shape, encode_color(self._picture)
+        sent = {"shape": shape, "camera": camera().resized(shape[1], shape[0]).to_dict()}
         for number in itertools.count(1):
             if self._stop.wait(self._period_s):
                 return
@@ -67,10 +70,10 @@ class StandInStream:
                 continue
             age_s = self.ages_s[number % len(self.ages_s)]
             others = tuple(OtherPicture(view=view) for view in self.watched())
-            message = composite(number, *self.scene, age_s=age_s).model_copy(update={"others": others})
-            pictures = [
-                encode_color(np.full((HEIGHT, WIDTH, 3), shade(each.view), np.uint8)) for each in others
-            ]
+            message = composite(number, *self.scene, age_s=age_s).model_copy(
+                update={"others": others, **sent}
+            )
+            pictures = [encode_color(np.full(shape, shade(each.view), np.uint8)) for each in others]
             self.publisher.send(encode(message, [jpeg, *pictures]))
             if number % 10 == 0:
                 self.publisher.send(encode(report("render-server", "stand-in renderer")))
@@ -126,10 +129,12 @@ class LiveApi:
 
 
 @contextmanager
-def live_api(folder: Path, *, period_s: float = PERIOD_S, **settings: object) -> Iterator[LiveApi]:
+def live_api(
+    folder: Path, *, period_s: float = PERIOD_S, picture: np.ndarray = NOISE, **settings: object
+) -> Iterator[LiveApi]:
     control_port, stream_port = ports.private_ports(2)
     endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
-    stream, server = StandInStream(stream_port, period_s), RenderServer(control_port)
+    stream, server = StandInStream(stream_port, period_s, picture), RenderServer(control_port)
     stream.watched = lambda: server.session.watched
     try:
         with running_api(folder, **endpoints, **settings) as api:

@@ -36,7 +36,7 @@ LOOKING = {
         "Room in 3-D",
         "Sign out",
     ),
-    *("Outlines and lamps", "Close the drawer", "Lamp 1"),
+    *("Outlines and lights", "Close the drawer", "Lamp 1"),
     *(
         "View",
         "Picture",

@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Iterator
 
+import cv2
 import pytest
 from playwright.sync_api import Browser, Route, WebSocketRoute, expect
 
@@ -15,12 +16,13 @@ from deltalight.services.demo import POSTER
 from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
     PATIENCE_S,
+    SCREENSHOTS,
     SIZE,
     STAND_IN_PERIOD_S,
     Desk,
     Stack,
 )
-from tests.services.live_samples import AGE_S, LiveApi, live_api, shade
+from tests.services.live_samples import AGE_S, NOISE, LiveApi, live_api, shade
 
 pytestmark = NEEDS_BROWSER
 LAMP = {"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}
@@ -32,7 +34,10 @@ PANELS = ("Object", "Lights", "Real", "Method", "Output")
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
-    with live_api(tmp_path_factory.mktemp("data"), period_s=STAND_IN_PERIOD_S) as running:
+    """Shows noise, or the demo's still where pictures are wanted."""
+    picture = cv2.cvtColor(cv2.imread(str(POSTER)), cv2.COLOR_BGR2RGB) if SCREENSHOTS else NOISE
+    data = tmp_path_factory.mktemp("data")
+    with live_api(data, period_s=STAND_IN_PERIOD_S, picture=picture) as running:
         yield running
 
 
@@ -171,7 +176,7 @@ def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk)
     expect(page.page.locator(".skeleton").first).to_be_visible()
     page.photograph("connecting")
     shown = page.page.locator("body").inner_text()
-    for false in ("None yet", "No scene", "No lamps", "Given model", "No object", "Voxel cone", "view only"):
+    for false in ("None yet", "No scene", "No lights", "Given model", "No object", "Voxel cone", "view only"):
         assert false not in shown, false
     for route in answered:
         route.continue_()

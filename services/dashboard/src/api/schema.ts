@@ -1433,7 +1433,7 @@ export interface components {
             readonly offset_s: number;
             /**
              * Speed
-             * @description Clip seconds a second; 0 holds `offset_s`, below 0 backwards.
+             * @description Clip seconds per second; 0 holds it at `offset_s`, below 0 plays it backwards.
              * @default 1
              */
             readonly speed: number;
@@ -1496,13 +1496,13 @@ export interface components {
             readonly reach: number;
             /**
              * Resolution
-             * @description Samples an edge of each shell.
+             * @description Samples along each edge of each shell.
              * @default 32
              */
             readonly resolution: number;
             /**
              * Rsm Size
-             * @description Texels an edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
              */
             readonly rsm_size?: number | null;
             /**
@@ -1513,7 +1513,7 @@ export interface components {
             readonly screen_space: boolean;
             /**
              * Sh Order
-             * @description Bands of spherical harmonics of what an object hides: 9, 16 or 25 coefficients a sample.
+             * @description Bands of spherical harmonics of what an object hides: 9, 16 or 25 coefficients per sample.
              * @default 4
              */
             readonly sh_order: number;
@@ -1764,7 +1764,7 @@ export interface components {
             readonly reflections: "rays" | "cones";
             /**
              * Rsm Size
-             * @description Texels an edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
              */
             readonly rsm_size?: number | null;
             /**
@@ -1791,12 +1791,12 @@ export interface components {
             readonly volume_edge_m?: number | null;
             /**
              * Volume Size
-             * @description Voxels an edge; null = 256 on a GPU, 64 in software.
+             * @description Voxels along each edge; null = 256 on a GPU, 64 in software.
              */
             readonly volume_size?: number | null;
             /**
              * Voxels
-             * @description Of the exact operator: six one-sided directions a voxel, or one for all (as in the paper).
+             * @description Of the exact operator: six one-sided directions per voxel, or one for all (as in the paper).
              * @default directional
              * @enum {string}
              */
@@ -1896,7 +1896,7 @@ export interface components {
             readonly direct_steps?: number | null;
             /**
              * Direct Volume Size
-             * @description Of shadow lobe: cells an edge of the volume of direct light; null = volume_size.
+             * @description Of shadow lobe: cells along each edge of the volume of direct light; null = volume_size.
              */
             readonly direct_volume_size?: number | null;
             /**
@@ -1917,7 +1917,7 @@ export interface components {
             readonly objects_steps?: number | null;
             /**
              * Objects Volume Size
-             * @description Of operator paper: cells an edge of the volume that lights the objects; null = volume_size.
+             * @description Of operator paper: cells along each edge of the volume that lights the objects; null = volume_size.
              */
             readonly objects_volume_size?: number | null;
             /**
@@ -1951,7 +1951,7 @@ export interface components {
             readonly reflections?: ("rays" | "none") | null;
             /**
              * Rsm Size
-             * @description Texels an edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
              */
             readonly rsm_size?: number | null;
             /**
@@ -1987,7 +1987,7 @@ export interface components {
             readonly volume_edge_m?: number | null;
             /**
              * Volume Size
-             * @description Cells an edge; more make it costlier, not better.
+             * @description Cells along each edge; more make it costlier, not better.
              * @default 32
              */
             readonly volume_size: number;
@@ -2086,7 +2086,7 @@ export interface components {
             readonly reflections: "rays" | "cones";
             /**
              * Rsm Size
-             * @description Texels an edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
              */
             readonly rsm_size?: number | null;
             /**
@@ -2118,12 +2118,12 @@ export interface components {
             readonly volume_edge_m?: number | null;
             /**
              * Volume Size
-             * @description Voxels an edge; null = 256 on a GPU, 64 in software.
+             * @description Voxels along each edge; null = 256 on a GPU, 64 in software.
              */
             readonly volume_size?: number | null;
             /**
              * Voxels
-             * @description Of the exact operator: six one-sided directions a voxel, or one for all (as in the paper).
+             * @description Of the exact operator: six one-sided directions per voxel, or one for all (as in the paper).
              * @default directional
              * @enum {string}
              */
@@ -2147,7 +2147,7 @@ export interface components {
             readonly map?: string | null;
             /**
              * Rotation Deg
-             * @description Turn of the map about up, degrees.
+             * @description Rotation of the map about its up axis, degrees.
              * @default 0
              */
             readonly rotation_deg: number;
@@ -3735,7 +3735,7 @@ export interface components {
             readonly rays: number;
             /**
              * Samples
-             * @description Of image_based and precomputed: samples a pixel of what a surface mirrors.
+             * @description Of image_based and precomputed: samples per pixel of what a surface mirrors.
              * @default 40
              */
             readonly samples: number;

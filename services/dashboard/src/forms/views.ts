@@ -17,13 +17,13 @@ export const VIEWS: readonly ViewText[] = [
   {
     value: "error",
     label: "Error of the paper",
-    help: "What the operator as printed gets wrong: red to yellow too dark, blue to white too bright. Black with others.",
+    help: "What the operator printed in the paper gets wrong: red to yellow too dark, blue to white too bright. Black with other methods.",
   },
   { value: "volume", label: "Volume", help: "The lit voxels or cells." },
   {
     value: "rsm",
     label: "Light's view",
-    help: "What the first lamp sees: the real scene on the left, objects on the right.",
+    help: "What the first light sees: the real scene on the left, objects on the right.",
   },
   { value: "lights", label: "Lights", help: "The lights found in the fish-eye picture." },
   { value: "camera", label: "Camera", help: "The camera's own picture, without objects." },

@@ -23,7 +23,7 @@ export const delay = computed(() => delayFigures(shown.value));
 
 export const DELAY_TIP =
   "From the capture of a frame to its picture on this page: median and 95th percentile of the last 10 s. " +
-  "The time on the network between the service and this page is not in it.";
+  "Network time between the server and this page is not included.";
 
 let drawn: { readonly age: number; readonly arrival: number } | null = null;
 

@@ -12,9 +12,9 @@ const STUCK_MS = 3000;
 /** Whether this browser decodes a kind of H.264; else why not. */
 export async function videoProblem(codec = USUAL_CODEC): Promise<string | null> {
   if (typeof VideoDecoder === "undefined")
-    return isSecureContext ? "This browser has no WebCodecs." : "Browsers decode video on https and localhost only.";
+    return isSecureContext ? "This browser has no WebCodecs." : "Browsers decode video only on https and localhost.";
   const { supported } = await VideoDecoder.isConfigSupported(configOf(codec));
-  return supported ? null : "This browser decodes no H.264.";
+  return supported ? null : "This browser does not decode H.264.";
 }
 
 function configOf(codec: string): VideoDecoderConfig {
@@ -58,7 +58,7 @@ export class VideoPictures {
   /** Fail where the decoder keeps pictures back. */
   checkAt(now: number): void {
     const [oldest] = this.waiting.values();
-    if (oldest && now - oldest.arrival > STUCK_MS) this.fail("The decoder gives no pictures.");
+    if (oldest && now - oldest.arrival > STUCK_MS) this.fail("The decoder produces no pictures.");
   }
 
   /** Forget what was under way. */

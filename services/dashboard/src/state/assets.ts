@@ -58,7 +58,7 @@ async function receive(
 ): Promise<AssetAnswer | undefined> {
   const asset = await sendShown(name, send);
   if (asset) {
-    announce(`${name} is among the assets.`);
+    announce(`${name} was added to the assets.`);
     await readAssets();
   }
   return asset;

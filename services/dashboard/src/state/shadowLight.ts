@@ -34,7 +34,7 @@ export async function takeShadowClick(pixel: Pixel): Promise<void> {
 async function addLightFrom(tip: Footing, thrower: Vector): Promise<void> {
   const direction = directionFrom(tip.point, thrower, tip.normal);
   if (!direction) {
-    toast("That point cannot throw this shadow: it lies behind the surface or at the tip. Click what throws it.");
+    toast("That point cannot cast this shadow: it lies behind the surface or at the tip. Click what casts it.");
     return;
   }
   tool.value = "move";

@@ -85,7 +85,7 @@ export async function isRecording(file: File): Promise<boolean> {
 export async function openRecording(file: File): Promise<void> {
   const kept = await sendShown(file.name, (progress) => uploadRecording(file, progress));
   if (!kept) return;
-  announce(`${kept.id} is among the recordings.`);
+  announce(`${kept.id} was added to the recordings.`);
   await readRecordings();
   openDrawer("recordings");
   await showRecording(kept.id, { playing: false });

@@ -29,7 +29,7 @@ export function Drawer() {
     else openDrawer(next);
   };
   return (
-    <section class="drawer" aria-label="Performance, nodes and takes">
+    <section class="drawer" aria-label="Performance, nodes and recordings">
       <ReplayBar />
       <div class="drawer-bar">
         <Tabs label="Drawer" tabs={TABS} value={isOpen ? tab : null} onChange={choose} panelId={PANEL_ID} />

@@ -58,7 +58,7 @@ function codecText(): string {
 }
 
 function codecTip(): string {
-  return noVideo.value === null ? `Coded as ${frame.value?.codec ?? "–"}` : `JPEG: ${noVideo.value}`;
+  return noVideo.value === null ? `Encoded as ${frame.value?.codec ?? "–"}` : `JPEG: ${noVideo.value}`;
 }
 
 /** Times before `now`, and the delay of what was shown then. */
@@ -102,7 +102,7 @@ function PassLegend({ sample, names }: { readonly sample: Sample; readonly names
       {sample.reused.size > 0 && (
         <tfoot>
           <tr>
-            <td colSpan={2}>Nothing is moving: pale passes are reused, and show the times of their last run.</td>
+            <td colSpan={2}>Nothing is moving: pale passes are reused and show the time of their last run.</td>
           </tr>
         </tfoot>
       )}

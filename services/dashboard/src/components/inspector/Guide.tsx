@@ -47,7 +47,7 @@ export function Guide() {
           <button type="button" onClick={() => (inspectorTab.value = "lights")}>
             Change the light
           </button>
-          <span>Colour, strength and position of each lamp. Or drag a shadow: its lamp follows.</span>
+          <span>Colour, strength and position of each light. Or drag a shadow: its light follows.</span>
         </Step>
         <Step of="compare">
           <button type="button" onClick={() => openDrawer("compare")}>

@@ -64,7 +64,7 @@ function LightEditor({ index, light, disabled }: LightEditorProps) {
       </Field>
       {isOutOfSight(light) && (
         <p class="quiet small">
-          This lamp is outside the picture. Use its fields to move it, or drag a shadow that it throws.
+          This light is outside the picture. Use its fields to move it, or drag a shadow that it casts.
         </p>
       )}
       <LightFields light={light} onChange={gesture.push} onEnd={gesture.end} disabled={disabled} />

@@ -25,9 +25,9 @@ const MODES: readonly Segment<Mode>[] = [
   { value: "environment", label: "Map" },
 ];
 const HELP: Readonly<Record<Mode, string>> = {
-  manual: "Lamps you set by hand.",
+  manual: "Lights that you set by hand.",
   fisheye: "What a fish-eye camera beside the objects sees, live.",
-  tracked: "Lamps with markers on them, which can be moved around.",
+  tracked: "Lamps that carry a marker, so that they can be moved.",
   environment: "A panorama of the surroundings (HDR or EXR).",
 };
 

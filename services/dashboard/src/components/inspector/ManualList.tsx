@@ -12,9 +12,9 @@ interface LightsProps {
 
 export function ManualList({ lights }: LightsProps) {
   return (
-    <Section title="Lamps" action={<AddLightButton />}>
-      {lights.manual.length === 0 && <p class="quiet small">None. Add one with the plus.</p>}
-      <div class="chips" role="group" aria-label="Lamps">
+    <Section title="Lights" action={<AddLightButton />}>
+      {lights.manual.length === 0 && <p class="quiet small">None yet. Use + to add one.</p>}
+      <div class="chips" role="group" aria-label="Lights">
         {lights.manual.map((light, index) => (
           <button
             key={index}

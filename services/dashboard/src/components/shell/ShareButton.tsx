@@ -10,7 +10,7 @@ export function ShareButton() {
     const made = await takeBeforeAfter();
     if (!made) return;
     await download(made.path, made.name);
-    announce(`${made.name} is among your downloads.`);
+    announce(`${made.name} was saved to your downloads.`);
   };
   const isDisabled = role.value !== "control" || isTakingSnapshot.value;
   return <IconButton icon="share" label="Save before and after as GIF" onClick={share} disabled={isDisabled} />;

@@ -14,7 +14,7 @@ export function PictureNotice() {
   switch (liveState.value) {
     case "connecting":
       if (hasPoster.value) return <Working text={STILL} />;
-      return <Full title="Connecting to the live picture" text="Asking the service for the newest frame." />;
+      return <Full title="Connecting to the live picture" text="Asking the server for the newest frame." />;
     case "waiting":
       if (hasPoster.value)
         return isWorking() ? <Working text={STILL + waitingText()} /> : <Banner text={waitingText()} />;
@@ -44,7 +44,7 @@ const NOTHING_SENDS =
   "Neither a camera nor a recording is sending frames. Start one with `deltalight up --source CAMERA`, or replay a recording below.";
 const PREPARING =
   "Frames are arriving, and the renderer is preparing its first picture. The first start on a machine can take a minute while shaders compile.";
-const SILENT = "The render server does not answer. Your changes are kept, and shown as soon as it does.";
+const SILENT = "The render server does not respond. Your changes are kept, and shown as soon as it does.";
 const STOPPED = "No new frames are coming from the camera. See Nodes below for what has stopped.";
 const NO_FISHEYE =
   "This scene is lit by a fish-eye camera, and none is sending. Objects appear once one does; or choose another light under Lights.";
@@ -55,7 +55,7 @@ function isWorking(): boolean {
 }
 
 function waitingText(): string {
-  if (renderServer.value === null) return "Asking the service what is running.";
+  if (renderServer.value === null) return "Asking the server what is running.";
   return isSending() ? PREPARING : NOTHING_SENDS;
 }
 

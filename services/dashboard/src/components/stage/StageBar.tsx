@@ -54,7 +54,7 @@ export function StageBar() {
       />
       <IconButton
         icon="frame"
-        label="Outlines and lamps"
+        label="Outlines and lights"
         hint="H"
         pressed={areOutlinesShown.value}
         onClick={() => (areOutlinesShown.value = !areOutlinesShown.value)}

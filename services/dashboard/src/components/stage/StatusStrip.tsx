@@ -57,8 +57,8 @@ function Figure({ name, value, tip }: { readonly name: string; readonly value: s
 
 function budgetText(budget: number | null | undefined): string {
   return budget == null
-    ? "While something moves, quality gives way as the method's setting says"
-    : `While something moves, quality and then size give way, to take ${milliseconds(budget)} a frame; at rest the picture becomes the best`;
+    ? "While something moves, quality is reduced as far as the method's setting allows"
+    : `While something moves, quality and then size are reduced to take ${milliseconds(budget)} per frame; at rest the picture has its best quality`;
 }
 
 function dropText(drops: Readonly<Record<string, number>>): string {

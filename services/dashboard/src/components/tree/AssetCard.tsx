@@ -24,7 +24,7 @@ export function AssetCard({ asset, mayChange }: AssetCardProps) {
   const use = asset.kind === "mesh" ? () => addObject(asset) : () => lightWith(asset);
   const entries: MenuEntry[] = [
     {
-      label: asset.kind === "mesh" ? "Add to the scene" : "Light with it",
+      label: asset.kind === "mesh" ? "Add to the scene" : "Light the scene with it",
       icon: "add",
       disabled: !mayChange,
       onClick: use,
@@ -42,7 +42,7 @@ export function AssetCard({ asset, mayChange }: AssetCardProps) {
         type="button"
         class="asset-use"
         disabled={!mayChange}
-        aria-label={`${asset.kind === "mesh" ? "Add" : "Light with"} ${name}`}
+        aria-label={`${asset.kind === "mesh" ? "Add" : "Light the scene with"} ${name}`}
         title={factsText(asset)}
         onClick={use}
       >

@@ -35,10 +35,10 @@ export function SceneTree() {
           <ObjectItem key={item.id} id={item.id} visible={item.visible} />
         ))}
       </TreeGroup>
-      <TreeGroup title="Lights" action={<AddLightButton />} empty={hasLights() ? null : "No lamps."}>
+      <TreeGroup title="Lights" action={<AddLightButton />} empty={hasLights() ? null : "No lights."}>
         <LightItems />
       </TreeGroup>
-      <TreeGroup title="Real scene" empty={document ? null : "Belongs to a scene."}>
+      <TreeGroup title="Real scene" empty={document ? null : "Comes with a scene."}>
         <TreeItem
           icon="room"
           label={geometryText(document?.real.geometry)}
