@@ -228,11 +228,11 @@ class Shading:
 
     def reuse_light(
         self, scene: Bindings, _grid: LowResGrid, light: LightState, view: CameraView
-    ) -> Bindings:
+    ) -> tuple[Bindings, DirectLight]:
         """Fills in the last frame's light where it serves, and lists where light must be computed."""
         assert self._history is not None
         is_diffuse = not scene["specular_surfaces"]
-        return {**scene, **self._history.run(scene, light if is_diffuse else None, view)}
+        return {**scene, **self._history.run(scene, light if is_diffuse else None, view)}, self._direct
 
     def trace_beams(
         self,
@@ -260,9 +260,14 @@ class Shading:
         return beams
 
     def light_directly(
-        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap | None
+        self,
+        scene: Bindings,
+        grid: LowResGrid,
+        caustics: Caustics | None,
+        voxels: VoxelMipmap | None,
+        *_kept: DirectLight,
     ) -> DirectLight:
-        """Computes the direct light on the real surfaces."""
+        """Computes the direct light on the real surfaces, but for what is kept of the last frame's."""
         joint = None if voxels is None else voxels.texture
         self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
@@ -398,6 +403,7 @@ def shading_stages(
             "caustic beams", shading.trace_beams, s.objects, bvh, s.own_measured, volume, s.lights, *lit.all
         )
     grid = g.stage("low res grid", shading.choose_pixels, scene)
+    kept: list[Resource[Any]] = []
     if shading.reuses_light:
         # What light at real surfaces depends on, besides the camera: another value whenever any of it changes.
         shared: tuple[Resource[Any], ...] = (s.surfaces, s.lit_area, s.lights, lit.environment)
@@ -405,10 +411,19 @@ def shading_stages(
         bounced = g.value("bounced light state", _new_object, *shared, volume, shown, marching, beams)
         direct = g.value("direct light state", _new_object, unblocked, bounced, s.objects, lit.object_maps)
         states = g.value("light state", LightState, unblocked, direct, bounced)
-        scene = g.stage("light reuse", shading.reuse_light, scene, grid, states, s.view)
+        scene, *kept = g.stages(
+            "light reuse",
+            shading.reuse_light,
+            scene,
+            grid,
+            states,
+            s.view,
+            outputs=("reusing scene", "kept light"),
+        )
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
-    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)
+    light = light_directly or shading.light_directly
+    direct = g.stage("direct light", light, scene, grid, caustics, shown, *kept)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
     behind = (s.objects, scene, direct, cones, bvh, s.observation, marching)

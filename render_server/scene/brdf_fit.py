@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.optimize import minimize_scalar, nnls
 
 from deltalight.render_server.scene.brdf_measurements import BrdfMeasurements
 from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrdf, lobe_density, rise_basis
@@ -54,6 +53,8 @@ class _Fit:
         lengths = np.linalg.norm(design, axis=0) + 1e-9
         size = design.shape[1]
         matrix = np.vstack([design / lengths, _RIDGE * np.eye(size)])
+        from scipy.optimize import nnls
+
         found, residual = nnls(matrix, np.append(values * self._trust, np.zeros(size)), maxiter=100 * size)
         return found / lengths, float(residual)
 
@@ -112,6 +113,8 @@ def _refined(residual: Residual, sigma: float, tried: Float64[np.ndarray, " n"])
     """Returns the best width within a step of what was tried."""
     step = np.log(tried[1] / tried[0])
     low, high = (np.clip(np.log(sigma) + sign * step, *np.log(tried[[0, -1]])) for sign in (-1, 1))
+    from scipy.optimize import minimize_scalar
+
     found = minimize_scalar(
         lambda log: residual(float(np.exp(log))),
         bounds=(low, high),

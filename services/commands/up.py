@@ -87,13 +87,8 @@ def up(
     from deltalight.services.host_store import open_store, scene_to_show, session_file
     from deltalight.services.supervisor import Supervisor
 
-    if ray_address is not None and placer is not PlacerKind.RAY:
-        raise DeltalightError("--ray-address names the cluster of --placer ray; give both, or neither.")
-    if rooms_host != LOOPBACK and placer is not PlacerKind.RAY:
-        raise DeltalightError(
-            "--rooms-host is for web processes elsewhere, which reach the render servers of --placer ray alone; leave"
-            " it out, or give both."
-        )
+    on_cluster = placer is PlacerKind.RAY
+    _require_fitting(rooms, ray_address, rooms_host, on_cluster=on_cluster)
     if rooms is not None:
         if source is not None or node is not None or scene is not None or device is not None:
             raise DeltalightError(
@@ -101,7 +96,6 @@ def up(
                 " --scene and --device."
             )
         commands = HostCommands(config_file, "info", spares, allow_software)
-        on_cluster = placer is PlacerKind.RAY
         _run_rooms(
             rooms,
             commands,
@@ -113,8 +107,6 @@ def up(
             ray_address=ray_address,
         )
         return
-    if placer is PlacerKind.RAY:
-        raise DeltalightError("--placer ray runs the rooms of a rooms file; name one with --rooms.")
     if node is None:
         source = source or _configured_source(config_file)
     elif source is not None:
@@ -143,6 +135,25 @@ def up(
         with Supervisor(plan.specs()) as supervisor:
             typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
             supervisor.run()
+
+
+def _require_fitting(
+    rooms: Path | None, ray_address: str | None, rooms_host: str, *, on_cluster: bool
+) -> None:
+    """Check that options of a cluster come with `--placer ray`, and that with rooms.
+
+    Raises:
+        DeltalightError: they do not.
+    """
+    if ray_address is not None and not on_cluster:
+        raise DeltalightError("--ray-address names the cluster of --placer ray; give both, or neither.")
+    if rooms_host != LOOPBACK and not on_cluster:
+        raise DeltalightError(
+            "--rooms-host is for web processes elsewhere, which reach the render servers of --placer ray alone; leave"
+            " it out, or give both."
+        )
+    if on_cluster and rooms is None:
+        raise DeltalightError("--placer ray runs the rooms of a rooms file; name one with --rooms.")
 
 
 def _run_rooms(

@@ -51,7 +51,7 @@ class Player:
     count: int = 0
 
     def __post_init__(self) -> None:
-        self.renderer = SceneRenderer(self.gpu, self.scene)
+        self.renderer = SceneRenderer(self.gpu, self.scene, checks=True)
         self.change(self.scene)
 
     def change(self, scene: SceneDocument) -> None:

@@ -98,6 +98,7 @@ class VoxelLab:
             **self._volume.bindings,
             **self._lights.bindings,
             **materials.bindings,
+            "SEVERAL_VIEWS": False,
             "bias_real": 0.0,
             "bias_virtual": 0.0,
             "has_caustics": False,

@@ -120,18 +120,6 @@ def test_an_object_that_is_added_finds_room_beside_the_first(stack: Stack, page:
     page.photograph("added")
 
 
-def test_an_object_in_other_units_is_scaled_and_a_message_says_so(stack: Stack, page: Desk) -> None:
-    page.named("button", "Add object").click()
-    with page.page.expect_file_chooser() as chosen:
-        page.page.get_by_role("menuitem", name="From a file").click()
-    chosen.value.set_files({"name": "drawn in mm.glb", "mimeType": "", "buffer": box_glb(edge=120)})
-    message = page.page.locator(".toast", has_text="so it was added at scale 0.001.")
-    message.wait_for()
-    page.photograph("units")
-    assert stack.object("drawn in mm")["pose"]["scale"] == 0.001
-    message.wait_for(state="detached")
-
-
 def test_a_simple_object_is_taken_from_the_shelf(stack: Stack, page: Desk) -> None:
     page.named("button", "Add object").click()
     page.named("menuitem", "Chrome ball").click()

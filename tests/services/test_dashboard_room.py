@@ -1,4 +1,4 @@
-"""The dashboard in a real browser: the room in 3-D, lamps beside the picture, models of the shelf."""
+"""The dashboard in a real browser: the room in 3-D, lamps beside the picture, models of the shelf and of files."""
 
 import gzip
 import os
@@ -22,6 +22,7 @@ from tests.services.dashboard_samples import (
     SIZE,
     Desk,
     Stack,
+    box_glb,
     demo_stack,
     fresh_desk,
     recorded_s,
@@ -106,6 +107,18 @@ def loaded_bytes(page: Desk) -> dict[str, int]:
     names = page.page.evaluate("performance.getEntriesByType('resource').map((each) => each.name)")
     files = {name.rpartition("/assets/")[2] for name in names if "/assets/" in name and "/api/" not in name}
     return {name: len(gzip.compress((DASHBOARD / "assets" / name).read_bytes())) for name in files}
+
+
+def test_an_object_in_other_units_is_scaled_and_a_message_says_so(stack: Stack, page: Desk) -> None:
+    page.named("button", "Add object").click()
+    with page.page.expect_file_chooser() as chosen:
+        page.page.get_by_role("menuitem", name="From a file").click()
+    chosen.value.set_files({"name": "drawn in mm.glb", "mimeType": "", "buffer": box_glb(edge=120)})
+    message = page.page.locator(".toast", has_text="so it was added at scale 0.001.")
+    message.wait_for()
+    page.photograph("units")
+    assert stack.object("drawn in mm")["pose"]["scale"] == 0.001
+    message.wait_for(state="detached")
 
 
 def test_the_first_page_is_light_and_the_room_comes_when_it_is_asked_for(stack: Stack, page: Desk) -> None:

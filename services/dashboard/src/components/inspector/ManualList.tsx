@@ -12,9 +12,9 @@ interface LightsProps {
 
 export function ManualList({ lights }: LightsProps) {
   return (
-    <Section title="Lights" action={<AddLightButton />}>
+    <Section title="Lights set by hand" action={<AddLightButton />}>
       {lights.manual.length === 0 && <p class="quiet small">None yet. Use + to add one.</p>}
-      <div class="chips" role="group" aria-label="Lights">
+      <div class="chips" role="group" aria-label="Light to edit">
         {lights.manual.map((light, index) => (
           <button
             key={index}
