@@ -214,8 +214,9 @@ def test_ports_are_those_of_the_code(resources: list[Resource]) -> None:
         if "endPort" in port
     }
     ((low, high),) = ranges
-    own = ports.PRIVATE_PORTS  # of this worker of the tests: every so manieth
-    assert low <= own[0] < low + own.step and high - own.step < own[-1] <= high
+    own = ports.PRIVATE_PORTS  # a process of the tests has every third of them or so
+    assert low <= own[0] < low + own.step
+    assert high - own.step < own[-1] <= high
     for service in of_kind(resources, "Service"):
         for port in service["spec"]["ports"]:
             assert port["port"] == open_ports[port["targetPort"]]
