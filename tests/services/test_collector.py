@@ -89,11 +89,13 @@ def test_a_finished_run_does_not_need_the_servers_answer(rig: Rig) -> None:
 def test_settled_figures_leave_out_the_first_half(rig: Rig) -> None:
     """The start, and a budget's first choice of size, say nothing of what follows."""
     rig.send_composites(6)
-    rig.collector.arrivals_s = [0.0, 5.0, 6.0, 7.0, 7.25, 7.5]
+    rig.collector.arrivals_s = [
+        rig.collector._began_s + each for each in (0, 0.05, 0.06, 0.07, 0.0725, 0.075)
+    ]
     rig.collector.ages_ms = [900.0, 800.0, 700.0, 100.0, 110.0, 120.0]
     figures = summarize(rig.collector, {})
-    assert figures["frames_per_s"] == pytest.approx(5 / 7.5)
-    assert figures["settled_frames_per_s"] == pytest.approx(4.0)
+    assert figures["frames_per_s"] == pytest.approx(5 / 0.075)
+    assert figures["settled_frames_per_s"] == pytest.approx(400)
     assert (figures["age_median_ms"], figures["settled_age_median_ms"]) == (410.0, 110.0)
 
 
