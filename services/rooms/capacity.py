@@ -19,6 +19,7 @@ GPU_LABEL, MEMORY_LABEL = "gpu", "gpu-memory-mb"  # of a host of a cluster: what
 USED_SHARE = 0.9  # of a device's memory; the rest is for the driver, and for what else runs
 CLAIMED_SHARE = 0.95  # of the claimed memory that must be there: drivers keep some to themselves
 PROBE_TIMEOUT_S = 60.0
+MAKE_REPORT = "make it on this host by `deltalight gpu-check --steps memory,speed`"
 _PROBE = """
 import json, sys
 from dataclasses import asdict
@@ -54,11 +55,10 @@ def load_figures(path: Path) -> RoomFigures:
         methods = next(iter(speed["timed"].values()))
         frame_ms = max(max(method["frames_ms"].values()) for method in methods.values())
         return RoomFigures(path, str(report["gpu"]), int(memory["room_bytes"]), float(frame_ms))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as fault:
-        raise DeltalightError(
-            f"{path} lacks memory or frame times of a room ({type(fault).__name__}: {fault}); make it on this host"
-            " by `deltalight gpu-check --steps memory,speed`."
-        ) from fault
+    except OSError as fault:
+        raise DeltalightError(f"{path} cannot be read ({fault.strerror}); {MAKE_REPORT}.") from fault
+    except (ValueError, KeyError, TypeError, AttributeError, StopIteration) as fault:
+        raise DeltalightError(f"{path} lacks memory or frame times of a room; {MAKE_REPORT}.") from fault
 
 
 def find_device_apart(device: int | None) -> "FoundDevice":
