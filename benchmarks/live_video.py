@@ -25,6 +25,7 @@ import httpx
 import numpy as np
 from jaxtyping import Float64, UInt8
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 import deltalight as dl
@@ -332,7 +333,8 @@ def main() -> None:
     with web_process(stream_port) as client:
         for size, motion in itertools.product(SIZES, MOTIONS):
             with publishing(stream_port, coded(relit, size, motion)):
-                for way, viewers in itertools.product(WAYS, CROWDS):
+                what = f"{size[0]}x{size[1]}, {motion}"
+                for way, viewers in track([*itertools.product(WAYS, CROWDS)], description=what):
                     seen, cores = asyncio.run(_crowd(client, way, viewers, seconds))
                     table.add_row(
                         f"{size[0]}x{size[1]}",
