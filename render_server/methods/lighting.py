@@ -24,7 +24,13 @@ from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones, TransmittedLight
+from deltalight.render_server.passes.reflections import (
+    RAY_ROUGHNESS,
+    ROUGHEST,
+    MirrorRays,
+    ScreenCones,
+    TransmittedLight,
+)
 from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.passes.voxels import (
@@ -104,6 +110,11 @@ def reflects_screen(objects: GeometryState) -> bool:
     return bool(objects.materials.smoothest < ROUGHEST)
 
 
+def mirrors_objects(objects: GeometryState) -> bool:
+    """Whether any object is smooth enough to show objects, by rays."""
+    return bool(objects.materials.smoothest < RAY_ROUGHNESS)
+
+
 def casts_caustics(objects: GeometryState) -> bool:
     """Whether any object is smooth enough to cast caustics."""
     return bool(objects.materials.smoothest**2 < GREATEST_ALPHA)
@@ -177,6 +188,7 @@ class Shading:
             self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
         self._transmitted: TransmittedLight | None = None
         self._rays: MirrorRays | None = None
+        self._object_rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
         self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
 
@@ -287,6 +299,22 @@ class Shading:
         self._rays.run({}, {**scene, **marching})
         return self._rays.reflection
 
+    def mirror_objects(
+        self, objects: GeometryState, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
+    ) -> moderngl.Texture | None:
+        """Traces the objects in smooth objects; returns None if none is smooth enough, or cones do."""
+        wanted = self._options.mirror_gather
+        is_quick = self.tier.reflection_step > 1
+        if wanted is None or self._screen is None or is_quick or not mirrors_objects(objects):
+            release_all(self._object_rays)
+            self._object_rays = None
+            return None
+        if self._object_rays is None:
+            march = self._options.march or {}
+            self._object_rays = MirrorRays(self._gpu, grid, bvh, wanted, march, of_objects=True)
+        self._object_rays.run({}, {**scene, **marching})
+        return self._object_rays.reflection
+
     def compare(
         self, grid: LowResGrid, direct: DirectLight, cones: ConeFields, reflection: moderngl.Texture | None
     ) -> ChangeRatio:
@@ -303,12 +331,13 @@ class Shading:
         bvh: ObjectBvh,
         seen: Observation,
         marching: Bindings,
+        mirrored: moderngl.Texture | None,
     ) -> moderngl.Texture | None:
-        """Traces what smooth objects reflect of the picture."""
+        """Traces what smooth objects reflect of the picture, and adds the objects `mirrored` in them."""
         if self._screen is None or not reflects_screen(objects):
             return None
         seen.image.build_levels()
-        self._screen.run(direct, cones, bvh, {**scene, **marching})
+        self._screen.run(direct, cones, bvh, {**scene, **marching}, mirrored)
         return self._screen.reflected
 
     def shade_objects(
@@ -361,6 +390,7 @@ class Shading:
             self._screen,
             self._transmitted,
             self._rays,
+            self._object_rays,
         )
         for item in held:
             if item is not None:
@@ -427,7 +457,8 @@ def shading_stages(
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
     behind = (s.objects, scene, direct, cones, bvh, s.observation, marching)
-    screen = g.stage("screen cones", shading.trace_screen, *behind)
+    mirrored = g.stage("mirrored objects", shading.mirror_objects, s.objects, scene, grid, bvh, marching)
+    screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
     reflected = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
     radiance = g.stage("transmitted light", shading.add_transmitted, reflected, *behind)
     return Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)

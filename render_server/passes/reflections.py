@@ -28,11 +28,11 @@ MEDIAN_DISC = 2.0 * 2.0**0.5
 
 
 class MirrorRays:
-    """Traces the virtual objects in smooth real surfaces by rays, because cones through voxels would blur them.
+    """Traces the virtual objects in smooth surfaces by rays, because cones through voxels would blur them.
 
-    `reflection` (RGBA16F): radiance of the objects times the fraction of the lobe that they fill, and that fraction.
-    `gather` completes the name of the kernel that lights reflected points (`mirror_gather...`); `defines` are that
-    kernel's.
+    The surfaces are real ones, or with `of_objects` those of the objects. `reflection` (RGBA16F): radiance of the
+    objects times the fraction of the lobe that they fill, and that fraction. `gather` completes the name of the
+    kernel that lights reflected points (`mirror_gather...`); `defines` are that kernel's.
     """
 
     def __init__(
@@ -42,8 +42,12 @@ class MirrorRays:
         objects: ObjectBvh,
         gather: str,
         defines: Mapping[str, float | str],
+        *,
+        of_objects: bool = False,
     ) -> None:
         self._grid, self._objects = grid, objects
+        if of_objects:
+            defines = {**defines, "OF_OBJECTS": 1}
         self.reflection = texture_2d(gpu, grid.picture_size, 4, "f2")
         self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
         self._hit_distance = texture_2d(gpu, grid.picture_size, 1, "f2")
@@ -65,8 +69,8 @@ class MirrorRays:
 
         The GPU counts the pixels that need rays, and traces nothing if there are none.
         """
-        self._list_pixels(scene)
         self._gather_light(light, scene)
+        self._list_pixels(scene)
         self._trace_rays(scene)
         self._smooth.run_counted(
             self._pixel_groups.count(self._pixels),
@@ -89,6 +93,8 @@ class MirrorRays:
             hit_distance=self._hit_distance,
             bounds_centre=tuple(self._objects.centre),
             bounds_radius=self._objects.radius,
+            hit_position=self._position,
+            scale=self._grid.scale,
         )
 
     def _gather_light(self, light: Bindings, scene: Bindings) -> None:
@@ -166,6 +172,7 @@ class ScreenCones:
             "screen_cones",
             ROUGHEST=ROUGHEST,
             CONE_COUNT=tier.reflection_cones,
+            RAY_ROUGHNESS=RAY_ROUGHNESS,
             MEDIAN_DISC=MEDIAN_DISC / tier.reflection_cones**0.5,  # the cones share the disc
             **voxels,
         )
@@ -175,13 +182,25 @@ class ScreenCones:
             self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
             self._fill = Kernel(gpu, "fill_reflections")
 
-    def run(self, direct: DirectLight, cones: ConeFields, objects: ObjectBvh, scene: Bindings) -> None:
-        """Fills `reflected`; the picture needs its mip levels (`CameraImage.build_levels`)."""
+    def run(
+        self,
+        direct: DirectLight,
+        cones: ConeFields,
+        objects: ObjectBvh,
+        scene: Bindings,
+        object_rays: moderngl.Texture | None,
+    ) -> None:
+        """Fills `reflected`; the picture needs its mip levels (`CameraImage.build_levels`).
+
+        `object_rays`: what rays saw of the objects (`MirrorRays.reflection`), so that cones leave them out.
+        """
         texels: Bindings = {"Texels": self._grid.virtual_texels, "scale": self._grid.scale}
+        rays: Bindings = {"OBJECT_RAYS": object_rays is not None, "object_rays": object_rays}
         self._kernel.run(
             (self._threads,),
             objects.bindings,
             texels,
+            rays,
             scene,
             reflected=self.reflected if self._traced is None else self._traced,
             sample_pixels=self._grid.pixels,

@@ -4,8 +4,8 @@
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
 #include "common/brdf.glsl"
-#include "common/mirror.glsl"
 #include "common/materials.glsl"
+#include "common/mirror.glsl"
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
@@ -36,7 +36,7 @@ float open_fraction(vec3 from, vec3 to) {
 void gather(ivec2 texel) {
     vec3 position = texelFetch(hit_position, texel, 0).xyz;
     vec4 normal = texelFetch(hit_normal, texel, 0);
-    Mirror m = mirror_at(texelFetch(sample_pixels, texel, 0).xy);
+    Mirror m = mirror_at(mirror_pixel(texelFetch(sample_pixels, texel, 0)));
     vec3 q = volume_coordinate(position);
     vec3 e_mu, e_rho;
     diffuse(q, normal.xyz, WHOLE, true, e_mu, e_rho);

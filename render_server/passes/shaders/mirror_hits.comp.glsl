@@ -14,7 +14,7 @@ void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy), size = textureSize(sample_pixels, 0);
     if (any(greaterThanEqual(texel, size))) return;
     imageStore(position_out, texel, vec4(0.0));
-    ivec2 pixel = texelFetch(sample_pixels, texel, 0).xy;
+    ivec2 pixel = mirror_pixel(texelFetch(sample_pixels, texel, 0));
     if (pixel.x < 0) return;
     Mirror m = mirror_at(pixel);
     MeshHit hit = MeshHit(0.0, -1, vec2(0.0));

@@ -1,4 +1,4 @@
-// The virtual objects in the mirror image of smooth real surfaces: rays over each pixel and its lobe. One invocation
+// The virtual objects in the mirror image of smooth surfaces: rays over each pixel and its lobe. One invocation
 // per ray; a pixel's rays are adjacent in a workgroup and summed there.
 #pragma switch TRANSMISSION
 #define OPAQUE_SHADOWS   // that buffer would be one too many

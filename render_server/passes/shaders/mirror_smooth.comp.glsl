@@ -14,12 +14,12 @@ float lobe_pixels(Mirror m, float d) { return 2.0 * m.alpha * d / (m.depth + d) 
 
 void smooth_pixel(ivec2 pixel) {
     Mirror m = mirror_at(pixel);
-    float entry = texelFetch(real_surface_normal, pixel, 0).w, farthest = 0.0, count = 0.0;
+    float entry = mirror_entry(pixel), farthest = 0.0, count = 0.0;
     vec4 own = texelFetch(traced, pixel, 0), around = vec4(0.0);
     ivec2 last = textureSize(traced, 0) - 1;
     for (int k = 0; k < 9; ++k) {
         ivec2 at = clamp(pixel + ivec2(k % 3, k / 3) - 1, ivec2(0), last);
-        if (texelFetch(real_surface_normal, at, 0).w != entry || texelFetch(object_coverage, at, 0).r >= 1.0) continue;
+        if (mirror_entry(at) != entry || !shows_mirror(texelFetch(object_coverage, at, 0).r)) continue;
         around += texelFetch(traced, at, 0);
         farthest = max(farthest, texelFetch(hit_distance, at, 0).r);
         count += 1.0;

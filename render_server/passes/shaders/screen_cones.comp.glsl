@@ -12,21 +12,27 @@
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D reflected;   // rgb radiance times fraction; a: fraction of the lobe
 #include "common/camera.glsl"
+#pragma switch OBJECT_RAYS
+#ifdef OBJECT_RAYS
+layout(rgba16f) readonly uniform image2D object_rays;   // objects, by rays: radiance times fraction; a: fraction of the lobe
+const float OBJECTS_BY_RAYS = RAY_ROUGHNESS;            // of smoother surfaces
+#else
+const float OBJECTS_BY_RAYS = -1.0;
+#endif
 
 const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its own surface
 
-// Radiance times fraction of one cone, across the picture.
-vec4 look_across(vec3 from, vec3 d, float spread) {
+// Radiance times fraction of one cone, through everything that it may hit. With `objects_apart` a cone that meets an object first
+// tells nothing (`is_open` false).
+vec4 look(vec3 from, vec3 d, float spread, bool objects_apart, out bool is_open) {
     ScreenHit hit = screen_hit(from, d, spread);
-    if (hit.fraction <= 0.0 || is_blocked(Ray(from, d), hit.distance)) return vec4(0.0);
-    return shown_at(hit, spread);
-}
-
-// The same, through everything that the cone may hit.
-vec4 look(vec3 from, vec3 d, float spread) {
-    vec4 seen = look_across(from, d, spread);
+    bool found = hit.fraction > 0.0;
+    is_open = !(found || objects_apart) || !is_blocked(Ray(from, d), found ? hit.distance : FARTHEST);
+    if (objects_apart && !is_open) return vec4(0.0);
+    vec4 seen = found && is_open ? shown_at(hit, spread) : vec4(0.0);
 #ifdef VOXELS
-    if (seen.a < 1.0) seen += (1.0 - seen.a) * vec4(look_in_voxels(from, d, spread), 1.0);
+    float open;
+    if (seen.a < 1.0) seen += (1.0 - seen.a) * vec4(look_in_voxels(from, d, spread, open), 1.0);
 #endif
     return seen;
 }
@@ -53,6 +59,7 @@ vec4 reflection(ivec2 pixel) {
     Change x = change_along(pixel, ivec2(1, 0), position, normal);
     Change y = change_along(pixel, ivec2(0, 1), position, normal);
     float spread = spread_of(alpha, x, y);
+    bool objects_apart = roughness < OBJECTS_BY_RAYS, is_open;
     vec4 sum = vec4(0.0);
     float count = 0.0;
     for (int j = 0; j < CONE_COUNT; ++j) {
@@ -65,10 +72,17 @@ vec4 reflection(ivec2 pixel) {
         vec3 h = basis * visible_normal(vec2(even.x, (float(j) + 0.5) / float(CONE_COUNT)), v * basis, alpha);
         vec3 d = normalize(2.0 * dot(v, h) * h - v);
         if (dot(d, normal.xyz) <= 0.0) continue;
-        sum += look(p + CLEAR * position.w * normal.xyz, d, spread);
+        vec4 seen = look(p + CLEAR * position.w * normal.xyz, d, spread, objects_apart, is_open);
+        if (objects_apart && !is_open) continue;
+        sum += seen;
         count += 1.0;
     }
-    return sum / max(count, 1.0);
+    vec4 seen = sum / max(count, 1.0);
+#ifdef OBJECT_RAYS
+    vec4 objects = imageLoad(object_rays, pixel);
+    seen = objects + (1.0 - objects.a) * seen;
+#endif
+    return seen;
 }
 
 #ifdef QUADS

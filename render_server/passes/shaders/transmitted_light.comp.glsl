@@ -1,6 +1,7 @@
 // What transparent objects show of what is behind them (docs/method.md 4.11): rays from the camera through their surfaces, which
 // refract and reflect them, and on into the picture, voxels or environment. Added to what the objects' surfaces reflect.
 #include "common/brdf.glsl"
+#include "common/lights.glsl"
 #include "common/environment.glsl"
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
@@ -29,16 +30,32 @@ void hold(vec3 from, vec3 direction, vec3 weight, int medium) {
     if (held_count < HELD && greatest(weight) > LEAST_WEIGHT) held[held_count++] = Path(from, direction, weight, medium);
 }
 
+// Mean radiance of the lamps over a cone around d.
+vec3 lamps_along(vec3 from, vec3 d, float spread) {
+    vec3 sum = vec3(0.0);
+    float alpha = max(spread / (2.0 * MEDIAN_DISC), LEAST_ALPHA);
+    for (int i = 0; i < light_count; ++i) {
+        if (is_image(lights[i])) continue;   // the picture shows the real one
+        vec3 l; float radius;
+        vec3 across = light_at(lights[i], from, l, radius);
+        sum += across * image_of_disc(d, l, alpha, radius);
+    }
+    return sum;
+}
+
 // What a path sees that leaves the transparent objects; `object`: distance of the next surface of any object.
 vec3 outside(vec3 from, vec3 d, float spread, float object) {
     ScreenHit hit = screen_hit(from, d, spread);
     vec4 seen = hit.fraction > 0.0 && hit.distance < object ? shown_at(hit, spread) : vec4(0.0);
+    if (seen.a >= 1.0) return seen.rgb;
+    float open = 1.0;
 #ifdef VOXELS
-    if (seen.a < 1.0) seen.rgb += (1.0 - seen.a) * look_in_voxels(from, d, spread);
+    vec3 beyond = look_in_voxels(from, d, spread, open);
 #else
-    seen.rgb += (1.0 - seen.a) * environment(d, atan(0.5 * spread));
+    vec3 beyond = environment(d, atan(0.5 * spread));
 #endif
-    return seen.rgb;
+    if (object >= NOTHING && open > 0.0) beyond += open * lamps_along(from, d, spread);
+    return seen.rgb + (1.0 - seen.a) * beyond;
 }
 
 // Holds what the surface makes of a path: one part goes on through it, the other is reflected. That part of the path

@@ -92,9 +92,25 @@ vec3 diffuse_under_lobe(vec3 f0, float roughness, float n_dot_l, float n_dot_v) 
     return in_and_out / max(1.0 - mean_specular_reflectance(f0, roughness), vec3(1e-3));
 }
 
+// Fraction of the lobe of `alpha` around the mirrored direction d that a disc of half-angle `radius` around l fills. In s, the tangent of
+// half the angle to d, the lobe is alpha^2 / (PI (alpha^2 + s^2)^2): even light on a sphere, projected stereographically. Of that sphere
+// the disc is a cap.
+float lobe_in_disc(vec3 d, vec3 l, float alpha, float radius) {
+    vec3 both = d + l, apart = d - l;
+    float s2 = dot(apart, apart) / max(dot(both, both), 1e-6), r = tan(0.5 * radius);
+    float beyond = alpha * alpha + s2 - r * r;
+    return 0.5 * (1.0 - beyond * inversesqrt(beyond * beyond + 4.0 * r * r * alpha * alpha));
+}
+
+// The same relative to the irradiance across the beam of a disc of radiance 1.
+float image_of_disc(vec3 d, vec3 l, float alpha, float radius) {
+    float r = max(radius, 1e-3), sine = sin(r);
+    return lobe_in_disc(d, l, alpha, r) / (PI * sine * sine);
+}
+
 // Specular BRDF times cosine for a light seen under half-angle `radius` (rad). Averaging the lobe's peak over the
 // light's disc, of radius/2 in half-vectors, gives a GGX peak of alpha^2 + (radius/2)^2; D stays a normalised
-// distribution, so the reflected energy is that of the unwidened lobe.
+// distribution, so the reflected energy is that of the unwidened lobe. A lobe narrower than that shows the disc itself.
 vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, float radius) {
     float alpha = max(roughness * roughness, 2e-3);
     float wide = min(sqrt(alpha * alpha + 0.25 * radius * radius), 1.0);
@@ -103,6 +119,7 @@ vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, flo
     vec3 h = l + v;
     h *= inversesqrt(max(dot(h, h), 1e-12));   // l = -v has no half-vector
     vec3 reflected = fresnel_schlick(f0, max(dot(l, h), 0.0)) * further_reflections(f0, lobe_albedo(roughness, n_dot_v).x);
+    if (alpha < 0.5 * radius) return reflected * image_of_disc(reflect(-v, n), l, alpha * sqrt(n_dot_v), radius);
     return reflected * (ggx_distribution(clamp(dot(n, h), 0.0, 1.0), wide)
         * smith_visibility(n_dot_l, n_dot_v, alpha) * n_dot_l);
 }

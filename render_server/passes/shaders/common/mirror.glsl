@@ -1,10 +1,41 @@
-// Smooth real surfaces, which reflect virtual objects by rays.
+// Smooth surfaces that reflect virtual objects by rays: real ones, or (OF_OBJECTS) those of the objects themselves. What needs
+// materials.glsl besides includes it before: what is included within a condition is not again.
 #include "common/geometry.glsl"
-#include "common/surfaces.glsl"
 #include "common/lobe.glsl"
+#ifdef OF_OBJECTS
+#include "common/shown_maps.glsl"
+#else
+#include "common/surfaces.glsl"
+#endif
 
 struct Mirror { bool present; vec3 point; vec3 normal; float depth; float alpha; };
 
+#ifdef OF_OBJECTS
+bool shines(MaterialEntry m) { return m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0; }
+
+// The smooth surface of the object that a pixel shows.
+Mirror mirror_at(ivec2 pixel) {
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = texelFetch(virtual_raster_position, raster, 0);
+    vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
+    Mirror m = Mirror(false, position.xyz, normal.xyz, position.w, LEAST_ALPHA);
+    if (position.w <= 0.0) return m;
+    float roughness = roughness_at(raster, int(normal.w));
+    m.alpha = max(roughness * roughness, LEAST_ALPHA);
+    bool faces = dot(m.normal, camera_position - m.point) > 0.0;
+    m.present = shines(materials[int(normal.w)]) && roughness < RAY_ROUGHNESS && faces;
+    return m;
+}
+
+// Of the two pixels that represent a texel of the reduced grid, the one that may show a mirror.
+ivec2 mirror_pixel(ivec4 represent) { return represent.zw; }
+
+// Whether a pixel of that `coverage` by objects shows mirrors.
+bool shows_mirror(float coverage) { return coverage > 0.0; }
+
+// Which smooth surface a pixel shows.
+float mirror_entry(ivec2 pixel) { return texelFetch(virtual_raster_normal, raster_texel(pixel), 0).w; }
+#else
 // The smooth surface that a pixel sees. A declared plane is flatter than its depth image: its own normal applies.
 Mirror mirror_at(ivec2 pixel) {
     vec4 position = texelFetch(real_surface_position, pixel, 0);
@@ -21,3 +52,10 @@ Mirror mirror_at(ivec2 pixel) {
     m.present = e.surface.x < RAY_ROUGHNESS && dot(m.normal, away) > 0.0;
     return m;
 }
+
+ivec2 mirror_pixel(ivec4 represent) { return represent.xy; }
+
+bool shows_mirror(float coverage) { return coverage < 1.0; }
+
+float mirror_entry(ivec2 pixel) { return texelFetch(real_surface_normal, pixel, 0).w; }
+#endif
