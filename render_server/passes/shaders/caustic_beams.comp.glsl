@@ -32,7 +32,12 @@ const float LOBE_FRACTION = 0.5;    // a ray represents part of its lobe: this w
 #else
 const float LOBE_FRACTION = 1.0;    // all go in the mirror direction, and are as wide as the lobe
 #endif
-const float RAYS_APART = inversesqrt(float(RAY_COUNT));   // of a block's edge
+#ifdef REFRACTED
+const float LAMP_FRACTION = 0.5;    // a ray represents part of its lamp: this wide
+const float RAYS_APART = 1.0;       // of a block's edge: those from one part of the lamp
+#else
+const float RAYS_APART = inversesqrt(float(RAY_COUNT));
+#endif
 const float OVERLAP = 0.6;          // deviation / distance to the next beam: their sum is even within a few percent
 // Standard deviation of the normal distribution with the peak of a GGX lobe cut off at 85 % of its energy;
 // half-vectors turn half as far as the directions they reflect.
@@ -182,9 +187,15 @@ Passage strongest_held() {
     return way;
 }
 
-Passage first_passage(LightView view, vec2 s) {
-    vec3 start = ray_point(view, s, view.range.z > 0.5 ? 0.0 : view.range.x);
-    return Passage(1u, start, normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0)), vec3(1.0), 0.0, -1);
+// Of a ray: where its lamp's light starts, relative to the lamp's middle and to the distance, and the depth in the light's view at
+// which rays from all over the lamp through one place of the view meet.
+struct LampPart { vec3 aside; float depth; };
+
+Passage first_passage(LightView view, vec2 s, LampPart part) {
+    vec3 meeting = ray_point(view, s, part.depth);
+    vec3 direction = normalize(normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0)) - part.aside);
+    float back = view.range.z > 0.5 ? part.depth : part.depth - view.range.x;
+    return Passage(1u, meeting - back * direction, direction, vec3(1.0), 0.0, -1);
 }
 
 bool meets_transparent(MeshHit hit) { return hit.triangle >= 0 && is_transparent(material_of_triangle(max(hit.triangle, 0))); }
@@ -205,8 +216,8 @@ Passage divided(Passage way, MeshHit hit, bool back) {
 }
 
 // The path by the same ways from another place of the light's view.
-Passage along_ways(LightView view, vec2 s, uint ways) {
-    Passage way = first_passage(view, s);
+Passage along_ways(LightView view, vec2 s, LampPart part, uint ways) {
+    Passage way = first_passage(view, s, part);
     for (int k = findMSB(ways) - 1; k >= 0; --k) {
         MeshHit hit = closest_hit(Ray(way.from, way.direction));
         if (meets_transparent(hit)) way = divided(way, hit, (ways >> uint(k) & 1u) != 0u);
@@ -217,10 +228,10 @@ Passage along_ways(LightView view, vec2 s, uint ways) {
 }
 
 // Drift of a path from this texel to the next block along `axis`.
-Drift drift_through(LightView view, ivec2 texel, ivec2 axis, Passage here, float side) {
+Drift drift_through(LightView view, ivec2 texel, ivec2 axis, LampPart part, Passage here, float side) {
     int apart = max(block_edge / 2, 1);
     for (int sign = 1; sign >= -1; sign -= 2) {
-        Passage other = along_ways(view, texel_lateral(view, texel + sign * apart * axis), here.ways);
+        Passage other = along_ways(view, texel_lateral(view, texel + sign * apart * axis), part, here.ways);
         if (other.ways != here.ways) continue;
         float blocks = float(sign * block_edge) / float(apart) * RAYS_APART;
         return Drift(blocks * (other.from - here.from), blocks * (other.direction - here.direction));
@@ -229,14 +240,14 @@ Drift drift_through(LightView view, ivec2 texel, ivec2 axis, Passage here, float
     return Drift(across, vec3(0.0));
 }
 
-void leave_objects(LightView view, ivec2 texel, float side, Passage way, vec3 flux, float radius) {
-    Drift x = drift_through(view, texel, ivec2(1, 0), way, side), y = drift_through(view, texel, ivec2(0, 1), way, side);
-    send(way.from, way.direction, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * radius)), x, y);
+void leave_objects(LightView view, ivec2 texel, float side, LampPart part, Passage way, vec3 flux, float radius) {
+    Drift x = drift_through(view, texel, ivec2(1, 0), part, way, side), y = drift_through(view, texel, ivec2(0, 1), part, way, side);
+    send(way.from, way.direction, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * LAMP_FRACTION * radius)), x, y);
 }
 
 // Sends a beam for each of the strongest PATHS paths of a ray; what its first surface reflects, mirrors' beams bring.
-void send_paths(LightView view, ivec2 texel, float side, vec3 flux, float radius) {
-    Passage start = first_passage(view, texel_lateral(view, texel));
+void send_paths(LightView view, ivec2 texel, float side, LampPart part, vec3 flux, float radius) {
+    Passage start = first_passage(view, texel_lateral(view, texel), part);
     MeshHit first = closest_hit(Ray(start.from, start.direction));
     held_count = 0;
     if (meets_transparent(first)) hold(divided(start, first, false));
@@ -245,7 +256,7 @@ void send_paths(LightView view, ivec2 texel, float side, vec3 flux, float radius
         Passage way = strongest_held();
         MeshHit hit = closest_hit(Ray(way.from, way.direction));
         if (!meets_transparent(hit)) {
-            leave_objects(view, texel, side, way, flux, radius);
+            leave_objects(view, texel, side, part, way, flux, radius);
             ++sent;
         } else if (findMSB(way.ways) < LONGEST_WAY) {
             hold(divided(way, hit, false));
@@ -260,7 +271,8 @@ bool lets_through(int material) {
 }
 
 void cast_ray(Light light, LightView view, ivec2 block, int j) {
-    ivec2 texel = texel_of_ray(view, block, ray_numbers(block, j));
+    vec4 numbers = ray_numbers(block, j);
+    ivec2 texel = texel_of_ray(view, block, numbers);
     Spot spot = spot_at(view, texel);
     if (!spot.present || !lets_through(spot.material)) return;
     vec3 to_light; float radius;
@@ -269,8 +281,10 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     vec3 flux = float(block_edge * block_edge) / float(RAY_COUNT) * texel_light(light, view, s);
     if (flux == vec3(0.0)) return;
     flux *= real_visibility(light, spot.point, spot.normal, bias_real);
-    float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
-    send_paths(view, texel, side, flux, radius);
+    float depth = (view.view_from_world * vec4(spot.point, 1.0)).z, angle = 2.0 * PI * numbers.x;
+    vec2 on_lamp = tan(radius) * sqrt(numbers.y) * vec2(cos(angle), sin(angle));
+    LampPart part = LampPart(transpose(mat3(view.view_from_world)) * vec3(on_lamp, 0.0), depth);
+    send_paths(view, texel, texel_side(view, depth), part, flux, radius);
 }
 #else
 // Ray j of a block: its texel is one of RAY_COUNT spread evenly over the block, which share the block's flux.

@@ -6,6 +6,7 @@
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
 #include "common/refraction.glsl"
+#include "common/lobe.glsl"
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
