@@ -11,6 +11,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.textures import texture_2d
 from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
 from deltalight.render_server.lights.lights import DirectionalLight, Light, RectangleLight
 from deltalight.render_server.lights.mirror_lights import MirrorLight
@@ -27,7 +28,8 @@ from deltalight.render_server.passes.shadow_maps import (
     tile_columns,
 )
 
-LIGHT_BYTES = 160  # of a std430 Light (shaders/common/lights.glsl)
+LIGHT_BYTES = 160  # of a std430 Light (shaders/common/light_shapes.glsl)
+TEXEL_BYTES = 16  # of four floats
 EMPTY = b"\0" * 256
 BRIGHTEST = float(np.finfo(np.float16).max)
 GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up has to fit, too
@@ -66,6 +68,7 @@ class LightBuffers:
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self._light_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
+        self._record_texture = texture_2d(gpu, (LIGHT_BYTES // TEXEL_BYTES, 1), 4, "f4")
         self._view_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
         self._environment: moderngl.TextureArray | None = None
         self._environment_half_angle = 0.0
@@ -76,6 +79,7 @@ class LightBuffers:
         """All bindings of the lights, by GLSL name."""
         return {
             "Lights": self._light_buffer,
+            "light_records": self._record_texture,
             "LightViews": self._view_buffer,
             "Lighting": self._block,
             "real_light_depth": self.real_atlas.depth,
@@ -174,7 +178,17 @@ class LightBuffers:
         self._light_buffer.orphan(max(len(records), 16))
         self._view_buffer.orphan(max(len(packed), 16))
         self._light_buffer.write(records or EMPTY[:16])
+        self._write_record_texture(records)
         self._view_buffer.write(packed or EMPTY[:16])
+
+    def _write_record_texture(self, records: bytes) -> None:
+        """Writes the same records a row each, for shaders that have no storage block left."""
+        size = LIGHT_BYTES // TEXEL_BYTES, max(len(self.lights), 1)
+        if self._record_texture.size != size:
+            self._record_texture.release()
+            self._record_texture = texture_2d(self._gpu, size, 4, "f4")
+        if records:
+            self._record_texture.write(records)
 
     def _packed(self, views: list[LightView]) -> bytes:
         columns = tile_columns(len(views))
@@ -209,8 +223,8 @@ class LightBuffers:
         """Frees the GL objects."""
         for item in (self.real_atlas, self.virtual_atlas, self.mirror_visibility, self._block):
             item.release()
-        for buffer in (self._light_buffer, self._view_buffer):
-            buffer.release()
+        for held in (self._light_buffer, self._view_buffer, self._record_texture):
+            held.release()
         if self._environment is not None:
             self._environment.release()
 

@@ -1,7 +1,8 @@
 // What transparent objects show of what is behind them (docs/method.md 4.11): rays from the camera through their surfaces, which
 // refract and reflect them, and on into the picture, voxels or environment. Added to what the objects' surfaces reflect.
 #include "common/brdf.glsl"
-#include "common/lights.glsl"
+#include "common/lighting.glsl"
+#include "common/light_shapes.glsl"
 #include "common/environment.glsl"
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
@@ -12,10 +13,13 @@
 layout(local_size_x = 64) in;
 layout(rgba16f) readonly uniform image2D reflected_radiance;   // of the objects
 layout(rgba16f) writeonly uniform image2D radiance_out;
+// An image, because OpenGL guarantees no more than eight storage blocks, and sixteen samplers.
+layout(rgba32f) readonly uniform image2D light_records;   // a row a light
 uniform sampler2D object_coverage;
 uniform float pixel_size;      // m at 1 m depth
 #include "common/camera.glsl"
 
+const float NOWHERE = 1e30;        // distance of what a ray does not meet
 const int MOST_SURFACES = 24;      // that the paths of one ray may meet
 const int HELD = 4;                // paths that wait
 const float LEAST_WEIGHT = 0.004;  // of a path that goes on: a step of 8-bit codes
@@ -31,14 +35,29 @@ void hold(vec3 from, vec3 direction, vec3 weight, int medium) {
     if (held_count < HELD && greatest(weight) > LEAST_WEIGHT) held[held_count++] = Path(from, direction, weight, medium);
 }
 
+vec4 light_record(int i, int column) { return imageLoad(light_records, ivec2(column, i)); }
+
+// Without what shadows and mirror images need.
+Light lamp(int i) {
+    Light light;
+    light.place = light_record(i, 0);
+    light.color = light_record(i, 1);
+    light.shape = light_record(i, 2);
+    light.axis_u = light_record(i, 3);
+    light.axis_v = light_record(i, 4);
+    light.mirror = light_record(i, 6);
+    return light;
+}
+
 // Mean radiance of the lamps over a cone around d.
 vec3 lamps_along(vec3 from, vec3 d, float spread) {
     vec3 sum = vec3(0.0);
     float alpha = max(spread / (2.0 * MEDIAN_DISC), LEAST_ALPHA);
     for (int i = 0; i < light_count; ++i) {
-        if (is_image(lights[i])) continue;   // the picture shows the real one
+        Light light = lamp(i);
+        if (is_image(light)) continue;   // the picture shows the real one
         vec3 l; float radius;
-        vec3 across = light_at(lights[i], from, l, radius);
+        vec3 across = unmirrored_light_at(light, from, vec3(0.0), l, radius);
         sum += across * image_of_disc(d, l, alpha, radius);
     }
     return sum;
@@ -55,7 +74,7 @@ vec3 outside(vec3 from, vec3 d, float spread, float object) {
 #else
     vec3 beyond = environment(d, atan(0.5 * spread));
 #endif
-    if (object >= NOTHING && open > 0.0) beyond += open * lamps_along(from, d, spread);
+    if (object >= NOWHERE && open > 0.0) beyond += open * lamps_along(from, d, spread);
     return seen.rgb + (1.0 - seen.a) * beyond;
 }
 

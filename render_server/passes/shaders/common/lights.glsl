@@ -1,29 +1,7 @@
 // Lights, their depth maps, and soft visibility with and without the virtual objects (docs/method.md 3, direct).
 #include "common/basis.glsl"
 #include "common/brdf.glsl"
-
-struct Light {
-    vec4 place;    // xyz: direction of travel (directional) or position in m; w: kind
-    vec4 color;    // rgb: E_perp (directional), intensity I (sphere, spot) or radiance L (rectangle), camera units
-    vec4 shape;    // x: tan(angular radius) (directional), radius in m (sphere, spot); y - z angle: fraction of I (spot)
-    vec4 axis_u;   // xyz: half an edge in m (rectangle) or direction of travel on the axis (spot)
-    vec4 axis_v;   // xyz: half the other edge in m (rectangle)
-    vec4 plane;    // of a mirror image: the plane (world) in front of which it shines
-    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; layer -1: no image. color.w: distance, m, up to
-                   // which points belong to the plane; shape.w: roughness; axis_u.w: entry of the surface table;
-                   // axis_v.w: the light that it is an image of
-    vec4 map_u;    // of a mirror image: its map's coordinates of a world point are dot(xyz, p) + w
-    vec4 map_v;
-    ivec4 views;   // first view and count in the real atlas, first and count in the virtual atlas
-};
-const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0;   // kinds
-// Of the scene's lights. llvmpipe executes what one kind needs for every light, so that a scene without it does without.
-#pragma switch bool has_rectangles
-#pragma switch bool has_mirror_images
-
-bool is_rectangle(Light light) { return has_rectangles && light.place.w == RECTANGLE; }
-
-bool is_image(Light light) { return has_mirror_images && light.mirror.w >= 0.0; }
+#include "common/light_shapes.glsl"
 
 struct LightView {
     mat4 view_from_world;   // light at the origin (unless directional), looking along +z
@@ -40,67 +18,6 @@ uniform sampler2D caster_distance;   // of virtual_light_depth: squared, in cell
 uniform sampler2DArray mirror_visibility;   // r, g: fraction of an image that a plane shows without and with objects
 #include "common/lighting.glsl"
 uniform int shadow_samples;
-
-// Fraction of its intensity that a spot emits along d (unit, of travel); 1 for a sphere.
-float spot_fraction(Light light, vec3 d) {
-    float angle = 2.0 * asin(min(0.5 * distance(light.axis_u.xyz, d), 1.0));   // exact for small angles too
-    return clamp(light.shape.y - light.shape.z * angle, 0.0, 1.0);
-}
-
-// Half the angle between a and b (as seen from the receiver) along the normal of their plane.
-vec3 edge_term(vec3 a, vec3 b) {
-    vec3 across = cross(a, b);
-    float sine = length(across);
-    return sine < 1e-12 ? vec3(0.0) : across * (0.5 * atan(sine, dot(a, b)) / sine);
-}
-
-vec2 corner(int i) { return vec2(((i + 1) & 2) == 0 ? -1.0 : 1.0, (i & 2) == 0 ? -1.0 : 1.0); }
-
-// Vector irradiance of a rectangle of radiance 1 at p above the horizon of n: dot(result, n) is the irradiance
-// (Lambert 1760, photometry of polygons; exact). `edges` is 5, the last along the horizon, or 0 for another kind of
-// light: llvmpipe leaves a loop early but executes both sides of a branch.
-vec3 rectangle_vector(Light light, int edges, vec3 p, vec3 n) {
-    mat2x3 axes = mat2x3(light.axis_u.xyz, light.axis_v.xyz);
-    vec3 centre = light.place.xyz - p, sum = vec3(0.0), leaves = vec3(0.0), enters = vec3(0.0);
-    vec3 a = centre + axes * corner(0);
-    for (int i = 1; i <= edges; ++i) {
-        vec3 b = centre + axes * corner(i);
-        float above_a = dot(n, a), above_b = dot(n, b);
-        vec3 crossing = mix(a, b, above_a / (above_a == above_b ? 1.0 : above_a - above_b));
-        bool leaving = above_a >= 0.0 && above_b < 0.0, entering = above_a < 0.0 && above_b >= 0.0;
-        vec3 from = entering ? crossing : a, to = leaving ? crossing : b;
-        if (i == 5) { from = leaves; to = enters; }
-        else if (leaving) leaves = crossing;
-        else if (entering) enters = crossing;
-        if (i == 5 || above_a >= 0.0 || above_b >= 0.0) sum += edge_term(from, to);
-        a = b;
-    }
-    bool before = dot(cross(axes[0], axes[1]), centre) < 0.0;
-    return before ? -sum : vec3(0.0);   // seen from the front, the corners run clockwise
-}
-
-// Irradiance across the beam at p of a surface with normal n, and the direction towards the light: the irradiance is
-// across * dot(n, to_light). A rectangle is one beam along its vector irradiance; its angular radius is that of the
-// disc with the same irradiance. Without a normal (0) no horizon clips it.
-vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
-    vec3 d = light.place.xyz - p;
-    float distance2 = max(dot(d, d), 1e-8);
-    if (has_rectangles) {
-        vec3 vector = rectangle_vector(light, is_rectangle(light) ? 5 : 0, p, n);
-        float across = length(vector);
-        to_light = across > 1e-12 ? vector / across : d * inversesqrt(distance2);
-        angular_radius = asin(min(sqrt(across / PI), 1.0));
-        if (is_rectangle(light)) return light.color.rgb * across;
-    }
-    if (light.place.w == DIRECTIONAL) {
-        to_light = -light.place.xyz;
-        angular_radius = atan(light.shape.x);
-        return light.color.rgb;
-    }
-    to_light = d * inversesqrt(distance2);
-    angular_radius = asin(min(light.shape.x * inversesqrt(distance2), 1.0));
-    return light.color.rgb / distance2 * spot_fraction(light, -to_light);
-}
 
 vec3 light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
     vec3 across = unmirrored_light_at(light, p, n, to_light, angular_radius);
