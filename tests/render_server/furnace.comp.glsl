@@ -1,5 +1,6 @@
 // What surfaces reflect of radiance 1 from everywhere: x by the lights' formulas, integrated over all directions, y by
-// those for gathered light, z by what voxels and cells reflect of it.
+// those for gathered light, z by what voxels and cells reflect of it, w by the lobe alone of a lamp wider than it, integrated over
+// all places of the lamp.
 #include "common/brdf.glsl"
 #include "common/lobe.glsl"
 
@@ -20,6 +21,21 @@ float specular_sample(vec2 u, vec3 v, vec3 f0, float roughness) {
     return specular_times_cosine(vec3(0.0, 0.0, 1.0), v, l, f0, roughness, 0.0).r / density;
 }
 
+const float LAMP = 0.3;      // rad, half-angle of the lamp
+const float REACH = 1.2;     // rad, around the mirrored direction: what the tails beyond hold is less than 1 %
+
+float shown_of_lamps(vec3 v, vec3 f0, float roughness) {
+    vec3 n = vec3(0.0, 0.0, 1.0);
+    mat3 basis = basis_around(reflect(-v, n));
+    float sum = 0.0, most = 1.0 - cos(REACH);
+    for (int j = 0; j < SIDE * SIDE; ++j) {
+        float z = 1.0 - most * (float(j / SIDE) + 0.5) / float(SIDE), phi = 2.0 * PI * (float(j % SIDE) + 0.5) / float(SIDE);
+        vec3 l = basis * vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
+        sum += specular_times_cosine(n, v, l, f0, roughness, LAMP).r;
+    }
+    return sum * 2.0 * PI * most / float(SIDE * SIDE);
+}
+
 void main() {
     uint i = gl_GlobalInvocationID.x;
     if (i >= uint(count)) return;
@@ -32,5 +48,5 @@ void main() {
     }
     float lobe = specular_reflectance(f0, roughness, cosine).r;
     float mean = mean_specular_reflectance(f0, roughness).r + mean_diffuse_reflectance(vec3(diffuse), f0, roughness).r;
-    found[i] = vec4(lit / float(SIDE * SIDE), diffuse * (1.0 - lobe) + lobe, mean, 0.0);
+    found[i] = vec4(lit / float(SIDE * SIDE), diffuse * (1.0 - lobe) + lobe, mean, shown_of_lamps(v, f0, roughness));
 }

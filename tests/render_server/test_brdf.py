@@ -17,8 +17,8 @@ ROUGHNESSES = np.array([0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.85, 1.0])
 WHITE = {"metal": (0.0, 1.0), "plastic": (1.0, 0.04), "glossy": (1.0, 0.08), "matt": (1.0, 0.0)}
 
 
-def reflected(gpu: GpuContext, diffuse: float, f0: float) -> Float32[np.ndarray, "roughnesses cosines 3"]:
-    """Of radiance 1 from everywhere: lights, gathered light, mean over all directions."""
+def reflected(gpu: GpuContext, diffuse: float, f0: float) -> Float32[np.ndarray, "roughnesses cosines 4"]:
+    """Of radiance 1 from everywhere: lights, gathered light, mean over all directions, wide lamps in the lobe."""
     roughness, cosine = np.meshgrid(ROUGHNESSES, COSINES, indexing="ij")
     surfaces = np.zeros((roughness.size, 8), np.float32)
     surfaces[:, :3], surfaces[:, 3] = diffuse, cosine.ravel()
@@ -26,7 +26,7 @@ def reflected(gpu: GpuContext, diffuse: float, f0: float) -> Float32[np.ndarray,
     given, found = gpu.ctx.buffer(surfaces.tobytes()), gpu.ctx.buffer(reserve=16 * len(surfaces))
     kernel = Kernel(gpu, Path(__file__).with_name("furnace"))
     kernel.run((len(surfaces),), Surfaces=given, Found=found, count=len(surfaces))
-    values = np.frombuffer(found.read(), np.float32).reshape(*roughness.shape, 4)[..., :3].copy()
+    values = np.frombuffer(found.read(), np.float32).reshape(*roughness.shape, 4).copy()
     for item in (given, found, kernel):
         item.release()
     return values
@@ -35,7 +35,7 @@ def reflected(gpu: GpuContext, diffuse: float, f0: float) -> Float32[np.ndarray,
 @pytest.mark.parametrize("name", WHITE)
 def test_white_surfaces_reflect_all_light(gpu: GpuContext, name: str) -> None:
     """From every side and at every roughness, by every path: within 2 %."""
-    found = reflected(gpu, *WHITE[name])
+    found = reflected(gpu, *WHITE[name])[..., :3]
     for path, values in zip(("lights", "gathered", "mean"), np.moveaxis(found, -1, 0), strict=True):
         print(f"{name}, {path}: {values.min():.3f} .. {values.max():.3f}")
     assert found == pytest.approx(1.0, abs=0.02)
@@ -46,6 +46,13 @@ def test_lights_and_gathered_light_reflect_alike(gpu: GpuContext, f0: float) -> 
     found = reflected(gpu, 0.0, f0)
     assert found[..., 0] == pytest.approx(found[..., 1], abs=0.02)
     assert found[..., 0].max() < 1.0
+
+
+def test_lamps_wider_than_the_lobe_keep_its_light(gpu: GpuContext) -> None:
+    """A mirror shows lamps of half-angle 0.3 that come from all sides as one even light, within 2 %."""
+    shown = reflected(gpu, 0.0, 1.0)[ROUGHNESSES <= 0.2][..., 3]
+    print(f"{shown.min():.3f} .. {shown.max():.3f}")
+    assert shown == pytest.approx(1.0, abs=0.02)
 
 
 def white_ball(gpu: GpuContext, stage: Stage, finish: dict[str, float]) -> float:

@@ -32,12 +32,7 @@ const float LOBE_FRACTION = 0.5;    // a ray represents part of its lobe: this w
 #else
 const float LOBE_FRACTION = 1.0;    // all go in the mirror direction, and are as wide as the lobe
 #endif
-#ifdef REFRACTED
-const float LAMP_FRACTION = 0.5;    // a ray represents part of its lamp: this wide
-const float RAYS_APART = 1.0;       // of a block's edge: those from one part of the lamp
-#else
-const float RAYS_APART = inversesqrt(float(RAY_COUNT));
-#endif
+const float RAYS_APART = inversesqrt(float(RAY_COUNT));   // of a block's edge
 const float OVERLAP = 0.6;          // deviation / distance to the next beam: their sum is even within a few percent
 // Standard deviation of the normal distribution with the peak of a GGX lobe cut off at 85 % of its energy;
 // half-vectors turn half as far as the directions they reflect.
@@ -163,6 +158,7 @@ const int MOST_SURFACES = 24;    // that the paths of one ray meet
 const int LONGEST_WAY = 16;      // surfaces that one of them meets
 const int HELD = 4;              // paths that wait
 const float LEAST_PART = 0.01;   // of the light, that a path must keep
+const float LAMP_FRACTION = 0.5; // a ray represents part of its lamp: this wide
 
 // A path through transparent objects: where it goes on, and what is left of its light. `ways`: whether it was reflected (1) or went
 // on (0) at each surface, after a leading 1; 0 where there is no such path. `medium`: the material that it is in, -1 for none.
@@ -187,9 +183,9 @@ Passage strongest_held() {
     return way;
 }
 
-// Of a ray: where its lamp's light starts, relative to the lamp's middle and to the distance, and the depth in the light's view at
-// which rays from all over the lamp through one place of the view meet.
-struct LampPart { vec3 aside; float depth; };
+// Of a ray: where its lamp's light starts, relative to the lamp's middle and to the distance; the depth in the light's view at which
+// rays from all over the lamp through one place of the view meet; and how far rays from that part of the lamp are apart, in blocks.
+struct LampPart { vec3 aside; float depth; float apart; };
 
 Passage first_passage(LightView view, vec2 s, LampPart part) {
     vec3 meeting = ray_point(view, s, part.depth);
@@ -233,10 +229,10 @@ Drift drift_through(LightView view, ivec2 texel, ivec2 axis, LampPart part, Pass
     for (int sign = 1; sign >= -1; sign -= 2) {
         Passage other = along_ways(view, texel_lateral(view, texel + sign * apart * axis), part, here.ways);
         if (other.ways != here.ways) continue;
-        float blocks = float(sign * block_edge) / float(apart) * RAYS_APART;
+        float blocks = float(sign * block_edge) / float(apart) * part.apart;
         return Drift(blocks * (other.from - here.from), blocks * (other.direction - here.direction));
     }
-    vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * RAYS_APART;
+    vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * part.apart;
     return Drift(across, vec3(0.0));
 }
 
@@ -283,7 +279,9 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     flux *= real_visibility(light, spot.point, spot.normal, bias_real);
     float depth = (view.view_from_world * vec4(spot.point, 1.0)).z, angle = 2.0 * PI * numbers.x;
     vec2 on_lamp = tan(radius) * sqrt(numbers.y) * vec2(cos(angle), sin(angle));
-    LampPart part = LampPart(transpose(mat3(view.view_from_world)) * vec3(on_lamp, 0.0), depth);
+    // Over the length of the objects a lamp spreads light by so many blocks; rays of a small one share a block.
+    float apart = clamp(radius * view.tile.z / float(block_edge), RAYS_APART, 1.0);
+    LampPart part = LampPart(transpose(mat3(view.view_from_world)) * vec3(on_lamp, 0.0), depth, apart);
     send_paths(view, texel, texel_side(view, depth), part, flux, radius);
 }
 #else
