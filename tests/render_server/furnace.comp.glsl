@@ -21,7 +21,7 @@ float specular_sample(vec2 u, vec3 v, vec3 f0, float roughness) {
     return specular_times_cosine(vec3(0.0, 0.0, 1.0), v, l, f0, roughness, 0.0).r / density;
 }
 
-const float LAMP = 0.3;      // rad, half-angle of the lamp
+const float LAMP = 0.15;     // rad, half-angle of the lamp
 const float REACH = 1.2;     // rad, around the mirrored direction: what the tails beyond hold is less than 1 %
 
 float shown_of_lamps(vec3 v, vec3 f0, float roughness) {

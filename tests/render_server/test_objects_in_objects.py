@@ -1,4 +1,4 @@
-"""Mirror-like objects show the others by rays, and lamps as they are: where optics says, and no brighter than they are."""
+"""Mirror-like objects show the others by rays, and lamps as they are: where optics says, and as bright."""
 
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,9 @@ def camera_ways() -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "h w 3"
     return pose[:3, 3], ways / np.linalg.norm(ways, axis=2, keepdims=True)
 
 
-def ball_mirror() -> tuple[Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
+def ball_mirror() -> tuple[
+    Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]
+]:
     """Pixels that show the ball, where they meet it, and the mirrored directions there."""
     eye, ways = camera_ways()
     along = (CENTRE - eye) @ np.moveaxis(ways, 2, 1)
@@ -89,7 +91,7 @@ def ball_mirror() -> tuple[Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w 3"]
 
 def meets_cube(place: np.ndarray, ways: np.ndarray) -> Bool[np.ndarray, "h w"]:
     """Which rays meet the cube (slabs)."""
-    low = BESIDE + (-EDGE / 2, -EDGE / 2, 0)
+    low = BESIDE + np.array([-EDGE / 2, -EDGE / 2, 0.0])
     a, b = (low - place) / ways, (low + EDGE - place) / ways
     enter, leave = np.minimum(a, b).max(axis=2), np.maximum(a, b).min(axis=2)
     return np.asarray((enter < leave) & (leave > 0))
@@ -142,7 +144,7 @@ def test_rough_mirror_blurs_and_keeps_the_light(gpu: GpuContext, stage: Stage) -
 
 
 def test_parallel_mirrors_make_no_light(gpu: GpuContext, stage: Stage) -> None:
-    """Two silver plates face each other in even light of radiance 1: neither shows more than that, and little less."""
+    """Two silver plates face each other in even light: neither shows more than that, and little less."""
     around = float(decode_lut(None)[GREY, 0])
     plates = [
         stage.virtual(shifted(trimesh.creation.box((0.3, 0.01, 0.2)), 0, y, 0.15), WHITE, SILVER)
@@ -162,7 +164,7 @@ def test_parallel_mirrors_make_no_light(gpu: GpuContext, stage: Stage) -> None:
 
 
 def test_smooth_ball_shows_the_lamp_itself(gpu: GpuContext, stage: Stage) -> None:
-    """A lamp of known radiance in a mirror ball: a disc where the mirrored ray meets the lamp, within a pixel, as bright."""
+    """A lamp in a mirror ball: as bright as it is, where mirrored rays meet it, within a pixel."""
     position, intensity, radius = np.array([0.3, -0.6, 0.8]), 0.8, 0.35
     lamp = sphere_light((position[0], position[1], position[2]), intensity, radius)
     _, fields = shown(gpu, stage.document([silver_ball(stage)], [lamp], floor()))

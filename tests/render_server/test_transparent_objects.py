@@ -37,6 +37,7 @@ from tests.render_server.scenes import (
     look_at,
     plain,
     shifted,
+    sphere_light,
 )
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -196,6 +197,24 @@ def test_clear_objects_neither_make_nor_lose_light(gpu: GpuContext, stage: Stage
         assert low > 0.95
         assert high < 1.03
         assert whole.mean() == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_pane_shows_the_lamp_behind_it(gpu: GpuContext, stage: Stage) -> None:
+    """As large as it is seen, and as bright but for what both faces reflect."""
+    eye, at, radius, intensity = np.array([0.0, -0.9, 0.3]), np.array([0.0, 1.1, 0.8]), 0.12, 0.05
+    pane = shifted(trimesh.creation.box((0.4, 0.002, 0.4)), 0, 0, 0.55)
+    lamp = sphere_light((at[0], at[1], at[2]), intensity, radius)
+    renderer = SceneRenderer(gpu, stage.document([glass(stage, pane)], [lamp], floor()))
+    renderer.render(frame(pose=look_at((eye[0], eye[1], eye[2]), (0.0, 0.0, 0.55))))
+    assert renderer.graph is not None
+    through = array_of(renderer.graph["transmitted light"]) - array_of(renderer.graph["virtual surface"])
+    renderer.release()
+    shown = through[..., 1]
+    passing = float((1 - fresnel(np.array([0.96]), 1 / IOR)[0]) ** 2)
+    radiance = intensity / (np.pi * radius**2)
+    assert np.quantile(shown[shown > 0.5 * radiance], 0.5) == pytest.approx(passing * radiance, rel=0.03)
+    disc_px = FOCAL * radius / np.linalg.norm(at - eye)
+    assert (shown / (passing * radiance)).sum() == pytest.approx(np.pi * disc_px**2, rel=0.1)
 
 
 def beams_of(gpu: GpuContext, document: SceneDocument) -> np.ndarray:

@@ -98,8 +98,9 @@ vec3 diffuse_under_lobe(vec3 f0, float roughness, float n_dot_l, float n_dot_v) 
 float lobe_in_disc(vec3 d, vec3 l, float alpha, float radius) {
     vec3 both = d + l, apart = d - l;
     float s2 = dot(apart, apart) / max(dot(both, both), 1e-6), r = tan(0.5 * radius);
-    float beyond = alpha * alpha + s2 - r * r;
-    return 0.5 * (1.0 - beyond * inversesqrt(beyond * beyond + 4.0 * r * r * alpha * alpha));
+    float beyond = alpha * alpha + s2 - r * r, both2 = 4.0 * r * r * alpha * alpha;
+    float root = sqrt(beyond * beyond + both2), less = 0.5 * both2 / (root * (root + abs(beyond)));   // without cancellation
+    return beyond > 0.0 ? less : 1.0 - less;
 }
 
 // The same relative to the irradiance across the beam of a disc of radiance 1.
