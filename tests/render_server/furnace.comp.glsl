@@ -29,9 +29,9 @@ float shown_of_lamps(vec3 v, vec3 f0, float roughness) {
     mat3 basis = basis_around(reflect(-v, n));
     float sum = 0.0, most = 1.0 - cos(REACH);
     for (int j = 0; j < SIDE * SIDE; ++j) {
-        float z = 1.0 - most * (float(j / SIDE) + 0.5) / float(SIDE), phi = 2.0 * PI * (float(j % SIDE) + 0.5) / float(SIDE);
+        float u = (float(j / SIDE) + 0.5) / float(SIDE), z = 1.0 - most * u * u, phi = 2.0 * PI * (float(j % SIDE) + 0.5) / float(SIDE);
         vec3 l = basis * vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
-        sum += specular_times_cosine(n, v, l, f0, roughness, LAMP).r;
+        sum += 2.0 * u * specular_times_cosine(n, v, l, f0, roughness, LAMP).r;
     }
     return sum * 2.0 * PI * most / float(SIDE * SIDE);
 }

@@ -119,8 +119,9 @@ vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, flo
     float n_dot_v = max(dot(n, v), 1e-3);
     vec3 h = l + v;
     h *= inversesqrt(max(dot(h, h), 1e-12));   // l = -v has no half-vector
-    vec3 reflected = fresnel_schlick(f0, max(dot(l, h), 0.0)) * further_reflections(f0, lobe_albedo(roughness, n_dot_v).x);
-    if (alpha < 0.5 * radius) return reflected * image_of_disc(reflect(-v, n), l, alpha * sqrt(n_dot_v), radius);
+    float whole = lobe_albedo(roughness, n_dot_v).x;
+    vec3 reflected = fresnel_schlick(f0, max(dot(l, h), 0.0)) * further_reflections(f0, whole);
+    if (alpha < 0.5 * radius) return reflected * (whole * image_of_disc(reflect(-v, n), l, alpha * sqrt(n_dot_v), radius));
     return reflected * (ggx_distribution(clamp(dot(n, h), 0.0, 1.0), wide)
         * smith_visibility(n_dot_l, n_dot_v, alpha) * n_dot_l);
 }

@@ -13,7 +13,8 @@ Ray lobe_ray(ivec2 pixel, Mirror m, vec4 numbers, float spread) {
     vec4 position = vec4(m.point, m.depth), normal = vec4(m.normal, mirror_entry(pixel));
     Change x = change_along(pixel, ivec2(1, 0), position, normal), y = change_along(pixel, ivec2(0, 1), position, normal);
     vec2 within = spread * (numbers.zw - 0.5);
-    vec3 from = m.point + within.x * x.position + within.y * y.position;
+    vec3 aside = within.x * x.position + within.y * y.position;
+    vec3 from = m.point + aside - m.normal * dot(aside, m.normal);   // on the tangent plane: not within a ball
     mat3 basis = basis_around(normalize(m.normal + within.x * x.normal + within.y * y.normal));
     vec3 v = normalize(camera_position - from);
     vec3 h = basis * visible_normal(numbers.xy, v * basis, m.alpha);
