@@ -49,10 +49,10 @@ def test_lights_and_gathered_light_reflect_alike(gpu: GpuContext, f0: float) -> 
 
 
 def test_lamps_wider_than_the_lobe_keep_its_light(gpu: GpuContext) -> None:
-    """A mirror shows lamps of half-angle 0.15 from all sides as one even light, within 3 %."""
+    """A mirror shows lamps of half-angle 0.15 from all sides as one even light, within 5 %."""
     shown = reflected(gpu, 0.0, 1.0)[ROUGHNESSES <= 0.2][..., 3]
     print(f"{shown.min():.3f} .. {shown.max():.3f}")
-    assert shown == pytest.approx(1.0, abs=0.03)
+    assert shown == pytest.approx(1.0, abs=0.05)
 
 
 def white_ball(gpu: GpuContext, stage: Stage, finish: dict[str, float]) -> float:
