@@ -98,7 +98,7 @@ def meets_cube(place: np.ndarray, ways: np.ndarray) -> Bool[np.ndarray, "h w"]:
 
 
 def centroid(mask: np.ndarray) -> Float64[np.ndarray, "2"]:
-    return np.argwhere(mask).mean(axis=0)
+    return np.asarray(np.argwhere(mask).mean(axis=0))
 
 
 def test_ball_shows_the_cube_where_optics_says(gpu: GpuContext, stage: Stage) -> None:
