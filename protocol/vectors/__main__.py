@@ -10,6 +10,8 @@ import numpy as np
 from deltalight.protocol.codecs import encode_array, encode_color, encode_depth
 from deltalight.protocol.envelope import encode
 from deltalight.protocol.messages import (
+    CameraEntry,
+    CamerasMessage,
     ColorMessage,
     CompositeMessage,
     ControlReply,
@@ -17,8 +19,6 @@ from deltalight.protocol.messages import (
     DepthMessage,
     FisheyeMessage,
     LampEntry,
-    CameraEntry,
-    CamerasMessage,
     LampsMessage,
     LightEntry,
     LightsMessage,

@@ -1,7 +1,7 @@
 """The cameras of a room: each node's streams are paired for themselves, their newest frames are rendered together.
 
-A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: because
-it is silent, sees another board than the first one, or its frames are of another time.
+A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: it is
+silent, sees another board than the first one, or its frames are of another time.
 """
 
 from collections import Counter, deque

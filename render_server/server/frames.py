@@ -143,8 +143,8 @@ class FrameAssembler:
     """Takes decoded messages in any order and returns the newest complete frame.
 
     `needs_depth`: the scene's real geometry comes from depth. Payloads are decoded for the selected frame only.
-    `counts`, which several may share, counts the others: `superseded` (overtaken by a newer frame), `unpaired_pose` (passed through when the
-    wait for a pose timed out), `unpaired_depth` (dropped: no depth near its time).
+    `counts`, which several may share, counts the others: `superseded` (overtaken by a newer frame), `unpaired_pose`
+    (passed through when the wait for a pose timed out), `unpaired_depth` (dropped: no depth near its time).
     """
 
     def __init__(

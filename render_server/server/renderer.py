@@ -116,9 +116,9 @@ class Renderer(Protocol):
         whole: bool = False,
         others: Sequence[ShownView] = (),
     ) -> Sequence[Pending]:
-        """Starts the pictures of a room's frames that are to be shown, at full size if `whole`, and those in `others`.
+        """Starts the pictures of a room's frames that are to be shown, at full size if `whole`, also in `others`.
 
-        Pictures finish in the order of their starts.
+        They finish in the order of their starts.
         """
 
     def sized(self, frame: ViewFrame) -> ViewFrame:

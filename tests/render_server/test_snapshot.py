@@ -208,12 +208,8 @@ def test_a_frame_without_pose_is_the_cameras_picture_linear_too(
     document = everyday(stage)
     view = replace(frame(noisy()), pose=None)
     renderer = SceneRenderer(gpu, document)
-    assert (
-        take_snapshot(
-            renderer, document, CameraFrame.numbered([view]), order(folder, {"name": "a"}, exr=True)
-        ).errors
-        == {}
-    )
+    room = CameraFrame.numbered([view])
+    assert take_snapshot(renderer, document, room, order(folder, {"name": "a"}, exr=True)).errors == {}
     renderer.release()
     np.testing.assert_array_equal(read_png(folder / "a.png"), view.color)
     linear = read_linear(folder / "composite.exr")
