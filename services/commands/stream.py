@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.live import Live
 
-from deltalight.services.commands.options import ConfigFile
+from deltalight.services.commands.options import ConfigFile, OneCamera
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def stream(
     composites: Annotated[
         str, typer.Option(help="Endpoint at which the render server publishes relit pictures.")
     ] = endpoint(COMPOSITE_PORT),
+    camera: OneCamera = None,
     config_file: ConfigFile = None,
 ) -> None:
     """Send the relit picture to a media server (H.264), for many viewers, until Ctrl-C."""
@@ -42,6 +43,7 @@ def stream(
     from deltalight.protocol.keys import KeySettings
     from deltalight.protocol.receiver import Receiver
     from deltalight.services.h264 import why_unavailable
+    from deltalight.services.relit_pictures import composite_topic
     from deltalight.services.settings import load_configuration
     from deltalight.services.stream_out import StreamOut, Target
 
@@ -56,7 +58,7 @@ def stream(
         console.print(sentence, markup=False, highlight=False)
 
     with (
-        closing(Receiver([composites], ["composite"], keys=keys)) as receiver,
+        closing(Receiver([composites], [composite_topic(camera)], keys=keys)) as receiver,
         StreamOut(target, tell) as out,
     ):
         tell(f"Waiting for the first picture of {composites}.")

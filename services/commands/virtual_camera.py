@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from deltalight.services.commands.options import ConfigFile, parse_size
+from deltalight.services.commands.options import ConfigFile, OneCamera, parse_size
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
 
 PERIOD_S = 1 / 25  # programs take a camera for frozen that gives less
@@ -18,6 +18,7 @@ def virtual_camera(
     composites: Annotated[
         str, typer.Option(help="Endpoint at which the render server publishes relit pictures.")
     ] = endpoint(COMPOSITE_PORT),
+    camera: OneCamera = None,
     size: Annotated[
         str | None,
         typer.Option(
@@ -29,7 +30,7 @@ def virtual_camera(
     """Show relit pictures as a webcam, for OBS and calls, until Ctrl-C."""
     from deltalight.protocol.keys import KeySettings
     from deltalight.protocol.receiver import Receiver
-    from deltalight.services.relit_pictures import newest_picture
+    from deltalight.services.relit_pictures import composite_topic, newest_picture
     from deltalight.services.settings import load_configuration
     from deltalight.services.virtual_camera import VirtualCamera
 
@@ -37,7 +38,7 @@ def virtual_camera(
     keys = load_configuration(config_file).section("keys", KeySettings).load([composites])
     with (
         VirtualCamera(device) as camera,
-        closing(Receiver([composites], ["composite"], keys=keys)) as receiver,
+        closing(Receiver([composites], [composite_topic(camera)], keys=keys)) as receiver,
     ):
         typer.echo(f"Waiting for the first picture of {composites}.", err=True)
         while (picture := newest_picture(receiver, PERIOD_S)) is None:

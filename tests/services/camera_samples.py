@@ -24,9 +24,10 @@ PERIOD_S = 0.02
 
 
 class StandInRoom:
-    """Publishes a picture of each camera that is live, every `PERIOD_S`, and which cameras there are."""
+    """Publishes a picture of each camera that is live, every `period_s`, and which cameras there are."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, period_s: float) -> None:
+        self._period_s = period_s
         self.statuses: dict[str, CameraStatus] = dict.fromkeys(SHADES, "live")
         self._publisher = Publisher(ports.endpoint(port))
         self._stop = threading.Event()
@@ -43,7 +44,7 @@ class StandInRoom:
         pictures = {
             name: encode_color(np.full((HEIGHT, WIDTH, 3), shade, np.uint8)) for name, shade in SHADES.items()
         }
-        while not self._stop.wait(PERIOD_S):
+        while not self._stop.wait(self._period_s):
             number += 1
             statuses = dict(self.statuses)
             entries = tuple(
@@ -83,9 +84,9 @@ def grey(jpeg: bytes) -> int:
 
 
 @contextmanager
-def camera_api(folder: Path, **settings: object) -> Iterator[CameraApi]:
+def camera_api(folder: Path, period_s: float = PERIOD_S, **settings: object) -> Iterator[CameraApi]:
     control_port, stream_port = ports.private_ports(2)
-    room, server = StandInRoom(stream_port), RenderServer(control_port)
+    room, server = StandInRoom(stream_port, period_s), RenderServer(control_port)
     endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
     try:
         with running_api(folder, **endpoints, **settings) as api:
