@@ -37,15 +37,15 @@ def virtual_camera(
     size_px = None if size is None else parse_size(size)
     keys = load_configuration(config_file).section("keys", KeySettings).load([composites])
     with (
-        VirtualCamera(device) as camera,
+        VirtualCamera(device) as webcam,
         closing(Receiver([composites], [composite_topic(camera)], keys=keys)) as receiver,
     ):
         typer.echo(f"Waiting for the first picture of {composites}.", err=True)
         while (picture := newest_picture(receiver, PERIOD_S)) is None:
             pass
-        camera.begin(size_px or (picture.shape[1], picture.shape[0]))
-        typer.echo(f"{device} shows the relit picture, {camera.size[0]}x{camera.size[1]}; Ctrl-C ends it.")
+        webcam.begin(size_px or (picture.shape[1], picture.shape[0]))
+        typer.echo(f"{device} shows the relit picture, {webcam.size[0]}x{webcam.size[1]}; Ctrl-C ends it.")
         while True:
-            camera.show(picture)
+            webcam.show(picture)
             newer = newest_picture(receiver, PERIOD_S)
             picture = picture if newer is None else newer
