@@ -123,6 +123,11 @@ class RoomCameras:
         return len(self._places) > 1
 
     @property
+    def statuses(self) -> dict[str, CameraStatus]:
+        """The status of each camera, in the order of their first frames."""
+        return {place.name: place.status for place in self._places.values()}
+
+    @property
     def entries(self) -> tuple[CameraEntry, ...]:
         """Returns all cameras, those left out included, in the order of their first frames."""
         return tuple(place.entry() for place in self._places.values())

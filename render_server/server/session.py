@@ -23,6 +23,7 @@ from deltalight.protocol.message_fields import as_counts, as_sentence
 from deltalight.protocol.messages import (
     MAX_OTHERS,
     CamerasMessage,
+    CameraStatus,
     CompositeMessage,
     ControlRequest,
     OtherPicture,
@@ -144,7 +145,7 @@ class RenderSession:
         self._cameras = RoomCameras(
             pairing, lambda fault: self._count_fault("bad_frames", fault), needs_depth=_needs_depth(scene)
         )
-        self._told: CamerasMessage | None = None
+        self._told: Mapping[str, CameraStatus] = {}  # of the cameras, by name
         self._name = name
         self._epoch = epoch
         self._renderer_name = renderer_name
@@ -210,16 +211,14 @@ class RenderSession:
         return None
 
     def cameras(self, *, if_changed: bool = False) -> CamerasMessage | None:
-        """Returns the room's cameras; None without any ever, or if nothing but their frames changed."""
-        entries = self._cameras.entries
-        told = () if self._told is None else self._told.cameras
-        changed = [(each.node, each.status) for each in entries] != [
-            (each.node, each.status) for each in told
-        ]
-        if not (entries or told) or (if_changed and not changed):
+        """Returns the room's cameras; None where there are and were none.
+
+        `if_changed`: also None if nothing but their frames is another than the last time.
+        """
+        told, self._told = self._told, self._cameras.statuses
+        if not (told or self._told) or (if_changed and told == self._told):
             return None
-        self._told = CamerasMessage(node=self._name, capture_ns=self._clock_ns(), cameras=entries)
-        return self._told
+        return CamerasMessage(node=self._name, capture_ns=self._clock_ns(), cameras=self._cameras.entries)
 
     def drops(self) -> dict[str, int]:
         """Returns the numbers of lost frames, by cause; topics come last, because nodes choose their number."""
