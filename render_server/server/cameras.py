@@ -81,7 +81,8 @@ class RoomCameras:
     """Takes the messages of all nodes, and returns the frames to be rendered together.
 
     `on_fault` is called with the fault of a frame whose data is broken, which is dropped. `counts` are those of
-    `FrameAssembler`, and `unplaced`: messages of nodes beyond `MAX_NODES` and frames of cameras beyond `MAX_CAMERAS`.
+    `FrameAssembler`, and `unplaced`: messages of nodes beyond `MAX_NODES` and frames of cameras beyond `MAX_CAMERAS`,
+    while none of those that have a place is silent.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class RoomCameras:
         """Stores a message until its partners arrive."""
         assembler = self._assemblers.get(message.node)
         if assembler is None:
-            if len(self._assemblers) >= MAX_NODES:
+            if len(self._assemblers) >= MAX_NODES and not self._make_room():
                 self.counts["unplaced"] += 1
                 return
             assembler = self._assemblers[message.node] = FrameAssembler(
@@ -142,7 +143,7 @@ class RoomCameras:
 
         A new frame waits for those of other cameras that are due, for `together_ms` at most.
         """
-        for name, assembler in self._assemblers.items():
+        for name, assembler in list(self._assemblers.items()):
             try:
                 frame = assembler.take(now_ns)
             except Exception as fault:  # a node's data is no reason to end, nor to hold up the others
@@ -162,11 +163,20 @@ class RoomCameras:
     def _note(self, name: str, frame: AssembledFrame, now_ns: int) -> None:
         place = self._places.get(name)
         if place is None:
-            if len(self._places) >= MAX_CAMERAS:
+            if len(self._places) >= MAX_CAMERAS and not self._make_room():
                 self.counts["unplaced"] += 1
                 return
             place = self._places[name] = _Place(name, frame, now_ns)
         place.note(frame, now_ns)
+
+    def _make_room(self) -> bool:
+        """Forgets the camera that has been silent longest; returns whether there was one."""
+        silent = [place for place in self._places.values() if place.status == "silent"]
+        if not silent:
+            return False
+        longest = min(silent, key=lambda place: place.newest.received_ns).name
+        del self._places[longest], self._assemblers[longest]
+        return True
 
     def _must_wait(self, members: Sequence[_Place], now_ns: int) -> bool:
         new_since_ns = min((place.ready_ns for place in members if place.is_new), default=None)

@@ -229,6 +229,24 @@ def test_nodes_beyond_the_limits_are_counted(room: Room) -> None:
     )  # frames, and two messages a node
 
 
+def test_a_new_camera_takes_the_place_of_the_one_that_is_silent_longest_where_all_are_taken(
+    room: Room,
+) -> None:
+    names = [f"node-{number}" for number in range(MAX_CAMERAS)]
+    room.begin(*names)
+    for number in range(30):
+        for name in names[2:] if number > 10 else names[1:]:
+            room.send(name, number)
+        room.pass_ms(20)
+        room.pictures()
+        room.pass_ms(80)
+    for number, name in enumerate(("new", *names[1:])):
+        room.send(name, 100 + number)
+    assert len(room.pictures()) == MAX_CAMERAS
+    assert list(room.statuses()) == [*names[1:], "new"]
+    assert "unplaced" not in room.session.drops()
+
+
 def test_changes_of_the_cameras_are_told_once(room: Room) -> None:
     session = room.session
     assert session.cameras() is None
