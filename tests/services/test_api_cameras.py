@@ -15,6 +15,7 @@ from deltalight.services.live_message import LiveHeader, unpack
 from tests.services.api_samples import sentence
 from tests.services.camera_samples import SHADES, CameraApi, camera_api, grey
 from tests.services.live_samples import event_socket, live_socket, next_event
+from tests.services.render_server_samples import NOWHERE
 from tests.services.test_api_live import follow
 from tests.services.test_api_scenes import wait_for
 
@@ -136,10 +137,17 @@ def test_a_viewer_of_a_camera_that_is_gone_sees_the_one_there_is(api: CameraApi)
         assert sentence(answer, 404) == "there is no camera 'right'; there is left."
 
 
-def test_pick_and_the_client_name_the_camera(api: CameraApi) -> None:
-    api.server.renderer.newest = {"left": SimpleNamespace(frame_id=5), "right": SimpleNamespace(frame_id=7)}  # type: ignore[dict-item]
+def test_pick_and_the_client_name_the_camera(api: CameraApi, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames_shown = {None: 5, "right": 7}
+
+    def picked(_x: float, _y: float, _ignore: str | None, camera: str | None) -> SimpleNamespace:
+        return SimpleNamespace(as_dict=lambda: {"frame_id": frames_shown[camera], **NOWHERE})
+
+    monkeypatch.setattr(api.server.renderer, "pick", picked)
     with Client(f"http://{api.address}") as client:
         assert client.cameras() == ["left", "right"]
+        assert client.pick(1, 2)["frame_id"] == 5
+        assert client.pick(1, 2, camera="right")["frame_id"] == 7
         frames = client.frames(camera="right")
         assert next(frames).header.node == "right"
         frames.close()  # type: ignore[attr-defined]
