@@ -158,9 +158,9 @@ def _library_name() -> str | None:
 
 def _packed_place(host: str, port: int) -> bytes:
     """Return a `sockaddr` of Linux."""
-    family, _, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-    packed = socket.inet_pton(family, str(place[0]).partition("%")[0])
+    family, _, _, _, (name, *_, scope) = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    packed = socket.inet_pton(family, str(name).partition("%")[0])
     head = struct.pack("=H", family) + struct.pack(">H", port)
     if family == socket.AF_INET:
         return head + packed + bytes(8)
-    return head + bytes(4) + packed + struct.pack("=I", int(place[3]))
+    return head + bytes(4) + packed + struct.pack("=I", scope)
