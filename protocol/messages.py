@@ -38,7 +38,8 @@ from deltalight.protocol.message_fields import (
 from deltalight.protocol.quality import Quality
 from deltalight.protocol.scene_fields import LightCount, PeakThreshold, ShownView, SmoothingTime, SplitKind
 
-SCHEMA_VERSION: Final = 8
+SCHEMA_VERSION: Final = 9
+OLDEST_SCHEMA_VERSION: Final = 8  # that is read: hosts can be upgraded one after another (SPEC.md, section 9)
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
 MAX_UNPACKED_BYTES = 256 * 1024 * 1024  # of all parts together; 24 compressed pictures could take 1.6 GB
@@ -93,7 +94,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[8] = SCHEMA_VERSION
+    schema_version: Annotated[int, Field(ge=OLDEST_SCHEMA_VERSION, le=SCHEMA_VERSION)] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count

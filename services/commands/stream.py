@@ -29,7 +29,7 @@ def stream(
         typer.Option(
             envvar="DELTALIGHT_STREAM_TO",
             show_envvar=True,
-            help="Address of the media server, such as rtsp://HOST:8554/NAME or rtmp://HOST/live/NAME.",
+            help="Address of the media server: rtsp://HOST:8554/NAME, rtmp://HOST/live/NAME, or srt://HOST:8890?streamid=ID.",
         ),
     ],
     composites: Annotated[
@@ -45,10 +45,11 @@ def stream(
     from deltalight.services.h264 import why_unavailable
     from deltalight.services.relit_pictures import composite_topic
     from deltalight.services.settings import load_configuration
+    from deltalight.services.srt import why_unavailable as why_no_srt
     from deltalight.services.stream_out import StreamOut, Target
 
     target = Target.parse(to)
-    reason = why_unavailable()
+    reason = why_unavailable() or (why_no_srt() if target.container == "mpegts" else None)
     if reason is not None:
         raise DeltalightError(reason)
     keys = load_configuration(config_file).section("keys", KeySettings).load([composites])
