@@ -38,7 +38,7 @@ class LocalPlacer:
         self._spare_due_s = 0.0
         self._forward = forward
         self._placed: dict[str, RenderProcess] = {}  # by slot
-        self._used_ports: set[int] = set()
+        self._used_ports = ports.used_ports()
 
     def slots(self) -> list[Slot]:
         """Return all slots."""
@@ -95,12 +95,10 @@ class LocalPlacer:
         return None if placed is None else placed.placement.room
 
     def _fresh_ports(self) -> list[int]:
-        """Choose ports that no placement has had, so that who still talks to a lost one reaches nobody else."""
-        while True:
-            found = ports.private_ports(2)
-            if self._used_ports.isdisjoint(found):
-                self._used_ports.update(found)
-                return found
+        """Choose ports that no late placement had, so that who still talks to a lost one reaches nobody else."""
+        found = ports.private_ports(2, avoid=self._used_ports)
+        self._used_ports.extend(found)
+        return found
 
     def _look_at(self, slot: str) -> list[PlacementEvent]:
         placed = self._placed[slot]

@@ -4,12 +4,14 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
 import psutil
 import pytest
 
+from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.host import HostCommands
 from deltalight.services.rooms.local_placer import Command, LocalPlacer
@@ -160,6 +162,20 @@ def test_closing_leaves_no_process(placer: AnyPlacer) -> None:
     processes = [psutil.Process(each) for each in placer.process_ids().values()]
     placer.close()
     assert not any(process.is_running() for process in processes)
+
+
+def test_ports_never_run_out_and_late_ones_are_not_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "PRIVATE_PORTS", range(20_000, 20_010))
+    monkeypatch.setattr(ports, "REMEMBERED_PORTS", 4)
+    late: set[str] = set()
+    with closing(LocalPlacer((None,), lambda *_: ChildSpec("room", ("-c", "")))) as placer:
+        for epoch in range(1, 8):  # ten ports would last for five
+            placement = placer.place(order("hall", epoch))
+            used = {placement.publish, placement.control}
+            assert len(used) == 2
+            assert not used & late
+            late = used
+            until(placer, lambda event: event.kind == "lost")
 
 
 def test_a_room_takes_a_host_with_its_labels_that_is_not_drained() -> None:
