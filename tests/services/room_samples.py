@@ -76,6 +76,11 @@ class StandInPlacer:
         found = (each for each in self.placed.values() if each.room == room and slot in (None, each.slot))
         return next(found)
 
+    def report_all(self) -> None:
+        """Have all render servers report; other threads may place and release meanwhile."""
+        epochs = [placement.epoch for placement in list(self.placed.values())]
+        self.events += [PlacementEvent(epoch, "reported", shows=True) for epoch in epochs]
+
     def _end(self, epoch: int) -> None:
         if epoch in self.servers:
             self.servers.pop(epoch).close()
