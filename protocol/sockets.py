@@ -16,6 +16,7 @@ RECONNECT_MAX_MS = 1000
 # The kernel finds dead peers, after 30 s. Not ZeroMQ's heartbeats: libzmq 4.3.5 aborts the process (`!_io_error`) at
 # the next of them where a peer hung up while the queue of what it had sent was full.
 KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 4
+HANDSHAKE_MS = 10_000  # who says nothing for so long takes nobody's place
 
 
 def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
@@ -50,6 +51,7 @@ def open_socket(
     socket.maxmsgsize = max_bytes
     socket.reconnect_ivl = RECONNECT_MS
     socket.reconnect_ivl_max = RECONNECT_MAX_MS
+    socket.handshake_ivl = HANDSHAKE_MS
     socket.tcp_keepalive = 1
     socket.tcp_keepalive_idle = KEEPALIVE_IDLE_S
     socket.tcp_keepalive_intvl = KEEPALIVE_INTERVAL_S

@@ -240,6 +240,8 @@ class RoomKeeper:
         except NoSlotError:
             self._epoch -= 1  # nothing was started with it; who waits asks ten times a second
             raise
+        except OSError as fault:  # open files, processes, memory
+            raise DeltalightError(f"this host has no more of what it needs ({fault.strerror}).") from fault
 
     def _release(self, room: _Room) -> None:
         for placement in (room.placement, room.successor):

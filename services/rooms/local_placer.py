@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from deltalight.protocol.keys import Keys
 from deltalight.services import ports
@@ -118,4 +119,6 @@ class LocalPlacer:
             self._spare_due_s = time.monotonic() + SPARE_AFTER_S
         is_due = self._placed and time.monotonic() >= self._spare_due_s
         if self._spare_spec is not None and self._spare is None and is_due:
-            self._spare = open_spare(self._spare_spec.arguments, self._spare_spec.warm)
+            self._spare_due_s = time.monotonic() + SPARE_AFTER_S
+            with suppress(OSError):  # no more open files or processes: rooms do without one
+                self._spare = open_spare(self._spare_spec.arguments, self._spare_spec.warm)

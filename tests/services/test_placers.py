@@ -1,5 +1,6 @@
 """What every placer promises, kept with real processes, by Ray's too: slots, losses, endpoints, no orphans."""
 
+import errno
 import os
 import signal
 import time
@@ -14,6 +15,7 @@ import pytest
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.host import HostCommands
+from deltalight.services.rooms import local_placer
 from deltalight.services.rooms.local_placer import Command, LocalPlacer
 from deltalight.services.rooms.placer import (
     NoSlotError,
@@ -162,6 +164,18 @@ def test_closing_leaves_no_process(placer: AnyPlacer) -> None:
     processes = [psutil.Process(each) for each in placer.process_ids().values()]
     placer.close()
     assert not any(process.is_running() for process in processes)
+
+
+def test_a_spare_that_cannot_be_started_is_missed_by_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing(*_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(local_placer, "SPARE_AFTER_S", 0.0)
+    monkeypatch.setattr(local_placer, "open_spare", refusing)
+    with closing(LocalPlacer((None,), reporting, spare=ChildSpec("spare", ("-c", "")))) as placer:
+        placer.place(order("hall", 1))
+        assert until(placer, lambda event: event.kind == "reported").shows
+        assert placer.spare_id is None
 
 
 def test_ports_never_run_out_and_late_ones_are_not_used_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """Which room runs where: slots, losses, moves and drains, with a placer that places nothing."""
 
+import errno
 import time
 from pathlib import Path
 
@@ -106,20 +107,27 @@ def test_the_next_keeper_is_followed_and_the_one_before_refused(tmp_path: Path) 
     assert follower.refused == 1
 
 
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        (DeltalightError("no key; make one."), "tried again: no key"),
+        (OSError(errno.EMFILE, "Too many open files"), "no more of what it needs (Too many open files)"),
+    ],
+)
 def test_a_room_that_cannot_be_started_is_tried_again_and_ends_no_other(
-    keeper: RoomKeeper, placer: StandInPlacer, monkeypatch: pytest.MonkeyPatch
+    keeper: RoomKeeper, placer: StandInPlacer, monkeypatch: pytest.MonkeyPatch, fault: Exception, why: str
 ) -> None:
     place = placer.place
 
     def refusing(order: RoomOrder, slot: str | None = None) -> Placement:
         if order.room == "hall":
-            raise DeltalightError("no key; make one.")
+            raise fault
         return place(order, slot)
 
     monkeypatch.setattr(placer, "place", refusing)
     running(keeper, placer, "door", "attic")
     assert states(keeper) == ["waiting", "running", "running"]
-    assert "tried again: no key" in rooms(keeper)["hall"].why
+    assert why in rooms(keeper)["hall"].why
     monkeypatch.undo()
     keeper.drain("attic")
     running(keeper, placer, "hall")
