@@ -4,6 +4,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import structlog
@@ -182,7 +183,8 @@ class ReplyServer:
         except DeltalightError as error:
             return self._reply(request.id, error=str(error))
         except Exception as error:  # the thread must survive a fault of the handler
-            _log.exception("control handler failed", op=request.op)
+            with suppress(OSError):  # of which no open file may be left for the log
+                _log.exception("control handler failed", op=request.op)
             return self._reply(
                 request.id, error=f"{request.op} failed with {error!r:.300}: see the log of {self._node}"
             )
