@@ -30,7 +30,12 @@ class RenderServer:
     def __init__(self, port: int) -> None:
         self.renderer = InvertingRenderer()
         self.session = RenderSession(self.renderer, SceneDocument(name="as started", revision=7))
-        self._replies = ReplyServer(ports.endpoint(port), self._execute)
+        self._port = port
+        self.open()
+
+    def open(self) -> None:
+        """Answer, again too."""
+        self._replies = ReplyServer(ports.endpoint(self._port), self._execute)
 
     def _execute(self, request: object) -> dict[str, object]:
         if getattr(request, "op", "") == "clock":

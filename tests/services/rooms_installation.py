@@ -180,8 +180,8 @@ def started(folder: Path, *options: str) -> Iterator[Installation]:
         yield found
         children = found.process.children(recursive=True)
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
-        assert psutil.wait_procs(children, timeout=5)[1] == []
+        assert process.wait(PATIENCE_S) == 130
+        assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
     finally:
         process.kill()
         process.wait()
