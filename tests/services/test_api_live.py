@@ -79,7 +79,7 @@ def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -
     assert (header["camera"]["width"], header["camera"]["height"]) == (WIDTH, HEIGHT)
     assert header["world_from_camera"][3] == [0, 0, 0, 1]
     assert [light["type"] for light in header["lights"]] == ["sphere", "environment"]
-    description = httpx.get(f"http://{live.address}/openapi.json").json()
+    description = httpx.get(f"http://{live.address}/openapi.json", timeout=PATIENCE_S).json()
     assert set(header) == set(description["components"]["schemas"]["LiveHeader"]["properties"])
     assert {"number", "frame_id", "capture_ns", "frames_per_s", "renderer"} <= set(header)
 
@@ -244,7 +244,7 @@ def test_who_changes_view_or_codec_all_the_time_is_closed(live: LiveApi, orders:
 
 
 def test_mjpeg_streams_pictures_and_live_jpg_is_the_newest(live: LiveApi) -> None:
-    with httpx.stream("GET", f"http://{live.address}/api/v1/live.mjpg") as response:
+    with httpx.stream("GET", f"http://{live.address}/api/v1/live.mjpg", timeout=PATIENCE_S) as response:
         assert response.headers["content-type"].startswith("multipart/x-mixed-replace")
         received = b""
         for chunk in response.iter_bytes():
@@ -425,7 +425,7 @@ def test_ctrl_c_ends_the_process_in_spite_of_open_streams_and_it_starts_again(tm
                 live_socket(address) as watched,
                 live_socket(address),  # stalled
                 event_socket(address),
-                httpx.stream("GET", f"http://{address}/api/v1/live.mjpg"),
+                httpx.stream("GET", f"http://{address}/api/v1/live.mjpg", timeout=PATIENCE_S),
             ):
                 read_frame(watched)
                 process.send_signal(number)

@@ -36,7 +36,7 @@ while True:
     time.sleep(0.05)
 """
 REFUSING = "import sys; print('deltalight: The scene is wrong; mend it.', file=sys.stderr); sys.exit(2)"
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 KINDS = (

@@ -21,6 +21,7 @@ import pytest
 from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.ray_cluster import LOOPBACK_ONLY, NO_STATISTICS, OBJECT_STORE_BYTES, RayCluster
 from tests.services.rooms_installation import (
+    PATIENCE_S,
     Installation,
     is_gone,
     settled,
@@ -263,7 +264,7 @@ def test_a_cluster_of_its_own_is_on_loopback_and_ends_with_its_process(*, is_kil
         else:
             told.write("end\n")
             told.flush()
-        process.wait(20)
+        process.wait(PATIENCE_S)
     wait_for(lambda: all(map(is_gone, daemons)))
 
 
@@ -294,7 +295,7 @@ def test_an_actor_without_keeper_ends_its_render_server(tmp_path: Path) -> None:
     )
     assert process.stdout is not None
     server = psutil.Process(int(process.stdout.readline()))
-    assert process.wait(20) == 1
+    assert process.wait(PATIENCE_S) == 1
     wait_for(lambda: is_gone(server))
     assert list(tmp_path.iterdir()) == []
     process.stdout.close()
