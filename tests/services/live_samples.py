@@ -160,11 +160,12 @@ def wait_for_frames(address: str, patience_s: float = PATIENCE_S) -> None:
 
 
 def live_socket(address: str, query: str = "", **options: object) -> ClientConnection:
-    return connect(f"ws://{address}/api/v1/live{query}", compression=None, **options)  # type: ignore[arg-type]
+    options = {"compression": None, "open_timeout": PATIENCE_S, **options}
+    return connect(f"ws://{address}/api/v1/live{query}", **options)  # type: ignore[arg-type]
 
 
 def event_socket(address: str, query: str = "", **options: object) -> ClientConnection:
-    return connect(f"ws://{address}/api/v1/events{query}", **options)  # type: ignore[arg-type]
+    return connect(f"ws://{address}/api/v1/events{query}", **{"open_timeout": PATIENCE_S, **options})  # type: ignore[arg-type]
 
 
 def read_frame(socket: ClientConnection, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
