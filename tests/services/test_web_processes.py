@@ -293,10 +293,12 @@ def test_while_the_database_is_away_reads_go_on_and_nothing_is_lost(
         assert changed.json()["revision"] == 2
         wait_for(lambda: second.client.get(f"/scenes/{scene_id}").json()["revision"] == 2)
         ticket = first.client.post("/tickets").json()["ticket"]
+        (mine,) = first.store.tokens.all()
         with event_socket(address(first), f"?ticket={ticket}") as socket:
             for is_power_cut in (False, True):
                 unsteady.stop(at_once=is_power_cut)
                 for api in (first, second):
+                    assert api.store.tokens.knows(mine.id), "streams go on"
                     for path in paths:
                         assert api.client.get(path).status_code == 200, path
                     assert api.client.get(f"/scenes/{scene_id}").json()["document"]["name"] == "two"
