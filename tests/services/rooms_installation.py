@@ -23,7 +23,7 @@ from deltalight.services.rooms.directory import DirectoryClient
 from deltalight.services.rooms.status import RoomStatus
 from tests.services.conftest import ROOT
 
-PATIENCE_S = 90.0
+PATIENCE_S = 150.0
 ROOMS = """
 slots: 2
 nodes: {desk: {source: take.mcap}}
