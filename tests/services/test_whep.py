@@ -330,7 +330,6 @@ def test_chromium_shows_what_the_jpeg_shows(live: Running) -> None:
         page.goto(f"http://{live.address}/openapi.json")
         shown = page.evaluate(WATCH)
         seen = np.array(shown["pixels"], np.uint8).reshape(shown["height"], shown["width"], 4)[..., :3]
-        agreement_db, frame_id = live.closest(seen)
+        agreement_db, _ = live.closest(seen, after=before)
     assert agreement_db > LEAST_PSNR_DB
     assert psnr_db(seen, np.roll(seen, 2, axis=1)) < agreement_db, "a shift by two pixels would show"
-    assert frame_id > before
