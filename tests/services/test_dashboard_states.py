@@ -15,7 +15,6 @@ from deltalight import __version__
 from deltalight.services.demo import POSTER
 from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
-    PATIENCE_S,
     SCREENSHOTS,
     SIZE,
     STAND_IN_PERIOD_S,
@@ -52,7 +51,6 @@ def stack(live: LiveApi) -> Stack:
 
 
 def seat(stack: Stack, browser: Browser, **options: object) -> Iterator[Desk]:
-    expect.set_options(timeout=PATIENCE_S * 1000)
     with browser.new_context(color_scheme="dark", **options) as context:  # type: ignore[arg-type]
         desk = Desk(stack, context.new_page())
         yield desk

@@ -173,13 +173,13 @@ def demo(page_port: int, *options: str) -> Iterator[str]:
         assert len(children) == 3
         yield f"{ports.LOOPBACK}:{page_port}"
         demo.send_signal(signal.SIGINT)
-        output, error = demo.communicate(timeout=20)
+        output, error = demo.communicate(timeout=PATIENCE_S)
     finally:
         demo.kill()  # its children end with it
     assert demo.returncode == 130
     assert "Traceback" not in error
     assert f"http://127.0.0.1:{page_port}" in output
-    assert psutil.wait_procs(children, timeout=1)[1] == []
+    assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
     assert ports.is_free(page_port)
 
 
@@ -188,8 +188,9 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     """The first as people start it; in the second, a change by REST is in the next picture that is begun."""
     (page_port,) = ports.private_ports(1)
     with demo(page_port) as address:
-        assert httpx.get(f"http://{address}/api/v1/settings").json()["has_poster"]
-        assert httpx.get(f"http://{address}/api/v1/poster.jpg").content == POSTER.read_bytes()
+        assert httpx.get(f"http://{address}/api/v1/settings", timeout=PATIENCE_S).json()["has_poster"]
+        poster = httpx.get(f"http://{address}/api/v1/poster.jpg", timeout=PATIENCE_S)
+        assert poster.content == POSTER.read_bytes()
     with demo(page_port, "--method", "paper") as address:
         check_changes(address)
 

@@ -151,7 +151,7 @@ def test_a_spare_ends_with_its_supervisor() -> None:
     )
     assert waiting.stdin is not None
     waiting.stdin.close()
-    assert waiting.wait(timeout=20) == 0
+    assert waiting.wait(timeout=60) == 0
 
 
 def test_all_that_spares_prepare_is_there() -> None:
