@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import moderngl
 
@@ -21,7 +22,6 @@ from deltalight.render_server.methods.lighting import (
     bounced_later,
     shading_stages,
     surfel_scene,
-    volume_placement,
 )
 from deltalight.render_server.methods.method import (
     RelightingMethod,
@@ -30,10 +30,12 @@ from deltalight.render_server.methods.method import (
     march_defines,
     resolve_voxel_cones,
 )
+from deltalight.render_server.methods.volume_placement import volume_placement, volume_placements
 from deltalight.render_server.methods.voxel_volumes import (
     FAR_SIZE,
     DeltaVoxels,
     VoxelSet,
+    affordable_size,
     delta_voxel_stages,
     joint_voxels,
     placed_volume,
@@ -48,13 +50,9 @@ from deltalight.render_server.passes.split_injection import (
     ResolveInjection,
     SplitInjection,
 )
+from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.passes.voxels import (
-    DIRECTIONS,
-    VolumePlacement,
-    VoxelMipmap,
-    memory_statement,
-)
+from deltalight.render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
 class InjectedVoxels:
@@ -200,6 +198,13 @@ class ExactCones:
         self._tracing.release()
 
 
+def _size_of(gpu: GpuContext, settings: DvctMethod, resolved: ResolvedSettings, count: int) -> int:
+    """Voxels an edge of each of so many volumes; 0: no room. Shadow cones know one volume."""
+    if count > 1 and settings.resolved_shadow == "cone":
+        return 0
+    return affordable_size(gpu, resolved.volume_size, count, settings.memory_budget_mb)
+
+
 def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     """Marches both solutions at once through one-sided directional voxels."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
@@ -209,7 +214,9 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     g.section("voxels")
     voxels = g.shared("voxels", lambda: DeltaVoxels(g.gpu, settings, resolved.volume_size))
     with bounced_later(g, s, lit, settings.tier):
-        placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
+        placement = volume_placements(
+            g, s, partial(_size_of, g.gpu, settings, resolved), settings.volume_edge_m, settings.tier
+        )
         mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
     shading = Shading(
         g.gpu,
