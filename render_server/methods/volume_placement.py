@@ -122,5 +122,5 @@ def _volume_edges(groups: Sequence[ObjectExtent], gaps: Sequence[Sequence[float]
             joint = ObjectExtent.around([groups[one], groups[other]]).volume_edge
             for index in (one, other):
                 own = groups[index].volume_edge
-                edges[index] = max(edges[index], own + share * (joint - own))
+                edges[index] = max(edges[index], float(own + share * (joint - own)))
     return edges

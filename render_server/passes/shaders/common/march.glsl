@@ -216,33 +216,34 @@ float enter_next(vec3 from, vec3 d, float t, uint crossed) {
     return nearest;
 }
 
-// Through the other volumes that the ray (world, m) meets after a distance t, and the coarse scene before each. Returns the
-// distance at which the last of them ends.
-float march_others(sampler3D mipmap, vec3 from, vec3 d, float t, float ratio, inout Crossed sum, inout bool differs) {
+// One march from q (voxels) along d, continued through other volumes and, between and behind them, the coarse scene.
+Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
+    Crossed sum = Crossed(vec3(0.0), 0.0);
+    differs = false;
     int home = volume;
-    uint crossed = 1u << home;
-    for (int i = 1; i < volume_count && sum.coverage < WALL; ++i) {
-        float enter = enter_next(from, d, t, crossed);
-        if (enter == ENDLESS) break;
+    vec3 from = volume_origin + q * voxel_edge;
+    float t = 0.0;   // m
+    uint crossed = 0u;
+    while (sum.coverage < WALL) {
+        float start = crossed == 0u ? 0.0 : t / voxel_edge + 1.0;   // whose first sample lies inside
         crossed |= 1u << volume;
-        if (far_size > 0) march_far((from + t * d - far_origin) / far_edge, d, t / far_edge, (enter - t) / far_edge, ratio, sum);
-        float start = enter / voxel_edge + 1.0;   // whose first sample lies inside
-        float length = march_near(mipmap, volume_coordinate(from) + start * d, d, start, ratio, sum, differs);
-        t = (start + length) * voxel_edge;
+        t = voxel_edge * (start + march_near(mipmap, volume_coordinate(from) + start * d, d, start, ratio, sum, differs));
+        float skip = t > 0.0 ? 0.0 : 1.5;   // as below
+        float next = t > 0.0 ? enter_next(from, d, t, crossed) : ENDLESS;
+        vec3 leave = (from + t * d - far_origin) / far_edge + skip * d;
+        if (far_size > 0 && sum.coverage < WALL) march_far(leave, d, t / far_edge + skip, (next - t) / far_edge, ratio, sum);
+        if (next == ENDLESS) break;
+        t = next;
     }
     volume = home;
-    return t;
+    return sum;
 }
-#endif
-
-// One march from q (voxels) along d, continued through other volumes and the coarse scene.
+#else
+// One march from q (voxels) along d, continued into the coarse scene.
 Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
     Crossed sum = Crossed(vec3(0.0), 0.0);
     differs = false;
     float t = march_near(mipmap, q, d, 0.0, ratio, sum, differs);
-#ifdef SEVERAL_VOLUMES
-    if (t > 0.0) t = march_others(mipmap, volume_origin + q * voxel_edge, d, t * voxel_edge, ratio, sum, differs) / voxel_edge;
-#endif
     if (far_size > 0 && sum.coverage < WALL) {
         vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
         // A surface that starts the march outside of the volume must not hit its own coarse voxels.
@@ -251,6 +252,7 @@ Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differ
     }
     return sum;
 }
+#endif
 
 // Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is that of rho.
 March march(vec3 q, vec3 d, float ratio, bool only_rho) {
