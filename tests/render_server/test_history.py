@@ -92,7 +92,7 @@ def fresh(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> Composit
 
 def placement_of(renderer: SceneRenderer) -> VolumePlacement:
     assert renderer.graph is not None
-    placement = renderer.graph["volume placement"]
+    (placement,) = renderer.graph["volume placement"]
     assert isinstance(placement, VolumePlacement)
     return placement
 
