@@ -3,6 +3,7 @@
 mu holds the real scene, rho real and virtual surfaces.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -56,19 +57,31 @@ FAR_EDGE_M = 20.0  # its greatest edge: what lies farther lights little through 
 FAR_MARGIN = 1.05
 
 
-def affordable_size(gpu: GpuContext, size: int, count: int, budget_mb: int) -> int:
-    """Returns how many voxels an edge each of `count` volume sets may have, `size` at most, of six directions.
+def sets_memory_mb(size: int, count: int) -> int:
+    """Returns the memory of `count` volume sets of six directions and of the coarse one beyond, MB."""
+    taken = 2 * count * volume_memory_bytes(size, DIRECTIONS) + volume_memory_bytes(FAR_SIZE, DIRECTIONS)
+    return math.ceil(taken / MEGABYTE)
 
-    What the GPU can hold limits it, and the budget, beside the coarse volume beyond; 0 where no size fits.
+
+def affordable_size(size: int, count: int, budget_mb: int, gpu: GpuContext | None = None) -> int:
+    """Returns how many voxels an edge each of `count` volumes may have, `size` at most; 0 where no size fits.
+
+    The budget limits several, and what the GPU can hold, if it is given; one that does not fit is refused elsewhere.
     """
-    info, far_bytes = gpu.ctx.info, volume_memory_bytes(FAR_SIZE, DIRECTIONS)
-    for fitting in range(size, 0, -VOLUME_STEP):
-        taken = count * 2 * volume_memory_bytes(fitting, DIRECTIONS) + far_bytes
-        holds = count * fitting <= info["GL_MAX_3D_TEXTURE_SIZE"]
-        holds = holds and count * fitting**3 * 4 <= info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]
-        if holds and taken <= budget_mb * MEGABYTE:
-            return fitting
-    return 0
+    while count > 1 and size > 0 and not _fits(size, count, budget_mb, gpu):
+        size -= VOLUME_STEP
+    return size
+
+
+def _fits(size: int, count: int, budget_mb: int, gpu: GpuContext | None) -> bool:
+    if sets_memory_mb(size, count) > budget_mb:
+        return False
+    if gpu is None:
+        return True
+    longest, largest = (
+        gpu.ctx.info[f"GL_MAX_{name}"] for name in ("3D_TEXTURE_SIZE", "SHADER_STORAGE_BLOCK_SIZE")
+    )
+    return bool(count * size <= longest and count * size**3 * 4 <= largest)
 
 
 class VoxelSet:
