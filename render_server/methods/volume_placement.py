@@ -74,7 +74,7 @@ def place_volumes(
     It is one around all of them where `edge_m` is given, and where several would have larger voxels.
     """
     whole = extent.volume_edge if edge_m is None else edge_m
-    single = [extent], (place_volume(*extent.upright, size_of(1), whole),)
+    single = [extent], (_placed(extent, size_of(1), whole),)
     parts = [each for each in extent.parts if each.volume_edge > 0]
     if edge_m is not None or len(parts) < 2 or not size_of(2):
         return single
@@ -86,7 +86,12 @@ def place_volumes(
     if len(groups) == 1 or not size or max(edges) * size_of(1) > whole * size:
         return single
     placed = zip(groups, edges, strict=True)
-    return groups, tuple(place_volume(*group.upright, size, edge) for group, edge in placed)
+    return groups, tuple(_placed(group, size, edge) for group, edge in placed)
+
+
+def _placed(group: ObjectExtent, size: int, edge: float) -> VolumePlacement:
+    low, high = group.upright
+    return place_volume(low, high, size, edge)
 
 
 def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
