@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -10,7 +11,14 @@ import zmq
 
 from deltalight.protocol.envelope import EnvelopeError, decode, encode
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest, StatsMessage
+from deltalight.protocol.messages import (
+    MAX_HEADER_BYTES,
+    OLDEST_SCHEMA_VERSION,
+    SCHEMA_VERSION,
+    ControlReply,
+    ControlRequest,
+    StatsMessage,
+)
 from deltalight.protocol.payloads import INLINE_CHARACTERS, decode_control, encode_control
 from deltalight.protocol.request import ReplyMemory, ReplyServer, RequestClient
 
@@ -272,6 +280,67 @@ def test_malformed_requests_get_a_sentence(opened: Callable[[Any], Any], pieces:
     assert isinstance(reply, ControlReply)
     assert (reply.id, reply.ok) == ("unreadable", False)
     assert opened(RequestClient(server.endpoint)).request(request(), 5).ok
+
+
+@contextmanager
+def answering(answers: Callable[[list[bytes]], list[bytes]]) -> Iterator[str]:
+    """Yield the endpoint of a socket that answers as a server of another version would."""
+    context = zmq.Context()
+    socket = context.socket(zmq.REP)
+    port = socket.bind_to_random_port("tcp://127.0.0.1")
+
+    def serve() -> None:
+        with suppress(zmq.ContextTerminated):
+            while True:
+                socket.send_multipart(answers(socket.recv_multipart()))
+        socket.close(0)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f"tcp://127.0.0.1:{port}"
+    finally:
+        context.term()
+        thread.join(5)
+
+
+def test_a_server_of_the_version_before_is_asked_in_it(opened: Callable[[Any], Any]) -> None:
+    asked = []
+
+    def answer(pieces: list[bytes]) -> list[bytes]:
+        read, _ = decode(pieces)
+        assert isinstance(read, ControlRequest)
+        asked.append(read.schema_version)
+        older = {"node": "s", "schema_version": OLDEST_SCHEMA_VERSION}
+        if read.schema_version != OLDEST_SCHEMA_VERSION:
+            refused = {"id": "unreadable", "ok": False, "error": "another version"}
+            return encode(ControlReply.model_validate(older | refused))
+        return encode(ControlReply.model_validate(older | {"id": read.id, "ok": True}))
+
+    with answering(answer) as endpoint:
+        client = opened(RequestClient(endpoint))
+        assert client.request(request(), 5).ok
+        assert client.request(request(), 5).ok
+        client.close()
+    assert asked == [SCHEMA_VERSION, OLDEST_SCHEMA_VERSION, OLDEST_SCHEMA_VERSION]
+
+
+def test_a_client_of_the_version_before_is_answered_in_it(opened: Callable[[Any], Any]) -> None:
+    def handle(control: ControlRequest) -> dict[str, object]:
+        if control.op == "refuse":
+            raise DeltalightError("not now")
+        return {"long": "x" * 100_000} if control.op == "long" else {}
+
+    server = opened(ReplyServer(ANY, handle))
+    context = zmq.Context()
+    socket = context.socket(zmq.REQ)
+    socket.connect(server.endpoint)
+    for op in ("ping", "refuse", "long"):
+        socket.send_multipart(encode(request(id=op, op=op, schema_version=OLDEST_SCHEMA_VERSION)))
+        assert socket.poll(5000)
+        reply, _ = decode(socket.recv_multipart())
+        assert reply.schema_version == OLDEST_SCHEMA_VERSION
+    context.destroy(0)
 
 
 @pytest.mark.parametrize(

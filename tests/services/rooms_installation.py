@@ -155,6 +155,14 @@ def started(folder: Path, *options: str) -> Iterator[Installation]:
     write_take(folder / "take.mcap", (96, 72), 5.0, frames=(0,) * 10)
     (folder / "scene.json").write_text(soaked_scene(choose_profile("small")).model_dump_json())
     (folder / "rooms.yaml").write_text(ROOMS)
+    with installed(folder, *options) as found:
+        wait_for(lambda: found.is_shown("hall") and found.is_shown("door"))
+        yield found
+
+
+@contextmanager
+def installed(folder: Path, *options: str) -> Iterator[Installation]:
+    """Run the rooms of `folder`/rooms.yaml; nothing of it is left afterwards."""
     page_port, rooms_port = ports.private_ports(2)
     command = [sys.executable, "-m", "deltalight.services.cli", "up", "--rooms", str(folder / "rooms.yaml")]
     command += ["--allow-software", "--data", str(folder / "data"), *options]
@@ -162,7 +170,6 @@ def started(folder: Path, *options: str) -> Iterator[Installation]:
     process = subprocess.Popen(command, cwd=ROOT)
     found = Installation(process, page_port, rooms_port)
     try:
-        wait_for(lambda: found.is_shown("hall") and found.is_shown("door"))
         yield found
         children = found.process.children(recursive=True)
         process.send_signal(signal.SIGINT)

@@ -1657,6 +1657,35 @@ export interface components {
             readonly source: string;
         };
         /**
+         * CameraState
+         * @description A camera whose pictures the render server makes, and its newest picture here.
+         */
+        readonly CameraState: {
+            /**
+             * Frame Id
+             * @description Of its newest picture.
+             */
+            readonly frame_id: number | null;
+            /** Frames Per S */
+            readonly frames_per_s: number | null;
+            /**
+             * Last Frame S
+             * @description Seconds since that came.
+             */
+            readonly last_frame_s: number | null;
+            /**
+             * Name
+             * @description Its node's.
+             */
+            readonly name: string;
+            /**
+             * Status
+             * @description `live`, or why it is left out: it is `silent`, sees `other_board` than the first one, or its frames are of `other_time`.
+             * @enum {string}
+             */
+            readonly status: "live" | "silent" | "other_board" | "other_time";
+        };
+        /**
          * CamerasAnswer
          * @description The cameras of this host.
          */
@@ -2441,6 +2470,12 @@ export interface components {
                 readonly [key: string]: unknown;
             }[];
             /**
+             * Node
+             * @description The node whose camera it is of, where the room has several; else null.
+             * @default null
+             */
+            readonly node: string | null;
+            /**
              * Number
              * @description Counts the pictures that came.
              */
@@ -2721,6 +2756,11 @@ export interface components {
          */
         readonly NewSnapshot: {
             /**
+             * Camera
+             * @description Whose frame, by its node's name; null = the first camera's.
+             */
+            readonly camera?: string | null;
+            /**
              * Exr
              * @description Add composite.exr: the composite's linear radiance.
              * @default false
@@ -2971,6 +3011,11 @@ export interface components {
          * @description A place in the composite.
          */
         readonly Pixel: {
+            /**
+             * Camera
+             * @description Whose picture, by its node's name; null = the first camera's.
+             */
+            readonly camera?: string | null;
             /**
              * Ignore
              * @description Id of an object to look through, at the real scene behind it: one that is being dragged.
@@ -4006,6 +4051,11 @@ export interface components {
          */
         readonly State: {
             /**
+             * Cameras
+             * @description The room's, in the order of their first frames: names for `camera` of other routes.
+             */
+            readonly cameras: readonly components["schemas"]["CameraState"][];
+            /**
              * Has Fisheye
              * @description Whether light of a fish-eye camera has come.
              */
@@ -4226,6 +4276,7 @@ export type AroofMethod = components['schemas']['AroofMethod'];
 export type AssetAnswer = components['schemas']['AssetAnswer'];
 export type BoxRegion = components['schemas']['BoxRegion'];
 export type CameraAnswer = components['schemas']['CameraAnswer'];
+export type CameraState = components['schemas']['CameraState'];
 export type CamerasAnswer = components['schemas']['CamerasAnswer'];
 export type Check = components['schemas']['Check'];
 export type DifferentialMethod = components['schemas']['DifferentialMethod'];
@@ -5616,6 +5667,8 @@ export interface operations {
             readonly query?: {
                 /** @description What to look at; without, the scene's own `output.view`. */
                 readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
+                /** @description Whose picture, by its node's name; without, the first camera's. */
+                readonly camera?: string | null;
             };
             readonly header?: never;
             readonly path?: never;
@@ -5652,6 +5705,15 @@ export interface operations {
             };
             /** @description Forbidden */
             readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
@@ -5739,6 +5801,15 @@ export interface operations {
             };
             /** @description Forbidden */
             readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
@@ -13050,6 +13121,15 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description Not Found */
+            readonly 404: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Conflict */
             readonly 409: {
                 headers: {
@@ -13753,6 +13833,8 @@ export interface operations {
             readonly query?: {
                 /** @description What to look at; without, the scene's own `output.view`. */
                 readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
+                /** @description Whose picture, by its node's name; without, the first camera's. */
+                readonly camera?: string | null;
             };
             readonly header?: never;
             readonly path?: never;
@@ -13794,6 +13876,15 @@ export interface operations {
             };
             /** @description Forbidden */
             readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
