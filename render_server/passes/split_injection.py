@@ -7,7 +7,8 @@ from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, 
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.volumes import PlacedVolume
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 
 LIGHT_SUMS = 14  # per slot: shaders/common/split_sums.glsl
 

@@ -54,6 +54,7 @@ void light(ivec2 pixel, ivec2 size) {
         }
     }
     if (known) { e_mu = e_rho = kept.rgb; unshadowed = kept.a; }
+    enter_volume(position.xyz);
     float fade = volume_fade(volume_coordinate(position.xyz));
     if (reached && fade > 0.0)
         e_rho += fade * caustic_irradiance(pixel, size, REAL_LAYER, position.xyz, normal.xyz, position.w);

@@ -46,7 +46,7 @@ const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no su
 #endif
 #ifdef REAL_DELTA
 layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 per slot
-layout(std430) buffer Support { int support[6]; };        // bounds of changed voxels: min xyz, -max xyz
+layout(std430) buffer Support { int support[]; };        // of each volume, bounds of changed voxels: min xyz, -max xyz
 #endif
 
 #ifdef GATHERED
@@ -204,13 +204,14 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 
 void light(Surfel s, uint own, vec3 n) {
     uint voxel = floatBitsToUint(s.uv_voxel.z);
+    ivec3 v = enter_volume_of(voxel, volume_size);
     vec3 radiance = outgoing(s, n, own);
 #if defined(REAL_DELTA) || defined(GATHERED)
     if (radiance == vec3(0.0)) return;
 #endif
 #ifdef REAL_DELTA
-    ivec3 v = voxel_of_index(voxel, volume_size);
-    for (int j = 0; j < 3; ++j) { atomicMin(support[j], v[j]); atomicMin(support[3 + j], -v[j]); }
+    int held = 6 * volume;
+    for (int j = 0; j < 3; ++j) { atomicMin(support[held + j], v[j]); atomicMin(support[held + 3 + j], -v[j]); }
 #endif
     float area = s.position_area.w, opaque = 1.0;
 #if defined(VIRTUAL) && defined(MATERIAL_MAPS)

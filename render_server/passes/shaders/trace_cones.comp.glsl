@@ -59,6 +59,7 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
 
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
+    enter_volume(s.position);
     vec3 q = volume_coordinate(s.position);
     vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
 #ifdef REAL

@@ -27,8 +27,23 @@ bool may_differ(vec3 q, vec3 d, float ratio, vec4 ball) {
 }
 
 vec4 ball_around_support() {
-    vec3 low = vec3(support[0], support[1], support[2]), high = vec3(-support[3], -support[4], -support[5]) + 1.0;
+    int held = 6 * volume;
+    vec3 low = vec3(support[held], support[held + 1], support[held + 2]);
+    vec3 high = vec3(-support[held + 3], -support[held + 4], -support[held + 5]) + 1.0;
     return vec4(0.5 * (low + high), 0.5 * length(high - low) + 3.0);   // the first samples lie a cell off the axis
+}
+
+// Whether a cone from q may meet a change in any volume. `ball`: of this one.
+bool may_meet_change(vec3 q, vec3 d, float ratio, vec4 ball) {
+    bool meets = may_differ(q, d, ratio, ball);
+#ifdef SEVERAL_VOLUMES
+    int home = volume;
+    vec3 from = volume_origin + q * voxel_edge;
+    for (volume = 0; volume < volume_count; ++volume)
+        meets = meets || may_differ(volume_coordinate(from), d, ratio, ball_around_support());
+    volume = home;
+#endif
+    return meets;
 }
 
 // Change of the irradiance by the objects. Lanes of a processor walk through their own lists of cones that meet any.
@@ -40,7 +55,7 @@ vec3 diffuse_change(vec3 q, vec3 n, ConeSet set) {
     for (int first = 0; first < cone_count; first += 32) {
         uint met = 0u;
         for (int k = first; k < min(first + 32, cone_count); ++k)
-            if (may_differ(q, basis * cone_direction(k, set), ratio, ball)) met |= 1u << (k - first);
+            if (may_meet_change(q, basis * cone_direction(k, set), ratio, ball)) met |= 1u << (k - first);
         while (met != 0u) {
             int k = findLSB(met);
             met &= met - 1u;

@@ -27,8 +27,7 @@ float shadow_bias(float depth) { return 3.0 * noise_sigma * depth * depth; }
 bool cones_may_reach(vec4 position, vec3 normal) {
     vec3 away = normalize(camera_position - position.xyz);
     float margin_m = 2.0 * sample_distance * position.w / max(dot(normal, away), 0.1);
-    vec3 place = position.xyz - volume_origin + margin_m;
-    return inside_cube(place, float(volume_size) * voxel_edge + 2.0 * margin_m);
+    return near_volume(position.xyz, margin_m);
 }
 
 // Whether cones or shadows of the objects reach the real surface of a pixel.

@@ -43,6 +43,7 @@ vec4 shown_at(ScreenHit hit, float spread) {
 // Radiance of all that a cone may meet, objects too, at the resolution of the voxels.
 vec3 look_in_voxels(vec3 from, vec3 d, float spread) {
     bool differs;
+    enter_volume(from);
     Crossed met = march_one(mipmap_rho, volume_coordinate(from), d, spread, differs);
     vec3 behind = (1.0 - blocked_fraction(met.coverage)) * environment(d, atan(0.5 * spread));
     return met.c + behind;
