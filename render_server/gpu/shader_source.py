@@ -152,7 +152,7 @@ def _kept(text: str) -> tuple[str, dict[str, str]]:
     return "".join([*kept, text[at:]]), macros
 
 
-def _follow(kind: str, is_defined: bool, branches: list[bool | None]) -> None:  # noqa: FBT001 - of a condition
+def _follow(kind: str, is_defined: bool, branches: list[bool | None]) -> None:
     """Opens, turns or closes a branch."""
     if kind in ("ifdef", "ifndef"):
         branches.append(is_defined == (kind == "ifdef"))
