@@ -15,6 +15,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.method_names import with_method
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.services import ports
+from deltalight.services.files import make_output_folder
 from deltalight.services.host import HostPlan
 from deltalight.services.host_store import activate_document, session_file
 from deltalight.services.storage.store import Store
@@ -24,6 +25,7 @@ ASSETS = Path(__file__).parent / "demo_assets"
 RECORDING = ASSETS / "demo.mcap"
 SCENE = ASSETS / "scene.json"
 POSTER = ASSETS / "poster.jpg"
+POSTER_BEFORE = ASSETS / "poster_before.jpg"
 NAME = "Demo"
 FRAME_BUDGET_MS = 125.0  # of what a viewer calls live: eight pictures a second
 
@@ -34,7 +36,7 @@ def demo_scene(method: str) -> SceneDocument:
     Raises:
         DeltalightError: the demo's files are missing.
     """
-    if not all(path.is_file() for path in (RECORDING, SCENE, POSTER)):
+    if not all(path.is_file() for path in (RECORDING, SCENE, POSTER, POSTER_BEFORE)):
         raise DeltalightError(f"The demo's files are missing in {ASSETS}; install Deltalight again.")
     scene = load_scene(SCENE)
     return with_method(scene, method)
@@ -72,6 +74,9 @@ def _kept(method: str, data: Path) -> Iterator[Path]:
         )
         scene = activate_document(store, paced)
         shutil.copyfile(POSTER, store.poster)
+        shutil.copyfile(POSTER_BEFORE, store.poster_before)
+        folder = make_output_folder(store.recordings)
+        (folder / RECORDING.name).symlink_to(RECORDING)  # replayed, the camera is moved by hand
     with session_file(scene) as session:
         yield session
 
