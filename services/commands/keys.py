@@ -12,7 +12,7 @@ keys = typer.Typer(no_args_is_help=True, help="Manage keys for connections to ot
 
 Folder = Annotated[
     Path | None,
-    typer.Option(help="Folder of the keys; default: that of the section `keys` in the configuration file."),
+    typer.Option(help="Folder of the keys; default: that of `keys` in the configuration file."),
 ]
 
 

@@ -39,7 +39,7 @@ def node(
         bool,
         typer.Option(
             "--tracking",
-            help="Take the camera's pose from OpenTrackIO packets; `node.tracking` in the configuration file says where from.",
+            help="Take the camera's pose from OpenTrackIO packets, by `node.tracking` in the configuration file.",
         ),
     ] = False,
     calibration: Annotated[
