@@ -145,7 +145,7 @@ class _Builder:
         self._settings, self._store, self._keys, self._metrics = settings, store, keys, metrics
         self._problems, self._cameras = Problems(), CameraFinder()
         self._tickets = Tickets(store=store.tickets)
-        self._recordings = RecordingStore(store.folder / "recordings")
+        self._recordings = RecordingStore(store.recordings)
         self._videos = RecordingVideos(self._recordings)
         self._snapshots = SnapshotStore(store.folder / "snapshots")
         self._pools = make_pools()

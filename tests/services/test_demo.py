@@ -23,7 +23,7 @@ from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.services import ports
 from deltalight.services.api.serve import listening
-from deltalight.services.demo import POSTER, RECORDING, SCENE, demo_plan, demo_scene
+from deltalight.services.demo import POSTER, POSTER_BEFORE, RECORDING, SCENE, demo_plan, demo_scene
 from deltalight.services.host import HostPlan
 from deltalight.services.host_store import session_file
 from deltalight.services.supervisor import Supervisor
@@ -72,9 +72,10 @@ def test_headless_demo_writes_composites_sheet_and_video(cli_process: RunCli, tm
     assert all(record["age_ms"] > 0 for record in records)
 
 
-def test_the_poster_is_small_and_of_the_pictures_shape() -> None:
-    assert POSTER.stat().st_size < 60_000
-    picture = cv2.imread(str(POSTER))
+@pytest.mark.parametrize("path", [POSTER, POSTER_BEFORE])
+def test_the_poster_is_small_and_of_the_pictures_shape(path: Path) -> None:
+    assert path.stat().st_size < 60_000
+    picture = cv2.imread(str(path))
     assert picture is not None
     assert picture.shape == (480, 640, 3)
 
@@ -188,9 +189,12 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     """The first as people start it; in the second, a change by REST is in the next picture that is begun."""
     (page_port,) = ports.private_ports(1)
     with demo(page_port) as address:
-        assert httpx.get(f"http://{address}/api/v1/settings", timeout=PATIENCE_S).json()["has_poster"]
-        poster = httpx.get(f"http://{address}/api/v1/poster.jpg", timeout=PATIENCE_S)
-        assert poster.content == POSTER.read_bytes()
+        with httpx.Client(base_url=f"http://{address}/api/v1", timeout=PATIENCE_S) as client:
+            assert client.get("/settings").json()["has_poster"]
+            assert client.get("/poster.jpg").content == POSTER.read_bytes()
+            assert client.get("/poster-before.jpg").content == POSTER_BEFORE.read_bytes()
+            (recording,) = client.get("/recordings").json()
+        assert (recording["id"], recording["frames"]) == ("demo", 30)
     with demo(page_port, "--method", "paper") as address:
         check_changes(address)
 

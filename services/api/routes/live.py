@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, Query, Request, Response, WebSocket, WebSocketDisconnect
@@ -158,7 +159,18 @@ async def live_picture(shared: Shared, view: WantedView = None, camera: WantedCa
 )
 def poster(shared: Shared) -> StoredFileResponse:
     """Return the still that stands for the live picture until it comes; `/settings` says whether there is one."""
-    path = shared.store.poster
+    return _still(shared.store.poster)
+
+
+@live_router.get(
+    "/poster-before.jpg", response_class=StoredFileResponse, responses={**responses(404), **JPEG_ANSWER}
+)
+def poster_before(shared: Shared) -> StoredFileResponse:
+    """Return the camera's own picture of the poster's frame; `/settings` says whether there is one."""
+    return _still(shared.store.poster_before)
+
+
+def _still(path: Path) -> StoredFileResponse:
     if not path.is_file():
         raise NotFoundError("there is no poster; wait for the live picture.")
     return StoredFileResponse(path, media_type="image/jpeg", headers=PICTURE_HEADERS)

@@ -80,6 +80,7 @@ class Settings(BaseModel):
     upload_limit_bytes: int
     requests_per_s: float
     has_poster: bool = Field(description="Whether `/poster.jpg` stands for the live picture until it comes.")
+    has_poster_before: bool = Field(description="Whether `/poster-before.jpg` is the camera's picture of it.")
     live_codecs: list[LiveCodec] = Field(description="What `WS /live` sends pictures as, for the asking.")
     no_h264: str | None = Field(description="Why `h264` is not among them; null where it is.")
     no_whep: str | None = Field(description="Why `POST /whep` gives no pictures; null where it does.")
@@ -157,6 +158,7 @@ def settings(shared: Shared) -> Settings:
         upload_limit_bytes=shared.settings.upload_limit_mb << 20,
         requests_per_s=shared.settings.requests_per_s,
         has_poster=shared.store.poster.is_file(),
+        has_poster_before=shared.store.poster_before.is_file(),
         live_codecs=["jpeg", "h264"] if shared.live.video.why_not is None else ["jpeg"],
         no_h264=shared.live.video.why_not,
         no_whep=shared.whep.why_not,
