@@ -56,18 +56,22 @@ def read_material(path: Path) -> GaussianBrdf | PolynomialTexture:
     except OSError as error:
         raise DeltalightError(f"{path} cannot be read ({error.strerror}); {_ADVICE}.") from error
     if not head.startswith(_MAGIC) or len(head.split()) != 4:
-        raise DeltalightError(f"{path.name} is no precomputed material; {_ADVICE}.")
+        raise DeltalightError(f"{path} is no precomputed material; {_ADVICE}.")
     version, digest = head.split()[2:]
     if version != str(VERSION).encode():
         raise DeltalightError(
-            f"{path.name} is a precomputed material of version {version.decode(errors='replace'):.20}, and this "
+            f"{path} is a precomputed material of version {version.decode(errors='replace'):.20}, and this "
             f"release reads version {VERSION}; {_ADVICE}."
         )
+    if len(content) > _LARGEST_BYTES:
+        raise DeltalightError(
+            f"{path} is larger than {_LARGEST_BYTES >> 20} MB, which no material is; {_ADVICE}."
+        )
     if hashlib.sha256(content).hexdigest().encode() != digest:
-        raise DeltalightError(f"{path.name} is damaged or cut short; {_ADVICE} again.")
+        raise DeltalightError(f"{path} is damaged or cut short; {_ADVICE} again.")
     made = _made(_unpacked(content))
     if made is None:
-        raise DeltalightError(f"{path.name} holds no material that can be drawn; {_ADVICE} again.")
+        raise DeltalightError(f"{path} holds no material that can be drawn; {_ADVICE} again.")
     return made
 
 

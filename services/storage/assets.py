@@ -222,8 +222,7 @@ class AssetStore:
             return place
         with self._children:
             if read_cached(place) is None:
-                task: Task = "mesh-thumbnail" if asset.format.kind == "mesh" else "map-thumbnail"
-                self._draw(task, path, place, asset.names[0])
+                self._draw(f"{asset.format.kind}-thumbnail", path, place, asset.names[0])
         return place
 
     def _draw(self, task: Task, path: Path, place: Path, name: str) -> None:
@@ -335,7 +334,7 @@ class AssetNames:
 def _needed_kind(place: str) -> str:
     if place == "lights.environment.map":
         return "map"
-    return "precomputed" if place.endswith(".precomputed") else "mesh"
+    return "material" if place.endswith(".precomputed") else "mesh"
 
 
 def _digest_of(session: Session, place: str, asset: str) -> str:
