@@ -57,7 +57,9 @@ describe("changes", () => {
     const { document } = answer("a", 1);
     const target = objectTarget("knot");
     const rough = { roughness: 0.5 };
-    const painted = target.apply(target.apply(document, { material: rough }), { material: { precomputed: "sha256:1" } });
+    const painted = target.apply(target.apply(document, { material: rough }), {
+      material: { precomputed: "sha256:1" },
+    });
     expect(painted.objects[0]?.material).toEqual({ precomputed: "sha256:1" });
     expect(target.apply(painted, { material: rough }).objects[0]?.material).toEqual(rough);
   });
