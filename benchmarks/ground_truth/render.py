@@ -54,9 +54,9 @@ SOFTNESS_PX = 0.5
 LEAST_STRATIFIED = 64
 """Samples from which on Mitsuba's stratified sampler is used; with fewer it is biased.
 
-Its permutations of few strata seem to depend on each other between dimensions. Measured in `two_lights`: with 4 samples
-a pass the room is 3.1 % too dark and objects add 1.2 times the light, with 16 it is 0.2 % too dark; 64 and 256 are
-0.1 % off independent samples, which is noise.
+Its permutations of few strata seem to depend on each other between dimensions. Measured in `two_lights`: with 4
+samples a pass the room is 3.1 % too dark and objects add 1.2 times the light, with 16 it is 0.2 % too dark; 64 and
+256 are 0.1 % off independent samples, which is noise.
 """
 WAVEFRONT = 20_000_000
 """Samples drawn at once; with Mitsuba's LLVM variant that takes less than half a GB."""
