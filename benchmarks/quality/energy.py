@@ -24,7 +24,7 @@ class Change:
     @property
     def visible(self) -> Linear:
         """The change that a camera shows: nothing above 1."""
-        return np.minimum(self.with_objects, 1) - np.minimum(self.without, 1)
+        return np.asarray(np.minimum(self.with_objects, 1) - np.minimum(self.without, 1))
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,10 @@ A line `deltalight material VERSION SHA256`, then a .npz archive of arrays, of w
 """
 
 import hashlib
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -75,8 +77,8 @@ def read_material(path: Path) -> GaussianBrdf | PolynomialTexture:
     return made
 
 
-def _unpacked(content: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an archive; none if it is none."""
+def _unpacked(content: bytes) -> Mapping[str, object]:
+    """The members of an archive, arrays if it is a material's; none if it is none."""
     try:
         with ZipFile(BytesIO(content)) as archive:
             if sum(item.file_size for item in archive.infolist()) > _LARGEST_BYTES:
@@ -87,9 +89,10 @@ def _unpacked(content: bytes) -> dict[str, np.ndarray]:
         return {}
 
 
-def _made(arrays: dict[str, np.ndarray]) -> GaussianBrdf | PolynomialTexture | None:
+def _made(arrays: Mapping[str, Any]) -> GaussianBrdf | PolynomialTexture | None:
     """The material of these arrays; None if they are none."""
-    if any(each.dtype.kind != "f" for each in arrays.values()):
+    # A member that is no array comes as bytes.
+    if any(not isinstance(each, np.ndarray) or each.dtype.kind != "f" for each in arrays.values()):
         return None
     if arrays.keys() == {"coefficients"}:
         return _polynomial(arrays["coefficients"])
