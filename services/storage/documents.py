@@ -100,8 +100,9 @@ def patch_object(name: str, patch: object) -> Edit:
 
 def _without_other_material(item: Document, patch: object) -> Document:
     old, new = item.get("material"), patch.get("material") if isinstance(patch, Mapping) else None
-    both = isinstance(old, Mapping) and isinstance(new, Mapping) and bool(new)
-    return {**item, "material": None} if both and ("precomputed" in old) != ("precomputed" in new) else item
+    if not (isinstance(old, Mapping) and isinstance(new, Mapping) and new):
+        return item
+    return {**item, "material": None} if ("precomputed" in old) != ("precomputed" in new) else item
 
 
 def _edit_object(name: str, change: Callable[[Document], Any]) -> Edit:
