@@ -39,7 +39,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Upload Asset
-         * @description Upload a mesh or an environment map as the body of the request; 200 where the same content is there already.
+         * @description Upload a mesh, an environment map or a precomputed material as the body of the request; 200 where the same content is there already.
          *
          *     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
          *     A .zip of one glTF and its files is kept as one .glb.
@@ -104,7 +104,7 @@ export interface paths {
         };
         /**
          * Thumbnail
-         * @description Return a picture of a mesh or map, 256 x 256 pixels on a transparent ground.
+         * @description Return a picture of a mesh, map or material, 256 x 256 pixels on a transparent ground.
          */
         readonly get: operations["thumbnail"];
         readonly put?: never;
@@ -1573,7 +1573,7 @@ export interface components {
             readonly asset: string;
             /**
              * Facts
-             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels.
+             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, polynomial_texture), base_color, and lobes and roughness, or width and height in texels.
              * @example {
              *       "maximum": [
              *         0.1,
@@ -1599,10 +1599,10 @@ export interface components {
             readonly format: string;
             /**
              * Kind
-             * @description `mesh` for objects and models, `map` for environment lights.
+             * @description `mesh` for objects and models, `map` for environment lights, `material` for what `material: {precomputed: ...}` names.
              * @enum {string}
              */
-            readonly kind: "mesh" | "map";
+            readonly kind: "mesh" | "map" | "material";
             /**
              * Names
              * @description Names under which it was uploaded.
@@ -4553,7 +4553,7 @@ export interface operations {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** @description The file itself: GLB, PLY, STL, HDR, EXR, OBJ, or a ZIP of one glTF and its files. */
+        /** @description The file itself: GLB, PLY, STL, HDR, EXR, DLMAT, OBJ, or a ZIP of one glTF and its files. */
         readonly requestBody: {
             readonly content: {
                 readonly "application/octet-stream": string;
