@@ -4,8 +4,9 @@
 #include "common/environment.glsl"
 #include "common/volume.glsl"
 #include "common/real_radiance.glsl"
+#include "common/map_texels.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D albedo_out;
 uniform sampler2D real_light_normal;
 uniform int view_index;
@@ -35,22 +36,26 @@ bool reaches_volume(vec3 p, float around) {
     return distance(q, clamp(q, vec3(0.0), vec3(float(volume_size)))) <= around / voxel_edge + SNAP_REACH;
 }
 
+bool is_wanted(LightView view, ivec2 texel) {
+    float depth = first_depth(real_light_depth, view, texel);
+    vec2 s = texel_lateral(view, texel);
+    return depth != NOTHING && reaches_volume(ray_point(view, s, depth), hit_spread(view, s, depth));
+}
+
+vec3 albedo_at(LightView view, ivec2 texel) {
+    vec3 p = ray_point(view, texel_lateral(view, texel), first_depth(real_light_depth, view, texel));
+    if (!camera_sees(p)) return unseen_albedo(p);
+    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+    vec3 to_light; float radius;
+    light_at(lights[light_of_view(view_index)], p, to_light, radius);
+    if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
+    return clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
+}
+
 void main() {
     LightView view = light_views[view_index];
-    if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy);
-    float depth = first_depth(real_light_depth, view, texel);
-    if (depth == NOTHING) return;
-    vec2 s = texel_lateral(view, texel);
-    vec3 p = ray_point(view, s, depth);
-    if (!reaches_volume(p, hit_spread(view, s, depth))) return;
-    vec3 albedo = unseen_albedo(p);
-    if (camera_sees(p)) {
-        vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
-        vec3 to_light; float radius;
-        light_at(lights[light_of_view(view_index)], p, to_light, radius);
-        if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
-        albedo = clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
+    for (uint i = next_wanted(view, first_item()); i < texels_of(view); i = next_wanted(view, i + items_apart())) {
+        ivec2 texel = map_texel(view, i);
+        imageStore(albedo_out, texel, vec4(albedo_at(view, texel), 1.0));
     }
-    imageStore(albedo_out, texel, vec4(albedo, 1.0));
 }
