@@ -275,7 +275,7 @@ class VirtualSurface:
             _caustics_on(grid, caustics),
             scene,
             radiance_out=self.radiance,
-            Texels=grid.virtual_texels,
+            ShownPixels=grid.shown_pixels,
             cone_irradiance=cones.virtual,
             cone_specular=cones.virtual_specular,
             screen_reflection=screen,

@@ -35,7 +35,8 @@ void light(ivec2 pixel, ivec2 size) {
     bool known = kept.a > 0.0 && !shadow_may_reach(position.xyz, normal.xyz, bias);
     if (reached) {
         vec3 v = normalize(camera_position - position.xyz);
-        for (int i = 0; i < (known ? 0 : light_count); ++i) {
+        int i = 0;
+        if (!known && light_count > 0) do {
             vec3 l; float radius;
             vec3 across = light_at(lights[i], position.xyz, normal.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
@@ -51,7 +52,7 @@ void light(ivec2 pixel, ivec2 size) {
                 s_mu += lobe * seen.x;
                 s_rho += lobe * arrives;
             }
-        }
+        } while (++i < light_count);
     }
     if (known) { e_mu = e_rho = kept.rgb; unshadowed = kept.a; }
     float fade = volume_fade(volume_coordinate(position.xyz));
@@ -68,9 +69,9 @@ void light(ivec2 pixel, ivec2 size) {
 void main() {
     ivec2 size = textureSize(real_surface_position, 0);
     int grid_width = (size.x + scale - 1) / scale;
-    uint block = uint(scale * scale);
-    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
+    uint block = uint(scale * scale), count = listed_count() * block, i = first_item();
+    if (i < count) do {
         ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
         if (all(lessThan(pixel, size))) light(pixel, size);
-    }
+    } while ((i += items_apart()) < count);
 }

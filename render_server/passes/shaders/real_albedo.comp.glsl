@@ -14,18 +14,24 @@ uniform float bias_real;   // m
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
-// Real direct and ambient light. The map's own light reaches its texels by definition.
+// Irradiance of a light that nothing blocks.
+vec3 unblocked(Light light, vec3 p, vec3 n) {
+    vec3 to_light; float radius;
+    vec3 across = light_at(light, p, n, to_light, radius);
+    return across * max(dot(n, to_light), 0.0);
+}
+
+// Real direct and ambient light. The map's own light reaches its texels by definition, so its shadows are not looked for.
 vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
-    for (int i = 0; i < light_count; ++i) {
-        bool own = i == light_of_view(view_index);
-        vec3 to_light; float radius;
-        vec3 across = light_at(lights[i], p, n, to_light, radius);
-        float cosine = dot(n, to_light);
-        if (cosine <= 0.0) continue;
-        e += across * cosine * (own ? 1.0 : real_visibility(lights[i], p, n, bias_real));
+    int own = light_of_view(view_index);
+    vec3 of_own = unblocked(lights[own], p, n);
+    for (int j = 0; j < light_count - 1; ++j) {
+        if (j == own) e += of_own;   // sums in the lights' order
+        Light light = lights[j < own ? j : j + 1];
+        e += unblocked(light, p, n) * real_visibility(light, p, n, bias_real);
     }
-    return e;
+    return own == light_count - 1 ? e + of_own : e;
 }
 
 const float SNAP_REACH = 0.5;   // voxels: split_inject searches a touched voxel this near (SNAP along each axis)
