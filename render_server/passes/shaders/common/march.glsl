@@ -136,6 +136,22 @@ bool may_be_far(vec3 q, int level) {
     return (occupied_far[corner_word(far_size, level, corner)] >> (corner.x & 31) & 1u) != 0u;
 }
 
+// Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together. Loops test at
+// their end, because software renderers run the body of those that test at their beginning once more, for no lane.
+
+// Goes on to the next cell, from that at `at` on, that may hold anything; whether there is one.
+bool find_near(inout Walk w, inout vec3 at, float ratio, vec3 low, vec3 high, inout bool differs) {
+    bool met = false;
+    if (inside_volume(at)) do {
+        vec3 reach = vec3(1.5 * float(1 << w.level));
+        differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
+        met = may_be_near(at, w.level);
+        if (!met) advance(w, ratio, 0.0, volume_levels);
+        at = sample_point(w);
+    } while (inside_volume(at) && !met);
+    return met;
+}
+
 // Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
 // `differs`: the path crossed cells where mu and rho differ.
 Crossed march_near(sampler3D mipmap, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
@@ -145,23 +161,24 @@ Crossed march_near(sampler3D mipmap, vec3 q, vec3 d, float ratio, out float t, o
     vec3 high = vec3(-support[3], -support[4], -support[5]) + 1.0;
     differs = false;
     vec3 at = sample_point(w);
-    for (int i = 0; i < 1024 && inside_volume(at) && sum.coverage < WALL; ++i) {
-        // Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together.
-        bool met = false;
-        for (int j = 0; j < 1024 && inside_volume(at) && !met; ++j) {
-            vec3 reach = vec3(1.5 * float(1 << w.level));
-            differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
-            met = may_be_near(at, w.level);
-            if (!met) advance(w, ratio, 0.0, volume_levels);
-            at = sample_point(w);
-        }
-        if (!met) break;
+    if (find_near(w, at, ratio, low, high, differs)) do {
         cross_cell(slice_fraction(w) * directional_sample(mipmap, volume_size, at, w), sum);
         advance(w, ratio, 0.0, volume_levels);
         at = sample_point(w);
-    }
+    } while (sum.coverage < WALL && find_near(w, at, ratio, low, high, differs));
     t = travelled(w);
     return sum;
+}
+
+// The same in the coarse real scene, of `edge` voxels.
+bool find_far(inout Walk w, inout vec3 at, float ratio, float before, float edge) {
+    bool met = false;
+    if (inside_cube(at, edge)) do {
+        met = may_be_far(at, w.level);
+        if (!met) advance(w, ratio, before, far_levels);
+        at = sample_point(w);
+    } while (inside_cube(at, edge) && !met);
+    return met;
 }
 
 // Continues through the coarse real scene, from q after a distance `before` (both in its voxels).
@@ -171,16 +188,11 @@ void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
     w.ahead *= float(1 << w.level);
     float edge = float(far_size);
     vec3 at = sample_point(w);
-    for (int i = 0; i < 256 && inside_cube(at, edge) && sum.coverage < WALL; ++i) {
-        for (int j = 0; j < 256 && inside_cube(at, edge) && !may_be_far(at, w.level); ++j) {
-            advance(w, ratio, before, far_levels);
-            at = sample_point(w);
-        }
-        if (!inside_cube(at, edge)) break;
+    if (sum.coverage < WALL && find_far(w, at, ratio, before, edge)) do {
         cross_cell(slice_fraction(w) * directional_sample(mipmap_far, far_size, at, w), sum);
         advance(w, ratio, before, far_levels);
         at = sample_point(w);
-    }
+    } while (sum.coverage < WALL && find_far(w, at, ratio, before, edge));
 }
 
 // One march from q (voxels) along d, continued into the coarse scene.
