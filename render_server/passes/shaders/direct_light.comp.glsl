@@ -1,5 +1,6 @@
 // Direct irradiance of the real surface at each pixel without and with the virtual objects (docs/method.md 3, direct), and
-// the light lobes on declared specular surfaces.
+// the light lobes on declared specular surfaces. SPARED: where the light without the objects is known, and no shadow of
+// theirs falls.
 #include "common/lit_pixels.glsl"
 #include "common/light_reach.glsl"
 #include "common/brdf.glsl"
@@ -34,6 +35,7 @@ void light(ivec2 pixel, ivec2 size) {
     vec4 kept = keeps_unblocked ? imageLoad(direct_mu, pixel) : vec4(0.0);
     bool known = kept.a > 0.0 && !shadow_may_reach(position.xyz, normal.xyz, bias);
     if (reached) {
+#ifndef SPARED
         vec3 v = normalize(camera_position - position.xyz);
         int i = 0;
         if (!known && light_count > 0) do {
@@ -53,6 +55,7 @@ void light(ivec2 pixel, ivec2 size) {
                 s_rho += lobe * arrives;
             }
         } while (++i < light_count);
+#endif
     }
     if (known) { e_mu = e_rho = kept.rgb; unshadowed = kept.a; }
     float fade = volume_fade(volume_coordinate(position.xyz));
