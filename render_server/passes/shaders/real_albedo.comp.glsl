@@ -26,11 +26,12 @@ vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
     int own = light_of_view(view_index);
     vec3 of_own = unblocked(lights[own], p, n);
-    for (int j = 0; j < light_count - 1; ++j) {
+    int j = 0;
+    if (light_count > 1) do {
         if (j == own) e += of_own;   // sums in the lights' order
         Light light = lights[j < own ? j : j + 1];
         e += unblocked(light, p, n) * real_visibility(light, p, n, bias_real);
-    }
+    } while (++j < light_count - 1);
     return own == light_count - 1 ? e + of_own : e;
 }
 
@@ -60,8 +61,10 @@ vec3 albedo_at(LightView view, ivec2 texel) {
 
 void main() {
     LightView view = light_views[view_index];
-    for (uint i = next_wanted(view, first_item()); i < texels_of(view); i = next_wanted(view, i + items_apart())) {
+    uint i = next_wanted(view, first_item());
+    if (i < texels_of(view)) do {
         ivec2 texel = map_texel(view, i);
         imageStore(albedo_out, texel, vec4(albedo_at(view, texel), 1.0));
-    }
+        i = next_wanted(view, i + items_apart());
+    } while (i < texels_of(view));
 }

@@ -104,6 +104,9 @@ void split(Light light, LightView view, ivec2 texel) {
 void main() {
     LightView view = light_views[view_index];
     Light light = lights[light_of_view(view_index)];
-    for (uint i = next_wanted(view, first_item()); i < texels_of(view); i = next_wanted(view, i + items_apart()))
+    uint i = next_wanted(view, first_item());
+    if (i < texels_of(view)) do {
         split(light, view, map_texel(view, i));
+        i = next_wanted(view, i + items_apart());
+    } while (i < texels_of(view));
 }

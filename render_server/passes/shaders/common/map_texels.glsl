@@ -14,6 +14,10 @@ ivec2 map_texel(LightView view, uint i) {
 
 // The first of a thread's items from i on that is wanted; texels_of(view) or more: none.
 uint next_wanted(LightView view, uint i) {
-    while (i < texels_of(view) && !is_wanted(view, map_texel(view, i))) i += items_apart();
+    bool found = false;
+    if (i < texels_of(view)) do {
+        found = is_wanted(view, map_texel(view, i));
+        if (!found) i += items_apart();
+    } while (!found && i < texels_of(view));
     return i;
 }
