@@ -57,24 +57,19 @@ void meet_triangle(int at, Ray ray, inout MeshHit hit) {
     hit = MeshHit(t, at, vec2(u, v));
 }
 
-// The hit nearest to the origin, or with `any_hit` the first that is found, before `limit`. Lanes of a processor go on to
-// their next leaves in a loop of their own, and then meet triangles together (Aila and Laine 2009).
+// The hit nearest to the origin, or with `any_hit` the first that is found, before `limit`.
 MeshHit hit_before(Ray ray, float limit, bool any_hit) {
     vec3 safe = mix(ray.direction, vec3(1e-12), lessThan(abs(ray.direction), vec3(1e-12)));
     vec3 inverse = 1.0 / safe;
     MeshHit hit = MeshHit(limit, -1, vec2(0.0));
     int count = nodes[0].skip;
-    int i = 0;
-    if (count > 0) do {
-        int j = 0, last = 0;
-        do {
-            Node node = nodes[i];
-            bool met = meets_box(node.low, node.high, ray.from, inverse, hit.distance);
-            if (met && node.leaf >= 0) { j = node.leaf >> 3; last = j + (node.leaf & 7); }
-            i = met ? i + 1 : node.skip;
-        } while (i < count && j == last);
-        if (j < last) do meet_triangle(j, ray, hit); while (++j < last);
-    } while (i < count && !(any_hit && hit.triangle >= 0));
+    for (int i = 0; i < count && !(any_hit && hit.triangle >= 0);) {
+        Node node = nodes[i];
+        bool met = meets_box(node.low, node.high, ray.from, inverse, hit.distance);
+        int last = met && node.leaf >= 0 ? (node.leaf >> 3) + (node.leaf & 7) : 0;
+        for (int j = node.leaf >> 3; j < last; ++j) meet_triangle(j, ray, hit);
+        i = met ? i + 1 : node.skip;
+    }
     return hit;
 }
 
