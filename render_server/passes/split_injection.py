@@ -29,7 +29,7 @@ class RealAlbedo:
         if self.atlas.size != lights.real_atlas.size:
             self.atlas.release()
             self.atlas = texture_2d(self._gpu, lights.real_atlas.size, 4, "f2")
-        threads = (lights.tile_size, lights.tile_size)
+        threads = (list_threads(self._gpu, lights.tile_size**2),)
         for view in range(len(lights.real_views)):
             self._kernel.run(threads, scene, albedo_out=self.atlas, view_index=view)
 
@@ -66,7 +66,7 @@ class SplitInjection:
             "VirtualLight": virtual.delta_sums,
             "real_albedo": real_albedo,
         }
-        threads = (lights.tile_size, lights.tile_size)
+        threads = (list_threads(self._gpu, lights.tile_size**2),)
         for real_views, virtual_views in lights.views_of_lights:
             for view in real_views:
                 self._real.run(threads, sums, scene, view_index=view)

@@ -78,7 +78,8 @@ vec2 light_fraction(Light light, vec3 p, vec3 n) { return visibility(light, p, n
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     vec3 p = s.position_area.xyz + n * voxel_edge * LIFT;
     mu = rho = vec3(0.0);
-    for (int i = 0; i < light_count; ++i) {
+    int i = 0;
+    if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
         vec3 to_light; float radius;
         vec3 across = light_at(lights[i], p, n, to_light, radius);
         float cosine = dot(n, to_light);
@@ -86,7 +87,7 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
         vec2 v = light_fraction(lights[i], p, n);
         mu += across * cosine * v.x;
         rho += across * cosine * arriving(lights[i], p, v, 0.0);
-    }
+    } while (++i < light_count);
     if (keep_light) {
 #ifndef REAL_RHO
         surfel_lights[own].direct_mu = vec4(mu, 0.0);
@@ -226,10 +227,11 @@ void light(Surfel s, uint own, vec3 n) {
 }
 
 void main() {
-    uint count = surfels_held();
-    for (uint i = first_item(); i < count; i += items_apart()) {
+    uint count = surfels_held(), i = first_item();
+    if (i < count) do {
         Surfel s = surfels[i];
-        light(s, 2u * i, s.normal_material.xyz);
-        if (s.uv_voxel.w > 0.5) light(s, 2u * i + 1u, -s.normal_material.xyz);
-    }
+        uint sides = s.uv_voxel.w > 0.5 ? 2u : 1u;   // a loop: software renderers would run a branch for all
+        uint side = 0u;
+        do light(s, 2u * i + side, side == 0u ? s.normal_material.xyz : -s.normal_material.xyz); while (++side < sides);
+    } while ((i += items_apart()) < count);
 }

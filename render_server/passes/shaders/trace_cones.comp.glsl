@@ -95,6 +95,7 @@ void trace(ivec2 texel) {
 
 // The texels that select_cone_texels or low_res_grid listed.
 void main() {
-    for (uint i = first_item(); i < listed_count(); i += items_apart())
-        trace(texel_of_index(texels[i], low_resolution_size.x));
+    uint i = first_item();
+    if (i < listed_count()) do trace(texel_of_index(texels[i], low_resolution_size.x));
+    while ((i += items_apart()) < listed_count());
 }

@@ -56,13 +56,13 @@ vec3 diffuse_change(vec3 q, vec3 n, ConeSet set) {
         uint met = 0u;
         for (int k = first; k < min(first + 32, cone_count); ++k)
             if (may_meet_change(q, basis * cone_direction(k, set), ratio, ball)) met |= 1u << (k - first);
-        while (met != 0u) {
+        if (met != 0u) do {
             int k = findLSB(met);
             met &= met - 1u;
             vec3 d = basis * cone_direction(first + k, set);
             March m = march(q, d, ratio, false);
             change += m.c_rho - m.c_mu + (m.t_rho - m.t_mu) * environment(d, half_angle);
-        }
+        } while (met != 0u);
     }
     return change * PI / float(cone_count);
 }
@@ -75,13 +75,14 @@ void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3
     mat3 basis = basis_around(n);
     e_mu = vec3(0.0);
     e_rho = vec3(0.0);
-    for (int k = 0; k < cone_count; ++k) {
+    int k = 0;
+    do {   // a loop that tests at its end: march.glsl
         vec3 d = basis * cone_direction(k, set);
         March m = march(q, d, set.width * ratio, only_rho);
         vec3 r = environment(d, half_angle);
         e_mu += m.c_mu + m.t_mu * r;
         e_rho += m.c_rho + m.t_rho * r;
-    }
+    } while (++k < cone_count);
     e_mu *= PI / float(cone_count);
     e_rho *= PI / float(cone_count);
 }

@@ -12,8 +12,8 @@ uniform float noise_sigma;   // m at 1 m
 // Of a point, and of any point in a sphere around it; `bias`: m, the least of all points.
 #ifdef SHADOW_CONES
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
-bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return true; }
-#elif defined(REAL_SHADOWS)
+bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return object_meets_cone_of_sphere(p, radius); }
+#elif defined(REAL_SHADOWS) || defined(SPARED)
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return false; }
 bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return false; }
 #else

@@ -141,6 +141,22 @@ bool may_be_far(vec3 q, int level) {
     return (occupied_far[corner_word(far_size, level, corner)] >> (corner.x & 31) & 1u) != 0u;
 }
 
+// Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together. Loops test at
+// their end, because software renderers run the body of those that test at their beginning once more, for no lane.
+
+// Goes on to the next cell, from that at `at` on, that may hold anything; whether there is one.
+bool find_near(inout Walk w, inout vec3 at, float before, float ratio, vec3 low, vec3 high, inout bool differs) {
+    bool met = false;
+    if (inside_volume(at)) do {
+        vec3 reach = vec3(1.5 * float(1 << w.level));
+        differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
+        met = may_be_near(at, w.level);
+        if (!met) advance(w, ratio, before, volume_levels);
+        at = sample_point(w);
+    } while (inside_volume(at) && !met);
+    return met;
+}
+
 // Through the volume around the objects, from q after a distance `before` (both in voxels), until a wall or the volume's end.
 // Returns the distance crossed (voxels). `differs`: the path crossed cells where mu and rho differ.
 float march_near(
@@ -155,21 +171,11 @@ float march_near(
     vec3 low = vec3(support[held], support[held + 1], support[held + 2]);
     vec3 high = vec3(-support[held + 3], -support[held + 4], -support[held + 5]) + 1.0;
     vec3 at = sample_point(w);
-    for (int i = 0; i < 1024 && inside_volume(at) && sum.coverage < WALL; ++i) {
-        // Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together.
-        bool met = false;
-        for (int j = 0; j < 1024 && inside_volume(at) && !met; ++j) {
-            vec3 reach = vec3(1.5 * float(1 << w.level));
-            differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
-            met = may_be_near(at, w.level);
-            if (!met) advance(w, ratio, before, volume_levels);
-            at = sample_point(w);
-        }
-        if (!met) break;
+    if (find_near(w, at, before, ratio, low, high, differs)) do {
         cross_cell(slice_fraction(w) * sample_near(mipmap, at, w), sum);
         advance(w, ratio, before, volume_levels);
         at = sample_point(w);
-    }
+    } while (sum.coverage < WALL && find_near(w, at, before, ratio, low, high, differs));
     return travelled(w);
 }
 
@@ -179,6 +185,17 @@ bool in_far(vec3 at, Walk w, float end) { return inside_cube(at, float(far_size)
 bool in_far(vec3 at, Walk w, float end) { return inside_cube(at, float(far_size)); }
 #endif
 
+// The same in the coarse real scene, until a distance `end` (its voxels).
+bool find_far(inout Walk w, inout vec3 at, float before, float end, float ratio) {
+    bool met = false;
+    if (in_far(at, w, end)) do {
+        met = may_be_far(at, w.level);
+        if (!met) advance(w, ratio, before, far_levels);
+        at = sample_point(w);
+    } while (in_far(at, w, end) && !met);
+    return met;
+}
+
 // Continues through the coarse real scene, from q after a distance `before`, for a distance `end` (all in its voxels) where
 // another volume is ahead.
 void march_far(vec3 q, vec3 d, float before, float end, float ratio, inout Crossed sum) {
@@ -186,16 +203,11 @@ void march_far(vec3 q, vec3 d, float before, float end, float ratio, inout Cross
     for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
     w.ahead *= float(1 << w.level);
     vec3 at = sample_point(w);
-    for (int i = 0; i < 256 && in_far(at, w, end) && sum.coverage < WALL; ++i) {
-        for (int j = 0; j < 256 && in_far(at, w, end) && !may_be_far(at, w.level); ++j) {
-            advance(w, ratio, before, far_levels);
-            at = sample_point(w);
-        }
-        if (!in_far(at, w, end)) break;
+    if (sum.coverage < WALL && find_far(w, at, before, end, ratio)) do {
         cross_cell(slice_fraction(w) * directional_sample(mipmap_far, 0, far_size, at, w), sum);
         advance(w, ratio, before, far_levels);
         at = sample_point(w);
-    }
+    } while (sum.coverage < WALL && find_far(w, at, before, end, ratio));
 }
 
 const float ENDLESS = 1e30;

@@ -32,12 +32,12 @@ vec4 accumulated(vec4 sum, vec4 v) {
 vec4 march(sampler3D mipmap, vec3 q, vec3 d, float ratio, vec2 interval) {
     vec4 sum = vec4(0.0);
     float t = interval.x;
-    for (int i = 0; i < 1024 && t < interval.y && sum.a < OPAQUE; ++i) {
+    if (t < interval.y) do {   // at least a cell a step; a loop that tests at its end: walk.glsl
         float diameter = max(1.0, ratio * t);
         int level = min(int(floor(log2(diameter) + 0.5)), volume_levels - 1);
         float edge = exp2(float(level));
         sum = accumulated(sum, cone_sample(mipmap, q + (t + 0.5 * edge) * d, level, d));
         t += edge;
-    }
+    } while (t < interval.y && sum.a < OPAQUE);
     return sum;
 }
