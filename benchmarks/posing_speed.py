@@ -16,7 +16,8 @@ import trimesh
 
 from deltalight.benchmarks.glb_builder import GlbBuilder
 from deltalight.render_server.passes.gbuffer import triangle_corners
-from deltalight.render_server.passes.voxels import pieces_in_volume, place_volume
+from deltalight.render_server.passes.volumes import place_volume
+from deltalight.render_server.passes.voxels import pieces_in_volume
 from deltalight.render_server.scene.gltf_meshes import load_gltf
 from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
 

@@ -41,7 +41,7 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
     from deltalight.render_server.methods.light_maps import LitScene
     from deltalight.render_server.passes.lights import LightBuffers
     from deltalight.render_server.passes.shading import DirectLight
-    from deltalight.render_server.passes.voxels import PlacedVolume, VolumePlacement
+    from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 
     size = setup.picture_size
     buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size)

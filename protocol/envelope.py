@@ -16,6 +16,7 @@ from deltalight.protocol.messages import (
     MAX_HEADER_BYTES,
     MAX_PART_BYTES,
     MESSAGE_TYPES,
+    OLDEST_SCHEMA_VERSION,
     SCHEMA_VERSION,
     Message,
     PartRule,
@@ -90,7 +91,7 @@ def unpack_header(header: Buffer) -> Message:
     """Return the message of a msgpack header.
 
     Raises:
-        EnvelopeError: not a header, another schema version (both are named), or a field out of its range.
+        EnvelopeError: not a header, a schema version that is not read (all are named), or a field out of its range.
     """
     if len(header) > MAX_HEADER_BYTES:
         raise EnvelopeError(f"the header has {len(header)} bytes, {MAX_HEADER_BYTES} are allowed: cut it")
@@ -117,13 +118,18 @@ def refusing(stream: str) -> Iterator[None]:
         raise EnvelopeError(_sentence(stream, error)) from error
 
 
+def is_readable_version(version: int) -> bool:
+    """Whether messages of a schema version are read here."""
+    return OLDEST_SCHEMA_VERSION <= version <= SCHEMA_VERSION
+
+
 def _check_version(version: object) -> None:
     if type(version) is not int:
         raise EnvelopeError(f"the header has no schema_version: send {SCHEMA_VERSION}")
-    if version != SCHEMA_VERSION:
+    if not is_readable_version(version):
         raise EnvelopeError(
-            f"the message has schema version {version} and this program speaks version {SCHEMA_VERSION}: "
-            "install the same Deltalight on both sides"
+            f"the message has schema version {version} and this program reads versions {OLDEST_SCHEMA_VERSION} to "
+            f"{SCHEMA_VERSION}: upgrade the older side"
         )
 
 

@@ -38,13 +38,15 @@ from deltalight.protocol.message_fields import (
 from deltalight.protocol.quality import Quality
 from deltalight.protocol.scene_fields import LightCount, PeakThreshold, ShownView, SmoothingTime, SplitKind
 
-SCHEMA_VERSION: Final = 8
+SCHEMA_VERSION: Final = 9
+OLDEST_SCHEMA_VERSION: Final = 8  # that is read: hosts can be upgraded one after another (SPEC.md, section 9)
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
 MAX_UNPACKED_BYTES = 256 * 1024 * 1024  # of all parts together; 24 compressed pictures could take 1.6 GB
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
 RESPONSE_SHAPE = (256, 3)
 MAX_OTHERS = len(get_args(ShownView)) - 1
+MAX_CAMERAS = 8  # of a room
 
 DType = Literal["uint8", "uint16", "float32"]
 Stream = Literal[
@@ -57,6 +59,7 @@ Stream = Literal[
     "pose",
     "lamps",
     "composite",
+    "cameras",
     "stats",
     "request",
     "reply",
@@ -91,7 +94,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[8] = SCHEMA_VERSION
+    schema_version: Annotated[int, Field(ge=OLDEST_SCHEMA_VERSION, le=SCHEMA_VERSION)] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count
@@ -316,6 +319,7 @@ class OtherPicture(BaseModel):
 class CompositeMessage(MessageBase):
     """The finished picture of the colour frame `frame_id` (sRGB, RGB order); parts: it, then those of `others`.
 
+    `node` is the render server; once a second camera has reported, it is the node whose frame the picture shows.
     `capture_ns` and the clock fields are those of that frame; `received_ns` and `rendered_ns` are by the server's
     clock. `scene_id` and `scene_revision` are those of the request that set the frame's scene. `camera`
     (`CameraModel.to_dict()` at the picture's size) and pose are those that it was rendered with. `quality` is that of
@@ -360,6 +364,39 @@ class CompositeMessage(MessageBase):
     def _scene_has_a_revision(self) -> Self:
         if self.scene_id is not None and self.scene_revision is None:
             raise ValueError("scene_revision must be given where scene_id is")
+        return self
+
+
+CameraStatus = Literal["live", "silent", "other_board", "other_time"]
+
+
+class CameraEntry(BaseModel):
+    """A camera of a room: the node that it belongs to, and its newest frame.
+
+    `received_ns` is by the server's clock. Only frames of those that are `live` are rendered; the others are silent,
+    see another board, or are not of the same time as those of the first.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    node: Name
+    status: CameraStatus
+    frame_id: Count
+    capture_ns: Nanoseconds
+    received_ns: Nanoseconds
+
+
+class CamerasMessage(MessageBase):
+    """The cameras of the render server `node`, in the order of their first frames."""
+
+    stream: Literal["cameras"] = "cameras"
+    frame_id: Count = 0
+    cameras: Annotated[tuple[CameraEntry, ...], Field(strict=False, max_length=MAX_CAMERAS)]
+
+    @model_validator(mode="after")
+    def _nodes_differ(self) -> Self:
+        if len({camera.node for camera in self.cameras}) < len(self.cameras):
+            raise ValueError("a node must come once")
         return self
 
 
@@ -435,6 +472,7 @@ Message = (
     | PoseMessage
     | LampsMessage
     | CompositeMessage
+    | CamerasMessage
     | StatsMessage
     | ControlRequest
     | ControlReply

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import structlog
@@ -15,8 +16,8 @@ from deltalight.protocol.envelope import EnvelopeError
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.message_fields import as_sentence
-from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest
-from deltalight.protocol.payloads import decode_control, encode_control
+from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, SCHEMA_VERSION, ControlReply, ControlRequest
+from deltalight.protocol.payloads import Control, decode_control, encode_control
 from deltalight.protocol.rights import CONTROL, Rights, refusal
 from deltalight.protocol.sockets import attach, open_socket
 
@@ -153,10 +154,12 @@ class ReplyServer:
             self._require_right(sender, request)
             earlier = self._memory.find(request)
         except DeltalightError as error:
-            return encode_control(self._reply(request.id, error=str(error)))
+            return encode_control(
+                _in_version(self._reply(request.id, error=str(error)), request.schema_version)
+            )
         if earlier is not None:
-            return encode_control(earlier)
-        reply, pieces = self._encoded(self._answered(request))
+            return encode_control(_in_version(earlier, request.schema_version))
+        reply, pieces = self._encoded(_in_version(self._answered(request), request.schema_version))
         self._memory.remember(request, reply, sum(len(piece) for piece in pieces))
         return pieces
 
@@ -170,8 +173,9 @@ class ReplyServer:
         try:
             return reply, encode_control(reply)
         except EnvelopeError as error:
-            refusal = self._reply(reply.id, error=f"the answer cannot be sent: {error}")
-            return refusal, encode_control(refusal)
+            told = self._reply(reply.id, error=f"the answer cannot be sent: {error}")
+            told = _in_version(told, reply.schema_version)
+            return told, encode_control(told)
 
     def _answered(self, request: ControlRequest) -> ControlReply:
         try:
@@ -179,7 +183,8 @@ class ReplyServer:
         except DeltalightError as error:
             return self._reply(request.id, error=str(error))
         except Exception as error:  # the thread must survive a fault of the handler
-            _log.exception("control handler failed", op=request.op)
+            with suppress(OSError):  # of which no open file may be left for the log
+                _log.exception("control handler failed", op=request.op)
             return self._reply(
                 request.id, error=f"{request.op} failed with {error!r:.300}: see the log of {self._node}"
             )
@@ -200,8 +205,9 @@ class ReplyServer:
 class RequestClient:
     """Sends requests to one `ReplyServer`, one at a time; threads may share it.
 
-    A request without an answer may be repeated unchanged: its id prevents a second execution. `keys` are required if
-    the endpoint leaves the host.
+    A request without an answer may be repeated unchanged: its id prevents a second execution. A server that reads
+    only an older schema version says so in that version, and is asked in it from then on. `keys` are required if the
+    endpoint leaves the host.
     """
 
     def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
@@ -211,6 +217,7 @@ class RequestClient:
         self._lock = threading.Lock()
         self._abandoned = threading.Event()
         self._socket: zmq.Socket[bytes] | None = None
+        self._version = SCHEMA_VERSION
         try:
             self._connected()
         except DeltalightError:
@@ -223,23 +230,32 @@ class RequestClient:
         Raises:
             DeltalightError: there was no answer within `timeout_s` seconds, or the server could not read the request.
         """
-        multipart = encode_control(control)
         deadline = time.monotonic() + timeout_s
         if not self._lock.acquire(timeout=timeout_s):
             raise DeltalightError(f"{self.endpoint} is still busy with another request: try again")
         try:
-            socket = self._connected()
-            if not _exchange(socket, multipart, deadline, self._abandoned):
-                trust = "" if self._keys is None else f" and trusts {self._keys.name}.key"
-                raise DeltalightError(
-                    f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs{trust}"
-                )
-            return _matched(control, socket.recv_multipart())
+            reply = self._asked(control, deadline, timeout_s)
+            if reply.id == UNREADABLE_ID and reply.schema_version < self._version:
+                self._version = reply.schema_version
+                reply = self._asked(control, deadline, timeout_s)
+            return _matched(control, reply)
         except DeltalightError:
             self._drop()
             raise
         finally:
             self._lock.release()
+
+    def _asked(self, control: ControlRequest, deadline: float, timeout_s: float) -> ControlReply:
+        """Send `control` in the server's version, and return what comes back."""
+        socket = self._connected()
+        if not _exchange(
+            socket, encode_control(_in_version(control, self._version)), deadline, self._abandoned
+        ):
+            trust = "" if self._keys is None else f" and trusts {self._keys.name}.key"
+            raise DeltalightError(
+                f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs{trust}"
+            )
+        return decode_control(socket.recv_multipart(), ControlReply)
 
     def abandon(self) -> None:
         """Wait for no answers any more: the server is gone; requests end soon, without one (any thread)."""
@@ -263,6 +279,7 @@ class RequestClient:
         if self._socket is not None:
             self._socket.close(0)
             self._socket = None
+        self._version = SCHEMA_VERSION  # whoever listens there next may speak a newer one
 
 
 def _exchange(
@@ -288,8 +305,12 @@ def _left_ms(deadline: float) -> int:
     return max(0, round((deadline - time.monotonic()) * 1000))
 
 
-def _matched(control: ControlRequest, multipart: list[bytes]) -> ControlReply:
-    reply = decode_control(multipart, ControlReply)
+def _in_version(message: Control, version: int) -> Control:
+    """Return a request or reply as an older version writes it: none has changed since the oldest that is read."""
+    return message.model_copy(update={"schema_version": version})
+
+
+def _matched(control: ControlRequest, reply: ControlReply) -> ControlReply:
     if reply.id == UNREADABLE_ID:
         raise EnvelopeError(f"the server cannot read the request: {reply.error}")
     if reply.id != control.id:

@@ -13,10 +13,10 @@ HIGH_WATER_MARK = 2  # frames; with the default of 1000 a slow consumer saw fram
 SEND_BUFFER_BYTES = 1 << 17
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 1000
-HEARTBEAT_MS = 1000
-# A receiver whose queue is full answers no heartbeat. If it is cut off for that, it may abort when it reconnects
-# (libzmq's issue 3937); no healthy receiver stalls for this long.
-HEARTBEAT_TIMEOUT_MS = 30_000
+# The kernel finds dead peers, after 30 s. Not ZeroMQ's heartbeats: libzmq 4.3.5 aborts the process (`!_io_error`) at
+# the next of them where a peer hung up while the queue of what it had sent was full.
+KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 4
+HANDSHAKE_MS = 10_000  # who says nothing for so long takes nobody's place
 
 
 def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
@@ -40,7 +40,7 @@ def open_socket(
     high_water_mark: int = HIGH_WATER_MARK,
     max_bytes: int = MAX_PART_BYTES,
 ) -> zmq.Socket[bytes]:
-    """Create a socket with queues of `high_water_mark` messages, pieces up to `max_bytes`, no linger, heartbeats."""
+    """Create a socket with queues of `high_water_mark` messages, pieces up to `max_bytes`, no linger, keepalive."""
     socket = context.socket(kind)
     socket.linger = 0
     if kind == zmq.PUB:
@@ -51,8 +51,11 @@ def open_socket(
     socket.maxmsgsize = max_bytes
     socket.reconnect_ivl = RECONNECT_MS
     socket.reconnect_ivl_max = RECONNECT_MAX_MS
-    socket.heartbeat_ivl = HEARTBEAT_MS
-    socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
+    socket.handshake_ivl = HANDSHAKE_MS
+    socket.tcp_keepalive = 1
+    socket.tcp_keepalive_idle = KEEPALIVE_IDLE_S
+    socket.tcp_keepalive_intvl = KEEPALIVE_INTERVAL_S
+    socket.tcp_keepalive_cnt = KEEPALIVE_PROBES
     return socket
 
 

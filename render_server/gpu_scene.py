@@ -1,5 +1,6 @@
 """Triangles on the GPU as stages receive them: those of the real scene and of the virtual objects."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,15 +24,25 @@ class ObjectExtent:
     """Where virtual objects are throughout their animations.
 
     `points` enclose them (world, m). `upright` holds the least and greatest coordinates as if every object was turned
-    back about its own middle: what is placed by them stands still while objects turn.
+    back about its own middle: what is placed by them stands still while objects turn. `parts`: each object alone.
     """
 
     points: Float64[np.ndarray, "n 3"]
     upright: Float64[np.ndarray, "2 3"]
+    parts: tuple["ObjectExtent", ...] = ()
+
+    @classmethod
+    def around(cls, parts: Sequence["ObjectExtent"]) -> "ObjectExtent":
+        """Returns the extent of several objects."""
+        points = np.concatenate([each.points for each in parts])
+        upright = np.stack(short_axis.bounds(np.concatenate([each.upright for each in parts])))
+        return cls(points, upright, tuple(parts))
 
     def equals(self, other: "ObjectExtent") -> bool:
         """Whether both are the same."""
-        return np.array_equal(self.points, other.points) and np.array_equal(self.upright, other.upright)
+        same = np.array_equal(self.points, other.points) and np.array_equal(self.upright, other.upright)
+        parts = zip(self.parts, other.parts, strict=False)
+        return same and len(self.parts) == len(other.parts) and all(a.equals(b) for a, b in parts)
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
@@ -69,7 +80,6 @@ class GeometryState:
 
     `corners` are for the voxeliser (`triangle_corners` in passes/gbuffer.py), `points` enclose the set.
     `swept_points` enclose it at all times of its animations: what is fitted around them stands still while it moves.
-    `upright_points` enclose the objects at all times as they would stand if each was turned back about its middle.
     """
 
     buffers: MeshBuffers
@@ -81,7 +91,7 @@ class GeometryState:
     )
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
-    upright_points: Float64[np.ndarray, "n 3"] | None = None  # of virtual objects
+    extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
     fronts_of: DepthViews | None = None  # what is solid as cameras see it: backs are not in it
 
     def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
@@ -121,6 +131,6 @@ class GeometryState:
     @property
     def extent(self) -> ObjectExtent:
         """Where the set is throughout its animations, and as its objects turn."""
-        points = self.lasting_points
-        upright = points if self.upright_points is None else self.upright_points
-        return ObjectExtent(points, np.stack(short_axis.bounds(upright)))
+        if self.extents:
+            return ObjectExtent.around(self.extents)
+        return ObjectExtent(self.lasting_points, np.stack(short_axis.bounds(self.lasting_points)))

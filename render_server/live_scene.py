@@ -23,6 +23,7 @@ from deltalight.render_server.frame_graph import (
     ShownBuffers,
     frame_graphs,
 )
+from deltalight.render_server.freed_memory import give_back_freed_memory
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
@@ -179,6 +180,8 @@ class LiveScene:
         except BaseException:
             self._budget = before
             raise
+        if scene.method != old.method and self._gpu.is_software:
+            give_back_freed_memory()
         self._precomputed.stop_waiting()
 
     def _new_budget(self, scene: SceneDocument) -> FrameBudget:

@@ -24,12 +24,18 @@ from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.live_scene import LiveScene, RelitFrame
 from deltalight.render_server.passes.composite import Composite, Picture
-from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
+from deltalight.render_server.picking import SHOWN_FRACTION, Pick, raster_texels
 from deltalight.render_server.post_effects.bloom import bloomed
 from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
 from deltalight.render_server.room_mesh import RoomMesh, room_mesh
 from deltalight.render_server.scene.depth_mesh import depth_mesh
-from deltalight.render_server.started_frame import CameraState, FrameSource, PassTimes, StartedView
+from deltalight.render_server.started_frame import (
+    CameraFrame,
+    CameraState,
+    FrameSource,
+    PassTimes,
+    StartedView,
+)
 from deltalight.render_server.view import CameraView, PosedFrame, output_size, resized_frame
 
 MEMORY_RETRY_S = 10.0  # after which a scene is built anew that the GPU had no memory for
@@ -120,7 +126,8 @@ class SceneRenderer:
         self._live = self._build(scene, waits=waits)
         self._full: tuple[GpuMemoryError, float] | None = None  # and when to try again
         self._readback = AsyncReadback(gpu)
-        self._cameras: list[CameraState] = [CameraState()]
+        self._cameras: dict[str, CameraState] = {}
+        self._newest: tuple[CameraState, ...] = ()  # the cameras of the newest pictures, in their order
         self.scene = scene
 
     def _build(self, scene: SceneDocument, *, waits: bool) -> LiveScene:
@@ -140,7 +147,7 @@ class SceneRenderer:
 
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
-        self._cameras = [CameraState()]
+        self._cameras, self._newest = {}, ()
         self._live.forget_frames()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
@@ -178,23 +185,43 @@ class SceneRenderer:
         whole: bool = False,
         others: Sequence[ShownView] = (),
     ) -> list[PendingComposite]:
-        """Starts a frame of each camera in one room, taken at one moment; otherwise as `submit`.
+        """Starts a frame of each camera in one room, taken at one moment (`submit_cameras`).
 
-        The cameras share one real scene and its light, so what one of them sees lights what the others show. Give
-        them in the same order each time: each is compared with its own earlier frames. Where a camera has lost its
-        pose, its picture stays as it is, and the room holds what it saw before. The first camera counts for
-        animations, boards on objects, and estimates of light. Times are those of all pictures together.
+        Give them in the same order each time: each is compared with its own earlier frames.
         """
         if not frames:
             raise DeltalightError("No frames were given; give one of each camera.")
+        if len(frames) != len(self._cameras):
+            self._cameras = {}
+        return self.submit_cameras(
+            CameraFrame.numbered(frames), with_linear=with_linear, whole=whole, others=others
+        )
+
+    def submit_cameras(
+        self,
+        taken: Sequence[CameraFrame],
+        *,
+        with_linear: bool = False,
+        whole: bool = False,
+        others: Sequence[ShownView] = (),
+    ) -> list[PendingComposite]:
+        """Starts the pictures of frames that cameras in one room took at one moment; otherwise as `submit`.
+
+        The cameras share one real scene and its light, so what one of them sees lights what the others show. Where a
+        camera has lost its pose, its picture stays as it is, and the room holds what it saw before; of one that is
+        left out, it holds nothing. The first camera counts for animations, boards on objects, and estimates of light.
+        Times are those of all pictures together.
+        """
         self._find_faults()
         started_s = time.perf_counter()
         with_linear = with_linear or self._with_linear
-        if len(frames) != len(self._cameras):
-            self._cameras = [CameraState() for _ in frames]
-        sized = [self._resized(camera, frame) for camera, frame in zip(self._cameras, frames, strict=True)]
-        sources = self._sources(sized, whole=whole or with_linear or self.scene.output.has_bloom)
+        self._begin(taken)
+        sized = [self._resized(camera, each.frame) for camera, each in zip(self._newest, taken, strict=True)]
+        all_sources = self._sources(sized, whole=whole or with_linear or self.scene.output.has_bloom)
+        sources = [source for source, each in zip(all_sources, taken, strict=True) if each.is_shown]
         started = [self._start_all(source, others, with_linear=with_linear) for source in sources]
+        for source in all_sources:
+            source.note_shown((self.scene.output.view, *others), self._live.model)
         times = self._end_frame(sources)
         submitted_ms = 1e3 * (time.perf_counter() - started_s)
 
@@ -215,15 +242,19 @@ class SceneRenderer:
             for source, views in zip(sources, started, strict=True)
         ]
 
+    def _begin(self, taken: Sequence[CameraFrame]) -> None:
+        """Provides for these cameras; the others keep their places, and nothing that they saw."""
+        self._newest = tuple(self._cameras.setdefault(each.camera, CameraState()) for each in taken)
+        for camera in self._cameras.values():
+            if camera not in self._newest:
+                camera.posed = camera.sized = None
+
     def _start_all(
         self, source: FrameSource, others: Sequence[ShownView], *, with_linear: bool
     ) -> list[StartedView]:
-        """Starts a frame in the document's view and the others, and notes what it shows."""
+        """Starts a frame in the document's view and the others."""
         main = self._start(source, self.scene.output.view, with_linear=with_linear)
-        views = [main, *(self._start_other(source, view) for view in others)]
-        cameras = next((each.seen for each in views if each.seen is not None), None)
-        source.camera.shown = ShownFrame(source.frame, cameras, source.buffers, self._live.model)
-        return views
+        return [main, *(self._start_other(source, view) for view in others)]
 
     def _end_frame(self, sources: Sequence[FrameSource]) -> PassTimes:
         if self.graph is None or all(source.relit is None for source in sources):
@@ -243,8 +274,8 @@ class SceneRenderer:
             self._gpu.check()
         except GpuMemoryError as fault:
             self._full = fault, time.monotonic() + MEMORY_RETRY_S
-            for camera in self._cameras:
-                camera.shown = camera.relit = None
+            for camera in self._cameras.values():
+                camera.forget_picture()
         if self._full is not None:
             self._rebuild(*self._full)
         if sum(self._gpu.errors.values()) > known:
@@ -263,16 +294,17 @@ class SceneRenderer:
 
     def _sources(self, frames: Sequence[ViewFrame], *, whole: bool) -> list[FrameSource]:
         """Relights the frames together; without a pose there is nothing but a camera's picture."""
-        for camera, frame in zip(self._cameras, frames, strict=True):
-            camera.shown = camera.relit = None
+        for camera in self._cameras.values():
+            camera.forget_picture()
+        for camera, frame in zip(self._newest, frames, strict=True):
             if frame.pose is not None:
                 camera.posed = PosedFrame(frame, CameraView(frame.camera, frame.pose.world_from_camera))
-        known = [camera for camera in self._cameras if camera.posed is not None]
+        known = [camera for camera in self._newest if camera.posed is not None]
         if any(frame.pose is not None for frame in frames):
             relit = self._live.relight([each.posed for each in known if each.posed is not None], whole=whole)
             for camera, found in zip(known, relit, strict=False):
                 camera.relit = found
-        return [self._source(camera, frame) for camera, frame in zip(self._cameras, frames, strict=True)]
+        return [self._source(camera, frame) for camera, frame in zip(self._newest, frames, strict=True)]
 
     def _source(self, camera: CameraState, frame: ViewFrame) -> FrameSource:
         if frame.pose is None or camera.posed is None:
@@ -289,8 +321,8 @@ class SceneRenderer:
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size; the same object for the same frame."""
-        holder = next((each for each in self._cameras if each.holds(frame)), self._cameras[0])
-        return self._resized(holder, frame)
+        holders = (each for each in self._newest if each.holds(frame))
+        return self._resized(next(holders, self._newest[0] if self._newest else CameraState()), frame)
 
     def _resized(self, camera: CameraState, frame: ViewFrame) -> ViewFrame:
         """Returns a camera's frame at the composite's size; the same object for the same frame."""
@@ -304,16 +336,19 @@ class SceneRenderer:
         camera.sized = frame, resized_frame(frame, *size)
         return camera.sized[1]
 
-    def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
-        """Picks what the newest picture (the first camera's) shows at a pixel, looking through the object `ignore`.
+    def pick(self, x: float, y: float, ignore: str | None = None, camera: str | None = None) -> Pick:
+        """Picks what a camera's newest picture shows at a pixel, looking through the object `ignore`.
+
+        `camera`: None = the first one.
 
         Raises:
-            DeltalightError: there is no picture yet, it has no pose, or the pixel lies outside.
+            DeltalightError: there is no picture of it, it has no pose, or the pixel lies outside.
         """
-        shown = self._cameras[0].shown
-        if shown is None:
+        first = self._newest[0] if self._newest else None
+        state = first if camera is None else self._cameras.get(camera)
+        if state is None or state.shown is None:
             raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
-        return shown.pick(x, y, ignore)
+        return state.shown.pick(x, y, ignore)
 
     def room(self) -> RoomMesh:
         """Returns the real scene as last built, else of the newest frame's depth, with the newest picture on it.
@@ -321,7 +356,7 @@ class SceneRenderer:
         Raises:
             DeltalightError: there is no picture of a known pose, or no surface in it.
         """
-        shown = self._cameras[0].shown
+        shown = self._newest[0].shown if self._newest else None
         if shown is None or shown.frame.pose is None:
             raise DeltalightError("The camera's place is not known yet; ask again when the board is in view.")
         view = CameraView(shown.frame.camera, shown.frame.pose.world_from_camera)
@@ -339,7 +374,7 @@ class SceneRenderer:
         Raises:
             DeltalightError: nothing was rendered yet.
         """
-        camera = self._cameras[number]
+        camera = self._newest[number] if number < len(self._newest) else CameraState()
         if camera.shown is None:
             raise DeltalightError("Nothing was rendered yet; render a frame first.")
         frame = camera.shown.frame

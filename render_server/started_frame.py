@@ -1,6 +1,6 @@
 """What a renderer keeps of each camera, and its frames whose pictures are on their way from the GPU."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from deltalight.render_server.frame_graph import ShownBuffers
 from deltalight.render_server.live_scene import RelitFrame
 from deltalight.render_server.picking import ShownFrame
 from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import CameraView, PosedFrame
 
 
@@ -21,6 +22,20 @@ class PassTimes(NamedTuple):
 
     ran: dict[str, float]
     reused: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFrame:
+    """A frame of one of a room's cameras; without `is_shown` it lights the room, and no picture of it is made."""
+
+    camera: str
+    frame: ViewFrame
+    is_shown: bool = True
+
+    @classmethod
+    def numbered(cls, frames: Sequence[ViewFrame]) -> "list[CameraFrame]":
+        """Returns frames of cameras that have no names."""
+        return [cls(str(number), frame) for number, frame in enumerate(frames)]
 
 
 @dataclass(eq=False)
@@ -35,6 +50,10 @@ class CameraState:
     sized: tuple[ViewFrame, ViewFrame] | None = None
     shown: ShownFrame | None = None
     relit: RelitFrame | None = None
+
+    def forget_picture(self) -> None:
+        """Forgets the newest picture, whose buffers another one takes."""
+        self.shown = self.relit = None
 
     def holds(self, frame: ViewFrame) -> bool:
         """Whether the newest frame that came is this one."""
@@ -56,6 +75,11 @@ class FrameSource:
     def is_lit(self) -> bool:
         """Whether there are lights to show."""
         return bool(self.lights)
+
+    def note_shown(self, views: Sequence[ShownView], model: Sequence[TriangleMesh]) -> None:
+        """Notes what the camera's newest pictures show; `model`: the real scene's meshes, if given."""
+        seen = next((seen for seen in map(self.seen_in, views) if seen is not None), None)
+        self.camera.shown = ShownFrame(self.frame, seen, self.buffers, model)
 
     def seen_in(self, view: ShownView) -> CameraView | None:
         """Returns the camera's view; None if the picture is not the camera's, or there is no pose."""

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from deltalight.protocol import short_axis
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Animation, AnyMaterial, SceneObject
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent, PlacedObject
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip
@@ -164,7 +165,10 @@ class VirtualObjects:
             materials,
             objects=tuple(objects),
             swept_points=np.vstack(swept) if any(item.moves for item in objects) else None,
-            upright_points=np.vstack([self._upright(item) for item in self._shown]),
+            extents=tuple(
+                ObjectExtent(lasting, np.stack(short_axis.bounds(self._upright(item))))
+                for item, lasting in zip(self._shown, swept, strict=True)
+            ),
         )
 
     def _material_table(self, merged: GpuMesh) -> MaterialTable:

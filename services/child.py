@@ -10,13 +10,15 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
-from deltalight.services.warm_spare import spare_environment, use_spare
+from deltalight.services.warm_spare import PREPARED, spare_environment, use_spare
 
+NODE, SERVER, WEB = "sensor node", "render server", "web process"  # names of a host's processes
 SPARE_AFTER_S = 4.0  # of a process's life: most have started by then
 STOP_TIMEOUT_S = 1.5  # then SIGKILL; all are gone within 2 s
 KEPT_LINES = 20
@@ -142,7 +144,19 @@ def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subproces
     return open_process(arguments, subprocess.PIPE, spare_environment(prepared))
 
 
-def take_spare(spare: "subprocess.Popen[str] | None", spec: ChildSpec) -> "subprocess.Popen[str] | None":
+@contextmanager
+def early_spares(commands: Mapping[str, str]) -> Iterator[dict[str, subprocess.Popen[str]]]:
+    """Start a spare of each command, by the name of its process, for a `Supervisor`; end those that nobody took."""
+    spares: dict[str, subprocess.Popen[str]] = {}
+    try:
+        for name, command in commands.items():
+            spares[name] = open_spare(ChildSpec.deltalight(name, command).arguments, PREPARED[command])
+        yield spares
+    finally:
+        end_all([spare for spare in spares.values() if spare.stdin is not None and not spare.stdin.closed])
+
+
+def take_spare(spare: subprocess.Popen[str] | None, spec: ChildSpec) -> subprocess.Popen[str] | None:
     """Tell a spare to go on as a deltalight command; None where there is no spare, or it died."""
     words = spec.arguments[len(ChildSpec.deltalight("").arguments) :]
     return spare if spare is not None and use_spare(spare, words) else None

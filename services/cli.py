@@ -42,6 +42,7 @@ from deltalight.services.commands.stream import stream
 from deltalight.services.commands.up import up
 from deltalight.services.commands.virtual_camera import virtual_camera
 from deltalight.services.logs import configure_logging
+from deltalight.services.open_files import allow_many_connections
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.signals import Terminated, raise_signals
 from deltalight.services.warm_spare import wait_if_spare
@@ -130,6 +131,7 @@ def main() -> None:
     """Run the command line of this process and exit with its code."""
     raise_signals()
     end_with_supervisor()
+    allow_many_connections()
     limit_blas_threads(sys.argv[1:])
     wait_if_spare()
     sys.exit(run(sys.argv[1:]))

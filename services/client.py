@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, cast
+from urllib.parse import urlencode
 
 import httpx
 import numpy as np
@@ -277,16 +278,37 @@ class Client:
         """Return rates, drops and delays of the processes."""
         return cast(Json, self.request("GET", "/state"))
 
+    def cameras(self) -> list[str]:
+        """Return the names of the cameras whose pictures are made, the first one's first."""
+        return [str(each["name"]) for each in self.state()["cameras"]]
+
+    def pick(self, x: float, y: float, *, ignore: str | None = None, camera: str | None = None) -> Json:
+        """Return what a pixel of a camera's newest picture shows, looking through the object `ignore`.
+
+        `camera`: None = the first one.
+        """
+        body = {"x": x, "y": y, "ignore": ignore, "camera": camera}
+        return cast(Json, self.request("POST", "/live/pick", json=body))
+
     def snapshot(
-        self, folder: Path, pictures: Sequence[Mapping[str, Any]] | None = None, *, exr: bool = False
+        self,
+        folder: Path,
+        pictures: Sequence[Mapping[str, Any]] | None = None,
+        *,
+        exr: bool = False,
+        camera: str | None = None,
     ) -> list[Path]:
         """Render one frame in several ways, `{name, view, method?}` each, and save the pictures in `folder`.
+
+        `camera`: whose frame; None = the first one's.
 
         Raises:
             ApiError: no picture could be rendered.
             DeltalightError: a picture cannot be written, or the service does not answer.
         """
-        body = {"exr": exr, **({} if pictures is None else {"pictures": [dict(each) for each in pictures]})}
+        body: Json = {"exr": exr} | ({} if camera is None else {"camera": camera})
+        if pictures is not None:
+            body["pictures"] = [dict(each) for each in pictures]
         made = self.request("POST", "/snapshots", json=body)
         folder.mkdir(parents=True, exist_ok=True)
         files = []
@@ -321,13 +343,15 @@ class Client:
                 for chunk in response.iter_bytes():
                     file.write(chunk)
 
-    def frames(self, view: ShownView | None = None) -> Iterator[LiveFrame]:
+    def frames(self, view: ShownView | None = None, *, camera: str | None = None) -> Iterator[LiveFrame]:
         """Yield composites as they arrive, always the newest; a slow caller misses some.
 
         `view`: what to look at; None = the scene's own. Until the renderer shows it, frames are in the scene's own
-        (`frame.header.view`).
+        (`frame.header.view`). `camera`: whose pictures, by its node's name; None = the first one's.
         """
-        with self._socket("/live" if view is None else f"/live?view={view}") as socket:
+        wanted = {"view": view, "camera": camera}
+        query = urlencode({key: value for key, value in wanted.items() if value is not None})
+        with self._socket(f"/live?{query}" if query else "/live") as socket:
             for message in socket:
                 if isinstance(message, bytes):
                     yield LiveFrame(*unpack(message))

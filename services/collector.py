@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from deltalight.protocol.clock import CLOCK_OP
 from deltalight.protocol.codecs import decode_color
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
@@ -25,8 +24,6 @@ from deltalight.protocol.request import RequestClient
 from deltalight.services.live_message import age_ms
 
 CONTROL_TIMEOUT_S = 10.0
-ALIVE_TIMEOUT_S = 1.0  # a separate thread of the render server answers, whatever the renderer does
-REPORT_INTERVAL_S = 3.0  # it reports each second, but not while it renders
 SHEET_PICTURES = 20
 SHEET_COLUMNS = 5
 SHEET_WIDTH = 256
@@ -44,7 +41,6 @@ class CompositeCollector:
         self.arrivals_s: list[float] = []
         self._out = out
         self._report: StatsMessage | None = None
-        self._reported_s = -math.inf
         self._began_s = time.monotonic()
         self._receiver = Receiver([composite_endpoint], ["composite", "stats"])
         self._client = RequestClient(control_endpoint)
@@ -69,16 +65,10 @@ class CompositeCollector:
         for multipart in (self._receiver.latest(timeout_s) or {}).values():
             message, parts = decode(multipart)
             if isinstance(message, StatsMessage):
-                self._report, self._reported_s = message, time.monotonic()
+                self._report = message
             elif isinstance(message, CompositeMessage) and self.count < limit:
                 self._add(message, parts)
         return self.count > before
-
-    def is_rendering(self) -> bool:
-        """Whether the render server is at work on a frame: it answers, and does not report meanwhile."""
-        if time.monotonic() - self._reported_s < REPORT_INTERVAL_S:
-            return False
-        return self._ask(CLOCK_OP, ALIVE_TIMEOUT_S) is not None
 
     def renderer_name(self) -> str:
         """The OpenGL renderer, as the render server reported it, or that it does not answer."""

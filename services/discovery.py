@@ -7,10 +7,11 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from deltalight.protocol.documents import nearest
+from deltalight.protocol.envelope import is_readable_version
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import TRUST_HINT, KeySettings, key_folder, trusted_keys
 from deltalight.protocol.message_fields import NAME_PATTERN
-from deltalight.protocol.messages import MESSAGE_TYPES, SCHEMA_VERSION
+from deltalight.protocol.messages import MESSAGE_TYPES, OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
 from deltalight.sensor_node.announce import SERVICE_TYPE
 
 if TYPE_CHECKING:
@@ -43,10 +44,10 @@ class FoundNode:
         Raises:
             DeltalightError: the node uses another version, has no keys, or its key is not trusted.
         """
-        if self.schema_version != SCHEMA_VERSION:
+        if not is_readable_version(self.schema_version):
             raise DeltalightError(
-                f"node {self.name} speaks version {self.schema_version} and this program {SCHEMA_VERSION}: install"
-                " the same on both."
+                f"node {self.name} speaks version {self.schema_version} and this program reads versions "
+                f"{OLDEST_SCHEMA_VERSION} to {SCHEMA_VERSION}: upgrade the older one."
             )
         if not self.key:
             raise DeltalightError(

@@ -151,6 +151,8 @@ class FoxgloveBridge:
     def _add(self, message: Message, parts: Sequence[memoryview]) -> None:
         if not isinstance(message, CompositeMessage):
             self._assembler.add(message, parts)
+        elif message.node in self._assembler.foreign:  # another camera's
+            return
         elif (picture := relit_picture(message, parts)) is not None:
             now_ns = message.capture_ns
             self.server.publish(COMPOSITE_TOPIC, composite_message(picture, now_ns), now_ns)

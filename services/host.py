@@ -10,13 +10,8 @@ from deltalight.protocol.keys import Keys, KeySettings
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.protocol.source import Source
 from deltalight.services import ports
-from deltalight.services.child import ChildSpec, Watch
-
-PREPARED = {  # by spares of a command
-    "node": ("deltalight.services.node_process", "pydantic_settings"),
-    "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings"),
-    "api": ("deltalight.services.api.serve", "pydantic_settings"),
-}
+from deltalight.services.child import NODE, SERVER, WEB, ChildSpec, Watch
+from deltalight.services.warm_spare import PREPARED
 
 
 @dataclass(frozen=True)
@@ -56,7 +51,7 @@ class HostCommands:
     def web(self, data: Path, page_port: int, *more: str) -> ChildSpec:
         """Return a web process."""
         options = ("--data", str(data.absolute()), *more, "--port", str(page_port))
-        return self.child("web process", "api", *options)
+        return self.child(WEB, "api", *options)
 
     def keys(self, endpoints: Sequence[str]) -> Keys | None:
         """Return the keys that connections to these endpoints take.
@@ -118,13 +113,11 @@ class HostPlan:
 
     def _node(self, source: str) -> ChildSpec:
         publish, clock = ports.endpoint(self.node_port), ports.endpoint(self.control_port)
-        return self._commands.node("sensor node", source, publish, clock, *(["--loop"] if self.loop else []))
+        return self._commands.node(NODE, source, publish, clock, *(["--loop"] if self.loop else []))
 
     def _server(self) -> ChildSpec:
         publish, control = ports.endpoint(self.composite_port), ports.endpoint(self.control_port)
-        spec = self._commands.server(
-            "render server", self.session_file, publish, control, self.device, *self._frames
-        )
+        spec = self._commands.server(SERVER, self.session_file, publish, control, self.device, *self._frames)
         return replace(spec, watch=self._watchdog)
 
     @property

@@ -59,6 +59,9 @@ class PictureHeader(BaseModel):
     lights: list[dict[str, Any]] = Field(description="What it was lit with.")
     camera: LiveCamera = Field(description="What projects points of the camera's space onto this picture.")
     world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null without a pose.")
+    node: str | None = Field(
+        None, description="The node whose camera it is of, where the room has several; else null."
+    )
     view: ShownView = Field(
         description="What it shows: the view that was asked for, or until there is a picture of it the scene's own."
     )
@@ -86,8 +89,9 @@ class PictureHeader(BaseModel):
         number: int,
         frames_per_s: float | None,
         renderer: str,
+        node: str | None = None,
     ) -> Self:
-        """Describe a composite.
+        """Describe a composite; `node` names its camera, where there are several.
 
         Raises:
             DeltalightError: its camera is invalid.
@@ -99,6 +103,7 @@ class PictureHeader(BaseModel):
             "scene": None if message.scene_id is None else scene,
             "render_ms": (message.rendered_ns - message.received_ns) / 1e6,
             "renderer": renderer,
+            "node": node,
         }
         return validate(cls, {**dict(message), **own}, "the composite")
 

@@ -2,6 +2,8 @@
 
 import random
 import socket
+from collections import deque
+from collections.abc import Container
 
 from deltalight.protocol.errors import DeltalightError
 
@@ -12,6 +14,7 @@ CONTROL_PORT = 5603  # the render server answers
 ROOMS_PORT = 5604  # the directory of rooms answers
 PAGE_PORT = 8000  # the web process serves dashboard, REST API and live video
 PRIVATE_PORTS = range(20_000, 32_000)  # below the kernel's range for outgoing connections
+REMEMBERED_PORTS = len(PRIVATE_PORTS) // 2  # of those that were used: a room may be placed without end
 
 
 def endpoint(port: int) -> str:
@@ -52,15 +55,20 @@ def require_free(port: int, purpose: str, option: str) -> None:
         )
 
 
-def private_ports(count: int) -> list[int]:
-    """Return free ports for one run's own processes, chosen so that two runs rarely collide.
+def used_ports() -> deque[int]:
+    """Return an empty memory of the ports that were used last."""
+    return deque(maxlen=REMEMBERED_PORTS)
+
+
+def private_ports(count: int, avoid: Container[int] = ()) -> list[int]:
+    """Return free ports for one run's own processes, chosen so that two runs rarely collide, and none to `avoid`.
 
     Raises:
         DeltalightError: nearly all ports of the range are in use.
     """
     found: list[int] = []
     for port in random.sample(PRIVATE_PORTS, len(PRIVATE_PORTS)):
-        if is_free(port):
+        if port not in avoid and is_free(port):
             found.append(port)
         if len(found) == count:
             return found

@@ -190,7 +190,8 @@ class Recorder:
 
     def _add(self, message: Message, parts: Sequence[memoryview]) -> None:
         if isinstance(message, CompositeMessage):
-            self._relit.add_picture(message, parts)
+            if message.node not in self._assembler.foreign:  # another camera's
+                self._relit.add_picture(message, parts)
         elif not isinstance(message, StatsMessage):
             self._assembler.add(message, parts)
         elif message.node == self._assembler.node:

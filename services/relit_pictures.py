@@ -28,6 +28,11 @@ def relit_picture(message: CompositeMessage, parts: Sequence[memoryview]) -> byt
     return encode_png(decode_color(part, message.encoding, message.shape))
 
 
+def composite_topic(camera: str | None) -> str:
+    """Return what to subscribe to: the pictures of one of several cameras, or None = all that come."""
+    return "composite" if camera is None else f"composite.{camera}"
+
+
 def newest_picture(receiver: Receiver, timeout_s: float) -> UInt8[np.ndarray, "h w 3"] | None:
     """Return the newest relit picture (sRGB) that comes within this time."""
     for multipart in (receiver.latest(timeout_s) or {}).values():

@@ -10,12 +10,14 @@ import json
 import struct
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from typing import BinaryIO
 
 from deltalight.services.h264 import TICKS_PER_S
 from deltalight.services.parent_death_signal import end_with_supervisor
+from deltalight.services.srt import SrtAddress, SrtCaller
 
 PACKET = struct.Struct("<QBI")  # time in ticks, whether it is a key, bytes
 RATE = 30  # that is announced; each picture has its own time
@@ -42,7 +44,10 @@ def send(spec: StreamSpec, packets: Iterator[tuple[int, bool, bytes]], answers: 
 
     ticks = Fraction(1, TICKS_PER_S)
     try:
-        with av.open(spec.url, "w", format=spec.container, options=spec.options) as container:
+        with (
+            _opened(spec.url) as target,
+            av.open(target, "w", format=spec.container, options=spec.options) as container,
+        ):
             stream = container.add_mux_stream(
                 "h264", rate=RATE, width=spec.width, height=spec.height, time_base=ticks
             )
@@ -55,6 +60,16 @@ def send(spec: StreamSpec, packets: Iterator[tuple[int, bool, bytes]], answers: 
                 _answer(answers, "")
     except (OSError, ValueError, av.FFmpegError) as fault:
         _answer(answers, getattr(fault, "strerror", None) or str(fault))
+
+
+@contextmanager
+def _opened(url: str) -> Iterator[str | SrtCaller]:
+    """Yield what PyAV writes to: an address of FFmpeg's, or a connection by SRT, which it has not."""
+    if not url.startswith("srt:"):
+        yield url
+        return
+    with SrtCaller(SrtAddress.parse(url)) as caller:
+        yield caller
 
 
 def _answer(answers: BinaryIO, text: str) -> None:

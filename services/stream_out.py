@@ -1,4 +1,4 @@
-"""The relit picture to a media server (RTSP, RTMP; extra `video`), which serves crowds from there."""
+"""The relit picture to a media server (RTSP, RTMP, SRT; extra `video`), which serves crowds from there."""
 
 import os
 import select
@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.h264 import TICKS_PER_S, AccessUnit, H264Encoder
 from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
+from deltalight.services.srt import SrtAddress
 from deltalight.services.stream_child import PACKET, StreamSpec
 
 KEY_INTERVAL_S = 2.0  # who joins at the server waits so long; media servers begin segments with keys
@@ -30,10 +31,8 @@ CONTAINERS: dict[str, tuple[str, dict[str, str]]] = {
     "rtsps": RTSP,
     "rtmp": ("flv", {}),
     "rtmps": ("flv", {}),
+    "srt": ("mpegts", {"flush_packets": "1"}),
 }
-NO_SRT = (
-    "PyAV's FFmpeg has no SRT; stream to a media server by rtsp:// or rtmp://, which can give SRT from there."
-)
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
@@ -64,8 +63,6 @@ class Target:
         except ValueError:
             host, port = None, None
         else:
-            if parts.scheme == "srt":
-                raise DeltalightError(NO_SRT)
             if parts.scheme not in CONTAINERS:
                 host = None
         if host is None or not url.isprintable() or " " in url:
@@ -73,6 +70,8 @@ class Target:
             raise DeltalightError(
                 f"--to takes an address such as rtsp://HOST:8554/NAME; it begins with one of {schemes}."
             )
+        if parts.scheme == "srt":
+            SrtAddress.parse(url)
         place = f"[{host}]" if ":" in host else host
         shown = f"{parts.scheme}://{place}" + (f":{port}" if port else "")
         return cls(url, shown, *CONTAINERS[parts.scheme])

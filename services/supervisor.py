@@ -1,13 +1,14 @@
 """Keeps the processes of one host alive: restarts what dies or hangs, gives up after too many, ends all together."""
 
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Self
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.child import Child, ChildSpec, end_all
+from deltalight.services.child import Child, ChildSpec, end_all, take_spare
 
 POLL_INTERVAL_S = 0.1
 RESTART_DELAY_S = 0.2
@@ -20,6 +21,8 @@ WRONG_INPUT_EXIT_CODE = 2
 class Supervisor:
     """Starts children, restarts those that die and ends all of them; a context manager.
 
+    `spares` (`child.early_spares`) become the first processes of the children of these names.
+
     Raises from `poll`:
         DeltalightError: a child refused its input (exit code 2; its own sentence is quoted), or died more
             than `maximum_restarts` times within a minute.
@@ -31,15 +34,17 @@ class Supervisor:
         *,
         forward: Callable[[str], None] | None = None,
         maximum_restarts: int = MAXIMUM_RESTARTS,
+        spares: Mapping[str, subprocess.Popen[str]] | None = None,
     ) -> None:
         write = forward or (lambda line: print(line, file=sys.stderr, flush=True))
         self._children = [Child(spec, write) for spec in specs]
         self._maximum_restarts = maximum_restarts
+        self._spares = spares or {}
 
     def __enter__(self) -> Self:
         try:
             for child in self._children:
-                child.start()
+                child.start(take_spare(self._spares.get(child.spec.name), child.spec))
         except BaseException:
             self.stop()
             raise

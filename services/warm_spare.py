@@ -7,8 +7,15 @@ import subprocess
 import sys
 from collections.abc import Sequence
 
+from deltalight.services.uncollected import uncollected
+
 SPARE_VARIABLE = "DELTALIGHT_SPARE_PREPARES"
 GO = b"1"
+PREPARED = {  # by spares of a command
+    "node": ("deltalight.services.node_process", "pydantic_settings"),
+    "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings"),
+    "api": ("deltalight.services.api.serve", "pydantic_settings"),
+}
 
 
 def spare_environment(prepared: tuple[str, ...]) -> dict[str, str]:
@@ -43,10 +50,8 @@ def wait_if_spare() -> None:
     prepared = os.environ.pop(SPARE_VARIABLE, None)
     if prepared is None:
         return
-    for name in filter(None, prepared.split(",")):
-        found = pkgutil.resolve_name(name)
-        if callable(found):
-            found()
+    with uncollected():
+        _prepare([name for name in prepared.split(",") if name])
     told = _read_all(sys.stdin.fileno())
     if not told.startswith(GO):
         sys.exit(0)
@@ -55,6 +60,13 @@ def wait_if_spare() -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, sys.stdin.fileno())
     os.close(nothing)
+
+
+def _prepare(names: Sequence[str]) -> None:
+    for name in names:
+        found = pkgutil.resolve_name(name)
+        if callable(found):
+            found()
 
 
 def _read_all(stdin: int) -> bytes:

@@ -105,9 +105,8 @@ class Watchdog:
         keys: Keys | None = None,
         patience: Patience | None = None,
     ) -> None:
-        self._process_id = process_id
         self._heartbeat = Heartbeat(patience or Patience(), time.monotonic())
-        self._worked = (0.0, time.monotonic())  # processor time, and when it was that
+        self._use = ProcessorUse(process_id)
         self._client = RequestClient(control, keys=keys)
         self._receiver = Receiver([reports], ["stats"], keys=keys)
         self._closing = threading.Event()
@@ -143,15 +142,10 @@ class Watchdog:
             self.newest = message if isinstance(message, StatsMessage) else self.newest
 
     def _examine(self) -> None:
-        if self._works():
+        if self._use.grew():
             self._heartbeat.worked_s = time.monotonic()
         if self._answers():
             self._heartbeat.answered_s = time.monotonic()
-
-    def _works(self) -> bool:
-        used_s, now_s = processor_time_s(self._process_id), time.monotonic()
-        (used_before_s, before_s), self._worked = self._worked, (used_s, now_s)
-        return used_s - used_before_s > WORKING_SHARE * (now_s - before_s)
 
     def _answers(self) -> bool:
         request = ControlRequest(node="supervisor", id=uuid.uuid4().hex, op=CLOCK_OP)
@@ -159,6 +153,21 @@ class Watchdog:
             return self._client.request(request, ANSWER_TIMEOUT_S).error is None
         except DeltalightError:
             return False
+
+
+class ProcessorUse:
+    """Tells whether a process works, by the processor time that it takes."""
+
+    def __init__(self, process_id: int) -> None:
+        self._process_id = process_id
+        self._used_s, self._looked_s = 0.0, time.monotonic()
+
+    def grew(self) -> bool:
+        """Whether it worked since the last look, or since the start."""
+        used_s, now_s = processor_time_s(self._process_id), time.monotonic()
+        worked = used_s - self._used_s > WORKING_SHARE * (now_s - self._looked_s)
+        self._used_s, self._looked_s = used_s, now_s
+        return worked
 
 
 def processor_time_s(process_id: int) -> float:

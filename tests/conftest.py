@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ import pytest
 import structlog
 
 from deltalight.services import ports
+from tests.lanes import SLOW_MARKERS, dealt, is_slow
 
 if TYPE_CHECKING:
     from deltalight.render_server.gpu.context import GpuContext
@@ -23,10 +25,16 @@ if TYPE_CHECKING:
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# A busy machine may take longer over an example than Hypothesis likes.
+with suppress(ImportError):
+    from hypothesis import HealthCheck, settings
+
+    settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("patient")
+
 # Thousands of tests and modules come to stay: to look through them again and again takes a third of the collection.
 gc.disable()
 
-SLOW_MARKERS = ("slow", "data")
 THREAD_COUNTS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 # OpenBLAS chooses its kernels by the processor's maker too, and they differ in the last bits of what they compute:
 # protected pictures were made with these. Whoever has loaded it already keeps what it chose.
@@ -34,10 +42,10 @@ PROCESSOR = Path("/proc/cpuinfo")
 if "numpy" not in sys.modules and PROCESSOR.exists() and "avx512f" in PROCESSOR.read_text():
     os.environ["OPENBLAS_CORETYPE"] = "SkylakeX"
 WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # gw0, gw1, ...; None where tests are not spread
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 
 if WORKER is not None:
-    number, count = int(WORKER.removeprefix("gw")), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-    ports.PRIVATE_PORTS = ports.PRIVATE_PORTS[number::count]
+    ports.PRIVATE_PORTS = ports.PRIVATE_PORTS[int(WORKER.removeprefix("gw")) :: WORKERS]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -72,22 +80,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave slow tests out of the quick tier; in the full one they come first, so that none is waited for alone."""
-    slow = [item for item in items if _is_slow(item)]
-    quick = [item for item in items if not _is_slow(item)]
     if config.getoption("all") or _are_slow_ones_named(config):
-        items[:] = slow + quick
-    elif slow:
+        items[:] = dealt(items, WORKERS)
+    elif slow := [item for item in items if is_slow(item)]:
         config.hook.pytest_deselected(items=slow)
-        items[:] = quick
+        items[:] = [item for item in items if not is_slow(item)]
 
 
 def pytest_collection_finish() -> None:
     gc.enable()
     gc.freeze()
-
-
-def _is_slow(item: pytest.Item) -> bool:
-    return any(item.get_closest_marker(name) for name in SLOW_MARKERS)
 
 
 def _are_slow_ones_named(config: pytest.Config) -> bool:

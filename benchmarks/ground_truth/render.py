@@ -51,6 +51,13 @@ seed would not give the same picture.
 """
 SOFTNESS_PX = 0.5
 """Standard deviation of the lens's blur, as of Mitsuba's default filter; a subpixel's own area is part of it."""
+LEAST_STRATIFIED = 64
+"""Samples from which on Mitsuba's stratified sampler is used; with fewer it is biased.
+
+Its permutations of few strata seem to depend on each other between dimensions. Measured in `two_lights`: with 4
+samples a pass the room is 3.1 % too dark and objects add 1.2 times the light, with 16 it is 0.2 % too dark; 64 and
+256 are 0.1 % off independent samples, which is noise.
+"""
 WAVEFRONT = 20_000_000
 """Samples drawn at once; with Mitsuba's LLVM variant that takes less than half a GB."""
 MAX_PASSES = 4096
@@ -182,10 +189,10 @@ class RoomRenderer:
         seed: int,
         advance: Callable[[], None],
     ) -> Float32[np.ndarray, "h w 3"]:
-        sensor = _sensor(self._fine, world_from_camera, "stratified")
         total = np.zeros((self._fine.height, self._fine.width, 3), np.float32)
         plan = passes(spp, self._camera.width * self._camera.height)
         for number, samples in enumerate(plan):
+            sensor = _sensor(self._fine, world_from_camera, _sampler(samples))
             total += samples * self._render(kind, sensor, samples, seed * MAX_PASSES + number)[..., :3]
             advance()
         return filtered(total / np.float32(sum(plan)))
@@ -219,6 +226,11 @@ def softened(picture: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 
     side = (SOFTNESS_PX**2 - 1 / 12) / 2
     kernel = np.array([side, 1 - 2 * side, side], np.float32)
     return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE))
+
+
+def _sampler(samples: int) -> str:
+    """Return the sampler with the least noise that is right in the mean."""
+    return "stratified" if samples >= LEAST_STRATIFIED else "independent"
 
 
 def _sensor(camera: CameraModel, world_from_camera: Matrix, sampler: str) -> dict[str, Any]:

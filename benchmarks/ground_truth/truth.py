@@ -1,6 +1,5 @@
 """Truth of benchmark scenes, rendered once and cached by the hash of everything that determines it."""
 
-import json
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -22,9 +21,8 @@ from deltalight.benchmarks.ground_truth.document import document_path, scene_doc
 from deltalight.benchmarks.ground_truth.point_lamps import LENS_BLUR_PX, point_lamps
 from deltalight.benchmarks.ground_truth.render import INTEGRATORS, SUBPIXELS, choose_variant
 from deltalight.benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
-from deltalight.benchmarks.ground_truth.truth_pictures import TruthRenderer
+from deltalight.benchmarks.ground_truth.truth_pictures import Halves, TruthRenderer, coded_psnr
 from deltalight.benchmarks.ground_truth.truth_writer import (
-    MANIFEST_FILE,
     TRUTH_FOLDER,
     is_whole,
     picture_path,
@@ -36,7 +34,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.protocol.scene import SceneDocument, load_scene
 
-RENDER_VERSION = 1
+RENDER_VERSION = 2
 """Increment when rendering changes in a way that the hashed numbers do not show (seeds, samples of depth...)."""
 CACHE = "ground-truth"
 
@@ -45,18 +43,31 @@ CACHE = "ground-truth"
 class TruthFrame:
     """One frame of truth; pictures are linear in camera units and noise-free unless stated otherwise.
 
-    `without` and `with_objects` are the room without and with virtual objects, each the mean of two halves of the
-    samples. `halves_psnr_db` is the agreement of the halves of `with_objects` in sRGB code of range 255; the mean is
-    about 6 dB closer to the limit of infinitely many samples. `cover` is the fraction of each pixel that virtual
-    objects cover, 0..1. The `sensor` pictures are 8-bit sRGB with the same draw of camera noise.
+    `without_halves` and `with_halves` are the room without and with virtual objects, each twice: half of the samples
+    each, with seeds of their own. `cover` is the fraction of each pixel that virtual objects cover, 0..1. The
+    `sensor` pictures are 8-bit sRGB with the same draw of camera noise.
     """
 
-    without: Float32[np.ndarray, "h w 3"]
-    with_objects: Float32[np.ndarray, "h w 3"]
-    halves_psnr_db: float
+    without_halves: Halves
+    with_halves: Halves
     cover: Float32[np.ndarray, "h w"]
     sensor_without: UInt8[np.ndarray, "h w 3"]
     sensor_with: UInt8[np.ndarray, "h w 3"]
+
+    @cached_property
+    def without(self) -> Float32[np.ndarray, "h w 3"]:
+        """The room without objects, by all samples."""
+        return np.asarray(self.without_halves.mean(axis=0))
+
+    @cached_property
+    def with_objects(self) -> Float32[np.ndarray, "h w 3"]:
+        """The room with objects, by all samples."""
+        return np.asarray(self.with_halves.mean(axis=0))
+
+    @property
+    def halves_psnr_db(self) -> float:
+        """Agreement of the halves of `with_objects`; the mean is about 6 dB closer to what endless samples give."""
+        return coded_psnr(*self.with_halves)
 
 
 @dataclass(frozen=True)
@@ -85,17 +96,12 @@ class Truth:
         """
         without, with_objects, cover = (self._picture(name, frame) for name in ("without", "with", "cover"))
         return TruthFrame(
-            without=without,
-            with_objects=with_objects,
-            halves_psnr_db=float(self._manifest["halves_psnr_db"][frame]),
+            without_halves=without,
+            with_halves=with_objects,
             cover=cover,
             sensor_without=self._sensor(self.folder / "rgb" / f"{frame:06d}.png"),
             sensor_with=self._sensor(self.folder / TRUTH_FOLDER / f"sensor_with-{frame:06d}.png"),
         )
-
-    @cached_property
-    def _manifest(self) -> dict[str, Any]:
-        return dict(json.loads((self.folder / TRUTH_FOLDER / MANIFEST_FILE).read_text()))
 
     def _picture(self, name: str, frame: int) -> np.ndarray:
         path = picture_path(self.folder / TRUTH_FOLDER, name, frame)

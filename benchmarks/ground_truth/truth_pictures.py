@@ -22,16 +22,16 @@ FISHEYE_SAMPLES = 64
 PROBE_HEIGHT_M = 0.05
 """Height of the fish-eye lens above the object's base: at its position, clear of what it stands on."""
 
-Halves = tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]
+Halves = Float32[np.ndarray, "2 h w 3"]
+"""A picture twice, each with half of the samples and seeds of its own, in the stored precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class FramePictures:
-    """Truth of a frame, in linear camera units and metres."""
+    """Truth of a frame, in linear camera units and metres; colour in two halves."""
 
-    without: Float32[np.ndarray, "h w 3"]
-    with_objects: Float32[np.ndarray, "h w 3"]
-    halves_psnr_db: float
+    without: Halves
+    with_objects: Halves
     cover: Float32[np.ndarray, "h w"]
     depth_m: Float32[np.ndarray, "h w"]
 
@@ -40,7 +40,7 @@ class FramePictures:
 class RoomPictures:
     """The room without objects from one pose."""
 
-    color: Float32[np.ndarray, "h w 3"]
+    color: Halves
     depth_m: Float32[np.ndarray, "h w"]
 
 
@@ -69,10 +69,10 @@ class TruthRenderer:
         room = self._room(pose)
         with_objects = RoomRenderer(self.assembly.with_objects(index), self.camera)
         mask = RoomRenderer(self.assembly.mask(index), self.camera)
-        halves = self._color(with_objects, pose)
+        color = self._color(with_objects, pose)
         covers = [mask.cover(pose, **self._half(half)) for half in (0, 1)]
         cover = np.asarray((covers[0] + covers[1]) / 2)
-        return FramePictures(room.color, _mean(halves), coded_psnr(*halves), cover, room.depth_m)
+        return FramePictures(room.color, color, cover, room.depth_m)
 
     def fisheye(self) -> Float32[np.ndarray, "h w 3"]:
         """Render the empty room as the fish-eye camera sees it, with point lamps blurred by its lens."""
@@ -88,13 +88,14 @@ class TruthRenderer:
         key = pose.tobytes()
         if key not in self._rooms:
             room = RoomRenderer(self.assembly.without(), self.camera)
-            color = _mean(self._color(room, pose))
+            color = self._color(room, pose)
             self._rooms[key] = RoomPictures(color, room.depth(pose, spp=DEPTH_SAMPLES, seed=SEED))
             self.advance()
         return self._rooms[key]
 
     def _color(self, room: RoomRenderer, pose: Matrix) -> Halves:
-        return room.color(pose, **self._half(0)), room.color(pose, **self._half(1))
+        halves = np.stack([room.color(pose, **self._half(half)) for half in (0, 1)])
+        return halves.astype(np.float16).astype(np.float32)  # so that sensors see what is stored
 
     def _half(self, half: int) -> Any:  # noqa: ANN401 - keywords of RoomRenderer
         """Return how to draw a half; its seeds are the same in every picture."""
@@ -115,8 +116,3 @@ def coded_psnr(a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"])
     """Return the PSNR (dB) of two linear pictures in sRGB code of range 255; infinite if they are equal."""
     error = np.mean(np.square(srgb_coded(a) - srgb_coded(b), dtype=np.float64))
     return float(20 * np.log10(255) - 10 * np.log10(error)) if error > 0 else float("inf")
-
-
-def _mean(halves: Halves) -> Float32[np.ndarray, "h w 3"]:
-    """Return the mean in the stored precision (11 bits of mantissa), so that sensors see what is stored."""
-    return ((halves[0] + halves[1]) / 2).astype(np.float16).astype(np.float32)

@@ -37,7 +37,6 @@ def write_truth(out: Path, renderer: TruthRenderer, about: dict[str, Any]) -> No
     scene = renderer.assembly.scene
     extrinsics = Extrinsics(world_from_fisheye=world_from_fisheye(renderer.assembly))
     step_m = StereoDepthSensor().step_m
-    psnr_db = []
     with DatasetWriter(out, board=scene.board, extrinsics=extrinsics, depth_scale=step_m) as dataset:
         (out / TRUTH_FOLDER).mkdir()
         for index in range(scene.frame_count):
@@ -45,12 +44,11 @@ def write_truth(out: Path, renderer: TruthRenderer, about: dict[str, Any]) -> No
             frame = sensor_frame(index, pictures, renderer.camera)
             dataset.add(replace(frame, world_from_camera=scene.world_from_camera[index]))
             _write_pictures(out / TRUTH_FOLDER, index, pictures)
-            psnr_db.append(pictures.halves_psnr_db)
         write_bracket(out, renderer.fisheye(), FIRST_CAPTURE_NS, np.random.default_rng(SEED))
     write_documents(out, scene)
     for asset in renderer.assembly.assets.iterdir():
         shutil.copy(asset, out)
-    manifest = {**about, "halves_psnr_db": psnr_db, "files": _hashes(out)}
+    manifest = {**about, "files": _hashes(out)}
     (out / TRUTH_FOLDER / MANIFEST_FILE).write_text(json.dumps(manifest, indent=2) + "\n")
 
 
@@ -84,7 +82,7 @@ def sensor_frame(index: int, pictures: FramePictures, camera: CameraModel) -> Se
     return SensorFrame(
         frame_id=index,
         timestamp_ns=capture_ns,
-        color=_exposed(pictures.without, index),
+        color=_exposed(pictures.without.mean(axis=0), index),
         camera=camera,
         depth=depth_from_steps(steps, stereo.step_m, camera, stereo.sigma_at_1m),
         depth_timestamp_ns=capture_ns,
@@ -107,7 +105,7 @@ def _write_pictures(folder: Path, index: int, pictures: FramePictures) -> None:
     named = {"without": pictures.without, "with": pictures.with_objects, "cover": pictures.cover}
     for name, picture in named.items():
         np.save(picture_path(folder, name, index), picture.astype(np.float16))
-    sensor = encode_png(_exposed(pictures.with_objects, index))
+    sensor = encode_png(_exposed(pictures.with_objects.mean(axis=0), index))
     (folder / f"sensor_with-{index:06d}.png").write_bytes(sensor)
 
 

@@ -6,6 +6,7 @@ from functools import cached_property
 
 from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
 from deltalight.benchmarks.ground_truth.truth import Truth, TruthFrame
+from deltalight.benchmarks.quality.energy import Change
 from deltalight.benchmarks.quality.metrics import Picture
 from deltalight.benchmarks.quality.regions import Regions, find_regions
 from deltalight.protocol.frames import ViewFrame
@@ -15,12 +16,13 @@ from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
 @dataclass(frozen=True, eq=False)
 class SceneCase:
-    """Truth of a scene with what the renderer sees of it, one view per frame."""
+    """Truth of a scene with what the renderer sees of it, one view per frame; `changes` by each half of truth."""
 
     truth: Truth
     frames: Sequence[TruthFrame]
     views: Sequence[ViewFrame]
     regions: Sequence[Regions]
+    changes: Sequence[Sequence[Change]]
 
     @classmethod
     def opened(cls, truth: Truth) -> "SceneCase":
@@ -34,7 +36,7 @@ class SceneCase:
         frames = [truth.frame(index) for index in range(truth.frame_count)]
         views = [builder(source[index]) for index in range(truth.frame_count)]
         regions = [find_regions(frame.without, frame.with_objects, frame.cover) for frame in frames]
-        return cls(truth, frames, views, regions)
+        return cls(truth, frames, views, regions, [_changes(frame) for frame in frames])
 
     @property
     def scene(self) -> BenchmarkScene:
@@ -45,3 +47,8 @@ class SceneCase:
     def references(self) -> list[Picture]:
         """Sensor pictures with the objects, noise included."""
         return [frame.sensor_with for frame in self.frames]
+
+
+def _changes(frame: TruthFrame) -> list[Change]:
+    pairs = zip(frame.without_halves, frame.with_halves, strict=True)
+    return [Change(without, full, find_regions(without, full, frame.cover)) for without, full in pairs]

@@ -1,5 +1,6 @@
 """Amount of light that a method adds and removes, relative to truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,6 +11,20 @@ from deltalight.benchmarks.quality.metrics import Mask
 from deltalight.benchmarks.quality.regions import Linear, Regions
 
 NEAR_PIXELS = (5, 5)  # enough to average the noise of single pixels, within the edge of a soft shadow
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A picture of the truth without and with objects, linear camera units, and where it says that they change it."""
+
+    without: Linear
+    with_objects: Linear
+    regions: Regions
+
+    @property
+    def visible(self) -> Linear:
+        """The change that a camera shows: nothing above 1."""
+        return np.asarray(np.minimum(self.with_objects, 1) - np.minimum(self.without, 1))
 
 
 @dataclass(frozen=True)
@@ -25,21 +40,21 @@ class Energy:
     virtual: float
 
 
-def energy_ratios(result: Linear, camera: Linear, without: Linear, truth: Linear, regions: Regions) -> Energy:
-    """Compare what `result` changes in the `camera` picture with what `truth` changes in `without`.
+def energy_ratios(result: Linear, camera: Linear, truth: Sequence[Change]) -> Energy:
+    """Compare what `result` changes in the `camera` picture (linear camera units) with what truth changes.
 
-    All are linear camera units; a camera shows nothing above 1, so truth is clipped there. Whether truth darkens or
-    brightens a channel is decided by the pixels around it: decided by its own value, the path tracer's noise would
-    count as light, always in its own direction (an unbiased result came out at 0.6 where truth adds 1 % of what it
-    takes).
+    `truth` are two pictures with noise of their own. Each says where light is taken or added, the other how much: a
+    picture that said both would count its own noise as light, always in its own direction. Where there is only one (a
+    photograph), its pixels are judged by those around them, which helps where their noise is independent.
     """
-    ours = result - camera
-    theirs = np.minimum(truth, 1) - np.minimum(without, 1)
-    around = _mean_around(theirs, regions.changed_real)
+    around = np.stack([_mean_around(each.visible, each.regions.changed_real) for each in truth])
+    theirs = np.stack([each.visible for each in reversed(truth)])
+    ours, shown = (np.broadcast_to(picture, theirs.shape) for picture in (result - camera, result))
+    objects = np.stack([_channels(each.regions.virtual) for each in truth])
     return Energy(
         _ratio(ours, theirs, around < 0),
         _ratio(ours, theirs, around > 0),
-        _ratio(result, np.minimum(truth, 1), _channels(regions.virtual)),
+        _ratio(shown, np.stack([np.minimum(each.with_objects, 1) for each in truth]), objects),
     )
 
 
@@ -60,7 +75,9 @@ def _channels(mask: Mask) -> Bool[np.ndarray, "h w 3"]:
 
 
 def _ratio(
-    ours: Float32[np.ndarray, "h w 3"], theirs: Float32[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w 3"]
+    ours: Float32[np.ndarray, "k h w 3"],
+    theirs: Float32[np.ndarray, "k h w 3"],
+    mask: Bool[np.ndarray, "k h w 3"],
 ) -> float:
     total = float(theirs[mask].sum(dtype=np.float64))
     return float(ours[mask].sum(dtype=np.float64)) / total if total != 0 else np.nan

@@ -7,7 +7,7 @@ import numpy as np
 
 from deltalight.benchmarks.ground_truth.truth import TruthFrame
 from deltalight.benchmarks.quality.case import SceneCase
-from deltalight.benchmarks.quality.energy import energy_ratios
+from deltalight.benchmarks.quality.energy import Change, energy_ratios
 from deltalight.benchmarks.quality.metrics import Comparison, Picture
 from deltalight.benchmarks.quality.penumbra import EdgeOnPicture
 from deltalight.benchmarks.quality.regions import Linear, Regions
@@ -30,7 +30,7 @@ def scene_figures(pictures: Sequence[Picture], case: SceneCase) -> Figures:
     `darkening`, `brightening`, `virtual_radiance` (energy.py); `penumbra_error` (first frame); `temporal_unchanged`,
     `temporal_changed` (temporal.py).
     """
-    frames = zip(pictures, case.frames, case.regions, strict=True)
+    frames = zip(pictures, case.frames, case.regions, case.changes, strict=True)
     figures = mean_figures(_frame_figures(*frame) for frame in frames)
     steadiness = temporal_deviation(pictures, case.references, [one.changed for one in case.regions])
     figures["temporal_unchanged"] = steadiness.unchanged
@@ -39,7 +39,9 @@ def scene_figures(pictures: Sequence[Picture], case: SceneCase) -> Figures:
     return figures
 
 
-def _frame_figures(picture: Picture, truth: TruthFrame, regions: Regions) -> Figures:
+def _frame_figures(
+    picture: Picture, truth: TruthFrame, regions: Regions, changes: Sequence[Change]
+) -> Figures:
     compared = Comparison(picture, truth.sensor_with)
     parts = {"picture": compared.everywhere()}
     parts |= {part: compared.over(getattr(regions, part)) for part in PARTS}
@@ -49,7 +51,7 @@ def _frame_figures(picture: Picture, truth: TruthFrame, regions: Regions) -> Fig
         for name, value in asdict(agreement).items()
     }
     camera = linear(truth.sensor_without)
-    energy = energy_ratios(linear(picture), camera, truth.without, truth.with_objects, regions)
+    energy = energy_ratios(linear(picture), camera, changes)
     figures["darkening"], figures["brightening"] = energy.darkening, energy.brightening
     figures["virtual_radiance"] = energy.virtual
     return figures

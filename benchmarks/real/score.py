@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from deltalight.benchmarks.ground_truth.sensors import srgb_bytes
-from deltalight.benchmarks.quality.energy import energy_ratios
+from deltalight.benchmarks.quality.energy import Change, energy_ratios
 from deltalight.benchmarks.quality.metrics import Mask, decibels
 from deltalight.benchmarks.quality.regions import Linear, Regions
 
@@ -38,7 +38,7 @@ def changed_part(truth: Linear, plate: Linear, table: Mask) -> Mask:
 def score(result: Linear, truth: Linear, plate: Linear, table: Mask, changed: Mask) -> Figures:
     """Compare a result with the photograph `truth`; `plate` is the empty table. All are linear, equally exposed."""
     regions = Regions(changed, table, np.zeros_like(table))
-    energy = energy_ratios(result, plate, plate, truth, regions)
+    energy = energy_ratios(result, plate, [Change(plate, truth, regions)])
     return Figures(
         psnr_db(result, truth, table), psnr_db(result, truth, changed), energy.darkening, energy.brightening
     )

@@ -25,7 +25,8 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.renderer import SceneRenderer
-from deltalight.services.demo import collect_composites, demo_scene
+from deltalight.services.demo import demo_scene
+from deltalight.services.headless_demo import collect_composites
 from deltalight.services.offline import with_output
 
 Keep = Callable[[SpeedReport], None]

@@ -10,6 +10,8 @@ import numpy as np
 from deltalight.protocol.codecs import encode_array, encode_color, encode_depth
 from deltalight.protocol.envelope import encode
 from deltalight.protocol.messages import (
+    CameraEntry,
+    CamerasMessage,
     ColorMessage,
     CompositeMessage,
     ControlReply,
@@ -244,6 +246,21 @@ def _small_examples() -> Iterator[Example]:
     yield "pose_no_board", PoseMessage(node=NODE, **_stamps(), status="no_board"), [], []
     lamps = (LampEntry(marker=40, world_from_marker=POSE), LampEntry(marker=41, world_from_marker=OTHER_POSE))
     yield "lamps", LampsMessage(node=NODE, **_stamps(), lamps=lamps), [], []
+    cameras = CamerasMessage(
+        node="server",
+        capture_ns=CAPTURE_NS,
+        cameras=(
+            CameraEntry(
+                node=NODE,
+                status="live",
+                frame_id=FRAME,
+                capture_ns=CAPTURE_NS,
+                received_ns=CAPTURE_NS + 2_000_000,
+            ),
+            CameraEntry(node="window", status="silent", frame_id=0, capture_ns=0, received_ns=1),
+        ),
+    )
+    yield "cameras", cameras, [], []
     stats = StatsMessage(
         node="server",
         capture_ns=CAPTURE_NS,

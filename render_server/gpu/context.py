@@ -72,6 +72,10 @@ class SharedPrograms:
     def __init__(self) -> None:
         self._programs: dict[tuple[str, ...], Program] = {}  # the longest unused first
 
+    def __len__(self) -> int:
+        """Returns how many are linked."""
+        return len(self._programs)
+
     def take(self, user: object, source: tuple[str, ...], link: Callable[[], Program]) -> Program:
         """Returns the program of that source for `user`; `link` makes it where there is none."""
         program = self._programs.pop(source, None) or link()

@@ -21,8 +21,12 @@ _BLOCK = re.compile(
 _SWITCH = re.compile(r"^\s*#\s*pragma\s+switch\s+(?:bool\s+)?(\w+)\s*$", re.MULTILINE)
 _CONSTANT = re.compile(r"#pragma switch bool (\w+)")
 _VALUE = re.compile(r"^const bool (\w+) = switched;$", re.MULTILINE)
+_DECLARES = re.compile("uniform|buffer|local_size")
+_WORD = re.compile(r"\b[A-Za-z_]\w*")
 _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
-_DIRECTIVE = re.compile(r"\s*#\s*(define|ifdef|ifndef|if|elif|else|endif)\b\s*(\w*)(?:[ \t]+(.*))?")
+_DIRECTIVE = re.compile(
+    r"^[ \t]*#[ \t]*(define|ifdef|ifndef|if|elif|else|endif)\b[ \t]*(\w*)(?:[ \t]+(.*))?.*$", re.MULTILINE
+)
 
 
 @dataclass(frozen=True)
@@ -94,11 +98,11 @@ def declarations(source: str) -> Declarations:
     text = _COMMENT.sub(" ", source)
     whole = _declaring(text)
     names = {name for _, _, _, name in _variables(whole)} | {name for _, _, name in _BLOCK.findall(whole)}
-    text = preprocessed(text)
+    kept, macros = _kept(text)
+    text = _expanded(_declaring(kept), macros)
     sizes = {axis: int(size) for axis, size in _LOCAL_SIZE.findall(text)}
-    switches = tuple(dict.fromkeys(_SWITCH.findall(text)))
+    switches = tuple(dict.fromkeys(_SWITCH.findall(kept)))
     names |= set(switches)
-    text = _declaring(text)
     formats: dict[str, frozenset[str]] = {}
     written: set[str] = set()
     for layout, access, kind, name in _variables(text):
@@ -112,8 +116,8 @@ def declarations(source: str) -> Declarations:
 
 
 def _declaring(text: str) -> str:
-    """Returns the statements that may declare a uniform or a block: few of a shader's, which saves time."""
-    return ";".join([part for part in text.split(";") if "uniform" in part or "buffer" in part]) + ";"
+    """Returns the statements that may declare a uniform, a block or a size: few of a shader's, which saves time."""
+    return ";".join([part for part in text.split(";") if _DECLARES.search(part)]) + ";"
 
 
 def _variables(text: str) -> Iterator[tuple[str, str, str, str]]:
@@ -128,28 +132,40 @@ def preprocessed(text: str) -> str:
 
     Conditions of `#if` and `#elif` are not computed: what hangs on them stays.
     """
+    return _expanded(*_kept(text))
+
+
+def _kept(text: str) -> tuple[str, dict[str, str]]:
+    """Returns what conditions leave of a text, and the macros that are defined there."""
     macros: dict[str, str] = {}
-    named = re.compile("(?!)")  # any of the macros; none yet
-    branches: list[bool | None] = []  # of the conditions around a line: taken or not, None: not computed
-    lines = []
-    for line in text.splitlines():
-        directive = _DIRECTIVE.match(line)
-        if directive is None:
-            if False not in branches:
-                lines.append(named.sub(lambda word: macros[word[0]], line))
-            continue
+    branches: list[bool | None] = []  # of the conditions around a place: taken or not, None: not computed
+    kept, at = [], 0
+    for directive in _DIRECTIVE.finditer(text):
+        if False not in branches:
+            kept.append(text[at : directive.start()])
+        at = directive.end()
         kind, name, value = directive.groups()
-        if kind == "define" and False not in branches:
+        if kind != "define":
+            _follow(kind, name in macros, branches)
+        elif False not in branches:
             macros[name] = value or ""
-            named = re.compile(rf"\b(?:{'|'.join(macros)})\b")
-        elif kind in ("ifdef", "ifndef"):
-            branches.append((name in macros) == (kind == "ifdef"))
-        elif kind == "if":
-            branches.append(None)
-        elif kind == "elif":
-            branches[-1] = None
-        elif kind == "else":
-            branches[-1] = None if branches[-1] is None else not branches[-1]
-        elif kind == "endif":
-            branches.pop()
-    return "\n".join(lines)
+    return "".join([*kept, text[at:]]), macros
+
+
+def _follow(kind: str, is_defined: bool, branches: list[bool | None]) -> None:
+    """Opens, turns or closes a branch."""
+    if kind in ("ifdef", "ifndef"):
+        branches.append(is_defined == (kind == "ifdef"))
+    elif kind == "if":
+        branches.append(None)
+    elif kind == "elif":
+        branches[-1] = None
+    elif kind == "else":
+        branches[-1] = None if branches[-1] is None else not branches[-1]
+    else:
+        branches.pop()
+
+
+def _expanded(text: str, macros: Mapping[str, str]) -> str:
+    """Returns a text with macros in place of their names."""
+    return _WORD.sub(lambda word: macros.get(word[0], word[0]), text) if macros else text

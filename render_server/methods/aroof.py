@@ -33,7 +33,8 @@ from deltalight.render_server.passes.occlusion_fields import (
     standing_uniforms,
 )
 from deltalight.render_server.passes.shading import DirectLight
-from deltalight.render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
+from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
+from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.scene.occlusion_field import FieldSettings, OcclusionField
 
 SHOWN_CELLS = 64  # for view `volume` alone; the method has no volume

@@ -27,7 +27,6 @@ from deltalight.render_server.methods.lighting import (
     ShadingOptions,
     shading_stages,
     surfel_scene,
-    volume_placement,
 )
 from deltalight.render_server.methods.method import (
     RelightingMethod,
@@ -36,6 +35,7 @@ from deltalight.render_server.methods.method import (
     march_defines,
     resolve_joint_maps,
 )
+from deltalight.render_server.methods.volume_placement import Placements, only_one, volume_placements
 from deltalight.render_server.methods.voxel_volumes import (
     FAR_SIZE,
     DirectionalVoxels,
@@ -50,12 +50,7 @@ from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.shading import DirectLightPair
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.passes.voxels import (
-    DIRECTIONS,
-    VolumePlacement,
-    VoxelMipmap,
-    memory_statement,
-)
+from deltalight.render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 from deltalight.render_server.view import NOWHERE, Rectangle
 
 
@@ -138,7 +133,7 @@ def solution_stages(
     g: Graph,
     s: FrameResources,
     voxels: SolutionVoxels,
-    placement: Resource[VolumePlacement],
+    placement: Resource[Placements],
     mu_maps: Resource[LightBuffers],
     rho_maps: Resource[LightBuffers],
     environment: Resource[tuple[moderngl.TextureArray, ...]],
@@ -257,7 +252,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     mu_maps = g.stage("shadow maps mu", lights.draw_mu, views, s.real)
     rho_maps = g.stage("shadow maps rho", lights.draw_rho, views, s.real, s.objects)
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
+    placement = volume_placements(g, s, only_one(resolved.volume_size), settings.volume_edge_m, settings.tier)
     voxels = g.shared("voxels", lambda: SolutionVoxels(g.gpu, settings, resolved.volume_size))
     lit_voxels = solution_stages(g, s, voxels, placement, mu_maps, rho_maps, environment)
     options = ShadingOptions(

@@ -21,7 +21,6 @@ from deltalight.render_server.methods.lighting import (
     bounced_later,
     shading_stages,
     surfel_scene,
-    volume_placement,
 )
 from deltalight.render_server.methods.method import (
     RelightingMethod,
@@ -30,13 +29,21 @@ from deltalight.render_server.methods.method import (
     march_defines,
     resolve_voxel_cones,
 )
+from deltalight.render_server.methods.volume_placement import (
+    SizeOf,
+    only_one,
+    volume_placement,
+    volume_placements,
+)
 from deltalight.render_server.methods.voxel_volumes import (
     FAR_SIZE,
     DeltaVoxels,
     VoxelSet,
+    affordable_size,
     delta_voxel_stages,
     joint_voxels,
     placed_volume,
+    sets_memory_mb,
 )
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
 from deltalight.render_server.passes.lights import LightBuffers
@@ -48,13 +55,9 @@ from deltalight.render_server.passes.split_injection import (
     ResolveInjection,
     SplitInjection,
 )
+from deltalight.render_server.passes.volumes import MOST_VOLUMES, VolumePlacement
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.passes.voxels import (
-    DIRECTIONS,
-    VolumePlacement,
-    VoxelMipmap,
-    memory_statement,
-)
+from deltalight.render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
 class InjectedVoxels:
@@ -200,6 +203,17 @@ class ExactCones:
         self._tracing.release()
 
 
+def _may_divide(settings: DvctMethod) -> bool:
+    """Whether objects far apart get volumes of their own: shadow cones and a given edge mean a single one."""
+    return settings.resolved_shadow == "map" and settings.volume_edge_m is None
+
+
+def _volume_sizes(gpu: GpuContext, settings: DvctMethod, resolved: ResolvedSettings) -> SizeOf:
+    if not _may_divide(settings):
+        return only_one(resolved.volume_size)
+    return lambda count: affordable_size(resolved.volume_size, count, settings.memory_budget_mb, gpu)
+
+
 def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     """Marches both solutions at once through one-sided directional voxels."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
@@ -209,7 +223,9 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     g.section("voxels")
     voxels = g.shared("voxels", lambda: DeltaVoxels(g.gpu, settings, resolved.volume_size))
     with bounced_later(g, s, lit, settings.tier):
-        placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
+        placement = volume_placements(
+            g, s, _volume_sizes(g.gpu, settings, resolved), settings.volume_edge_m, settings.tier
+        )
         mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
     shading = Shading(
         g.gpu,
@@ -316,7 +332,12 @@ def state_memory(settings: DvctMethod, resolved: ResolvedSettings) -> str:
     size, budget_mb = resolved.volume_size, settings.memory_budget_mb
     if settings.operator == "paper":
         return memory_statement(size, 1, budget_mb)
-    return memory_statement(size, DIRECTIONS, budget_mb, FAR_SIZE)
+    stated = memory_statement(size, DIRECTIONS, budget_mb, FAR_SIZE)
+    divided = affordable_size(size, MOST_VOLUMES, budget_mb) if _may_divide(settings) else 0
+    if not divided:
+        return stated
+    divided_mb = sets_memory_mb(divided, MOST_VOLUMES)
+    return f"{stated}; objects far apart: up to {MOST_VOLUMES} of {divided}^3, {divided_mb} MB"
 
 
 DVCT = RelightingMethod(DvctMethod, dvct, resolve_voxel_cones, state_memory)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from operator import eq
 from typing import Any
 
 import moderngl
@@ -14,7 +13,7 @@ from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
+from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import LitScene, Points, object_extent
@@ -32,40 +31,17 @@ from deltalight.render_server.passes.reflections import (
     TransmittedLight,
 )
 from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
-from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.passes.voxels import (
+from deltalight.render_server.passes.volumes import (
     PlacedVolume,
-    VolumePlacement,
-    VoxelMipmap,
-    keep_placement,
-    place_volume,
 )
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.view import CameraView, Rectangle
 
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
 SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
-
-
-def volume_placement(
-    g: Graph, s: FrameResources, size: int, edge_m: float | None, tier: QualityTier = BEST
-) -> Resource[VolumePlacement]:
-    """Declares the cube of voxels or cells around the objects; a quick tier moves it only when it must."""
-    placed: VolumePlacement | None = None
-
-    def place(extent: ObjectExtent) -> VolumePlacement:
-        """Places a cube around the objects, snapped to its cells; it stands still while they turn."""
-        nonlocal placed
-        edge = extent.volume_edge if edge_m is None else edge_m
-        low, high = extent.upright
-        wanted = place_volume(low, high, size, edge)
-        if placed is None or not tier.refresh_tiles or not keep_placement(placed, *extent.bounds, wanted):
-            placed = wanted
-        return placed
-
-    placing = g.shared("volume placement", lambda: place)
-    return g.value("volume placement", placing, object_extent(g, s), same=eq)
 
 
 def bounced_later(
@@ -258,7 +234,7 @@ class Shading:
         """Traces the beams that smooth objects cast; None if none is smooth enough."""
         if self._caustics is None or not casts_caustics(objects):
             return None
-        reach = volume.placement.size * volume.placement.voxel_edge
+        reach = max(each.size * each.voxel_edge for each in volume.placements)
         own = {"normal_offset": self._normal_offset(objects)}
         scene = {**seen.bindings, **objects.materials.bindings, **self._lights.bindings, **own}
         transmits = objects.materials.transmits

@@ -26,9 +26,9 @@ from deltalight.render_server.methods.lighting import (
     casts_caustics,
     shading_stages,
     surfel_scene,
-    volume_placement,
 )
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
+from deltalight.render_server.methods.volume_placement import volume_placement
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import (
@@ -54,14 +54,9 @@ from deltalight.render_server.passes.lpv_lighting import (
 )
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.split_injection import RealAlbedo
+from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.passes.voxels import (
-    PlacedVolume,
-    VolumePlacement,
-    Voxelize,
-    VoxelMipmap,
-    VoxelStore,
-)
+from deltalight.render_server.passes.voxels import Voxelize, VoxelMipmap, VoxelStore
 
 
 class LpvCells:

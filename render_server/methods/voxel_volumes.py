@@ -3,6 +3,7 @@
 mu holds the real scene, rho real and virtual surfaces.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,8 +23,15 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import LitScene
 from deltalight.render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, casts_caustics, surfel_scene
-from deltalight.render_server.methods.method import march_defines
+from deltalight.render_server.methods.method import VOLUME_STEP, march_defines
+from deltalight.render_server.methods.volume_placement import Placements
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.volumes import (
+    FarVolumeBlock,
+    PlacedVolume,
+    VolumePlacement,
+    place_volume,
+)
 from deltalight.render_server.passes.voxel_light import (
     AlbedoTexture,
     GatherVoxels,
@@ -33,22 +41,47 @@ from deltalight.render_server.passes.voxel_light import (
 )
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
+    MEGABYTE,
     ClearVoxels,
-    FarVolumeBlock,
     FilterVoxels,
     OccupyVoxels,
-    PlacedVolume,
     ResolveVoxels,
-    VolumePlacement,
     Voxelize,
     VoxelMipmap,
     VoxelStore,
-    place_volume,
+    volume_memory_bytes,
 )
 
 FAR_SIZE = 32  # voxels an edge of the coarse volume beyond
 FAR_EDGE_M = 20.0  # its greatest edge: what lies farther lights little through a cone's solid angle
 FAR_MARGIN = 1.05
+
+
+def sets_memory_mb(size: int, count: int) -> int:
+    """Returns the memory of `count` volume sets of six directions and of the coarse one beyond, MB."""
+    taken = 2 * count * volume_memory_bytes(size, DIRECTIONS) + volume_memory_bytes(FAR_SIZE, DIRECTIONS)
+    return math.ceil(taken / MEGABYTE)
+
+
+def affordable_size(size: int, count: int, budget_mb: int, gpu: GpuContext | None = None) -> int:
+    """Returns how many voxels an edge each of `count` volumes may have, `size` at most; 0 where no size fits.
+
+    The budget limits several, and what the GPU can hold, if it is given; one that does not fit is refused elsewhere.
+    """
+    while count > 1 and size > 0 and not _fits(size, count, budget_mb, gpu):
+        size -= VOLUME_STEP
+    return size
+
+
+def _fits(size: int, count: int, budget_mb: int, gpu: GpuContext | None) -> bool:
+    if sets_memory_mb(size, count) > budget_mb:
+        return False
+    if gpu is None:
+        return True
+    longest, largest = (
+        gpu.ctx.info[f"GL_MAX_{name}"] for name in ("3D_TEXTURE_SIZE", "SHADER_STORAGE_BLOCK_SIZE")
+    )
+    return bool(count * size <= longest and count * size**3 * 4 <= largest)
 
 
 class VoxelSet:
@@ -70,10 +103,21 @@ class VoxelSet:
 
     def fill(self, corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement) -> None:
         """Replaces the voxels by those of the triangles, and clears the old ones from the mipmaps."""
+        self.fill_all([corners], (placement,))
+
+    def fill_all(
+        self, corners: Sequence[Float32[np.ndarray, "m 3 10"]], placements: Sequence[VolumePlacement]
+    ) -> None:
+        """Fills several volumes, each with the triangles of its own."""
         self._clear.run(self.store, self._mipmaps, self.volume)
-        self.volume.place(placement)
-        self._voxelize.run(self.store, corners, self.volume)
+        self.volume.place(*placements)
+        self._voxelize.run_all(self.store, corners, self.volume)
         self.is_lit = False
+
+    def resize(self, size: int, count: int) -> None:
+        """Makes room for `count` volumes of `size` voxels an edge, as the mipmaps must have; all voxels are gone."""
+        self.store.resize(size, count)
+        self.groups.resize(size, count)
 
     def forget_light(self) -> None:
         """Clears the sums if they hold light."""
@@ -154,14 +198,23 @@ class DirectionalVoxels:
         self._filter = FilterVoxels(gpu)
         self._occupy = OccupyVoxels(gpu)
 
-    def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
+    def _make_room(self, placements: Placements) -> None:
+        """Makes room for so many volumes, and gives back what more of them took."""
+        wanted = placements[0].size, len(placements)
+        if wanted != (self.real.store.volume_size, self.real.store.volume_count):
+            for each in (self.mu, self.rho, self.real, self.objects):
+                each.resize(*wanted)
+
+    def voxelize_real(self, real: GeometryState, placements: Placements) -> VoxelSet:
         """Voxelises the real scene, with back faces if one camera saw it."""
-        self.real.fill(real.solid_corners(placement.voxel_edge), placement)
+        self._make_room(placements)
+        self.real.fill_all([real.solid_corners(each.voxel_edge) for each in placements], placements)
         return self.real
 
-    def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
+    def voxelize_objects(self, objects: GeometryState, placements: Placements) -> VoxelSet:
         """Voxelises the objects."""
-        self.objects.fill(objects.corners, placement)
+        self._make_room(placements)
+        self.objects.fill_all([objects.corners] * len(placements), placements)
         self.objects.groups.reset(self.objects.store)
         if self._bounces > 0:
             self._group.run(
@@ -282,7 +335,7 @@ class DeltaVoxels(DirectionalVoxels):
     ) -> LitVoxels:
         """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
         voxels.forget_light()
-        self._light.reset_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
+        self._light.reset_support(object_voxels(objects, voxels.volume.placements))
         self._light_rho(scene, gathered=False)
         return LitVoxels(real, voxels, self._light.support)
 
@@ -310,7 +363,7 @@ class DeltaVoxels(DirectionalVoxels):
 
 
 def delta_voxel_stages(
-    g: Graph, s: FrameResources, lit: LitScene, voxels: DeltaVoxels, placement: Resource[VolumePlacement]
+    g: Graph, s: FrameResources, lit: LitScene, voxels: DeltaVoxels, placement: Resource[Placements]
 ) -> tuple[Resource[VoxelMipmap], Resource[VoxelMipmap]]:
     """Declares voxelisation, lighting, filtering and bounces: mu of the real scene, then rho with the objects."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
@@ -345,6 +398,25 @@ def delta_voxel_stages(
         outputs=("bounces joint", "bounced joint voxels"),
     )
     return mu, rho
+
+
+def object_voxels(
+    objects: GeometryState, placements: Placements
+) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
+    """Returns the bounds of the voxels that hold objects, of each volume: (min x, y, z, -max x, y, z)."""
+    if len(placements) == 1:
+        return placements[0].voxel_bounds(np.stack(objects.bounds))
+    boxes = [each.bounds for each in objects.extents]
+    return np.concatenate([_met_voxels(each, boxes) for each in placements])
+
+
+def _met_voxels(
+    placement: VolumePlacement, boxes: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
+    met = [np.stack(box) for box in boxes if placement.meets(*box)]
+    if not met:
+        return np.array([placement.size] * 3 + [1] * 3, np.int32)
+    return placement.voxel_bounds(np.concatenate(met))
 
 
 def placed_volume(voxels: VoxelSet) -> PlacedVolume:

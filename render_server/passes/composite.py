@@ -16,7 +16,8 @@ from deltalight.render_server.passes.gbuffer import CameraImage, rgba_bytes
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
 from deltalight.render_server.passes.shading import DirectLight
-from deltalight.render_server.passes.voxels import PlacedVolume, VoxelMipmap
+from deltalight.render_server.passes.volumes import PlacedVolume
+from deltalight.render_server.passes.voxels import VoxelMipmap
 
 FILL_RADIUS = 3  # texels of the reduced grid by which the change extends into a hole
 

@@ -1,5 +1,6 @@
 """Cone tracing at reduced resolution: the pixel that represents each texel, and the light that its cones gather."""
 
+import math
 from collections.abc import Mapping
 
 import moderngl
@@ -14,7 +15,7 @@ class LowResGrid:
     """For each block of the picture, the pixel of a real surface (x, y) and of a virtual one (x, y), as RGBA16I.
 
     -1 marks a block that shows none; -2 - pixel represents real surfaces that objects hide. `virtual_texels` lists
-    the texels that show an object (count, then indices).
+    the texels that show an object (count, then indices), `shown_pixels` the picture's pixels that do.
     """
 
     def __init__(self, gpu: GpuContext, picture_size: tuple[int, int], scale: int) -> None:
@@ -22,6 +23,7 @@ class LowResGrid:
         self.size = (-(-picture_size[0] // scale), -(-picture_size[1] // scale))
         self.pixels = texture_2d(gpu, self.size, 4, "i2")
         self.virtual_texels = gpu.ctx.buffer(bytes(4 * (1 + self.texel_count)))
+        self.shown_pixels = gpu.ctx.buffer(bytes(4 * (1 + math.prod(picture_size))))
         self._kernel = Kernel(gpu, "low_res_grid")
 
     @property
@@ -44,11 +46,13 @@ class LowResGrid:
     def run(self, scene: Bindings) -> None:
         """Selects the pixels."""
         self.empty_list(self.virtual_texels)
+        self.shown_pixels.write(bytes(4))
         self._kernel.run(
             self.size,
             scene,
             sample_pixels_out=self.pixels,
             Texels=self.virtual_texels,
+            ShownPixels=self.shown_pixels,
             picture_pixels=self.picture_size,
             scale=self.scale,
         )
@@ -57,6 +61,7 @@ class LowResGrid:
         """Frees the GL objects."""
         self.pixels.release()
         self.virtual_texels.release()
+        self.shown_pixels.release()
         self._kernel.release()
 
 

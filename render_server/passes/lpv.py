@@ -13,7 +13,8 @@ from jaxtyping import Float64
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
 from deltalight.render_server.passes.gbuffer import NO_CUTOUTS
-from deltalight.render_server.passes.voxels import LOWER_VOLUME, VolumePlacement, VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.volumes import VolumePlacement
+from deltalight.render_server.passes.voxels import LOWER_VOLUME, VoxelMipmap, VoxelStore
 
 COEFFICIENT_BYTES = 16  # per cell and channel: 4 floats
 INJECTED_SUMS = 12  # per cell: 4 coefficients x 3 channels

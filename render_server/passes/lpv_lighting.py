@@ -9,7 +9,8 @@ from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import LightVolume
-from deltalight.render_server.passes.voxels import PlacedVolume, VoxelStore
+from deltalight.render_server.passes.volumes import PlacedVolume
+from deltalight.render_server.passes.voxels import VoxelStore
 
 
 def light_volume_bindings(mu: LightVolume, rho: LightVolume) -> dict[str, Binding]:

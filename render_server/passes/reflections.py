@@ -165,8 +165,6 @@ class ScreenCones:
         self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
         self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
         voxels = {} if march is None else {"VOXELS": 1, **march}
-        if tier.reflection_step == 2:
-            voxels["QUADS"] = 1
         self._kernel = Kernel(
             gpu,
             "screen_cones",
@@ -177,8 +175,12 @@ class ScreenCones:
             **voxels,
         )
         self._traced: moderngl.Texture | None = None
+        self._list_quads: Kernel | None = None
         self._fill: Kernel | None = None
+        self._pixels = grid.shown_pixels
         if tier.reflection_step == 2:
+            self._list_quads = Kernel(gpu, "list_quads")
+            self._pixels = gpu.ctx.buffer(bytes(grid.shown_pixels.size))
             self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
             self._fill = Kernel(gpu, "fill_reflections")
 
@@ -194,14 +196,18 @@ class ScreenCones:
 
         `object_rays`: what rays saw of the objects (`MirrorRays.reflection`), so that cones leave them out.
         """
-        texels: Bindings = {"Texels": self._grid.virtual_texels, "scale": self._grid.scale}
+        if self._list_quads is not None:
+            self._pixels.write(bytes(4))
+            texels: Bindings = {"Texels": self._grid.virtual_texels, "scale": self._grid.scale}
+            self._list_quads.run((self._threads,), texels, scene, ShownPixels=self._pixels)
         rays: Bindings = {"OBJECT_RAYS": object_rays is not None, "object_rays": object_rays}
         self._kernel.run(
             (self._threads,),
             objects.bindings,
-            texels,
             rays,
             scene,
+            ShownPixels=self._pixels,
+            scale=self._grid.scale,
             reflected=self.reflected if self._traced is None else self._traced,
             sample_pixels=self._grid.pixels,
             direct_mu=direct.light.mu,
@@ -210,11 +216,16 @@ class ScreenCones:
             cone_rho=cones.rho,
         )
         if self._fill is not None:
-            self._fill.run((self._threads,), texels, scene, traced=self._traced, reflected=self.reflected)
+            shown = self._grid.shown_pixels
+            self._fill.run(
+                (self._threads,), scene, ShownPixels=shown, traced=self._traced, reflected=self.reflected
+            )
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.reflected, self._traced, self._kernel, self._fill)
+        release_all(self.reflected, self._traced, self._kernel, self._fill, self._list_quads)
+        if self._list_quads is not None:
+            self._pixels.release()
 
 
 class TransmittedLight:
@@ -251,7 +262,7 @@ class TransmittedLight:
             (self._threads,),
             objects.bindings,
             scene,
-            Texels=self._grid.virtual_texels,
+            ShownPixels=self._grid.shown_pixels,
             scale=self._grid.scale,
             reflected_radiance=reflected,
             radiance_out=self.radiance,

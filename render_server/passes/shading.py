@@ -1,6 +1,7 @@
 """Full-resolution shading: direct light on the real surfaces, and radiance of the virtual ones."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import moderngl
@@ -41,7 +42,8 @@ class DirectLight:
 
     With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
     do. Without `objects_shadow` other passes do, and E_rho is E_mu. Pixels that objects do not reach are 0. `texels`
-    lists the blocks of pixels that are shaded; with `reuses`, LightHistory fills it beforehand.
+    lists the blocks of pixels that are shaded; with `reuses`, LightHistory fills it beforehand, and `spared`: blocks
+    whose light without the objects is known, and of which they block none.
     """
 
     def __init__(
@@ -58,10 +60,12 @@ class DirectLight:
         defines = {} if shadow_cones is None else {"SHADOW_CONES": 1, "DIRECTIONS": shadow_cones}
         if not objects_shadow:
             defines = {"REAL_SHADOWS": 1}
+        self.defines: Mapping[str, float | str] = defines
         self._kernel = Kernel(gpu, "direct_light", **defines)
+        self._spared = Kernel(gpu, "direct_light", SPARED=1) if reuses else None
         self._select = Kernel(gpu, "select_direct_texels", **defines)
         self._reuses = reuses
-        self.texels = gpu.ctx.buffer(reserve=4)
+        self.texels, self.spared = (gpu.ctx.buffer(reserve=4) for _ in range(2))
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -85,7 +89,11 @@ class DirectLight:
         voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
         if not self._reuses:
             self.select(grid, self.texels, voxels, scene)
-        self._shade(grid, self.bindings, voxels, _caustics_on(grid, caustics), scene)
+        shared = voxels, _caustics_on(grid, caustics), scene
+        self._shade(grid, self.bindings, *shared)
+        if self._spared is not None and scene["keeps_unblocked"]:
+            listed: Bindings = {**self.bindings, **grid.bindings, "Texels": self.spared}
+            self._spared.run((list_threads(self._gpu, math.prod(self._size)),), listed, *shared)
 
     def select(self, grid: LowResGrid, texels: moderngl.Buffer, *scene: Bindings) -> None:
         """Lists the texels where objects may change light, and clears all light."""
@@ -102,7 +110,9 @@ class DirectLight:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.light, self.lobes, self._kernel, self._select, self.texels)
+        release_all(
+            self.light, self.lobes, self._kernel, self._spared, self._select, self.texels, self.spared
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +151,7 @@ class LightHistory:
             [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)] for _ in range(2)
         )
         self._stale = texture_2d(gpu, grid.size, 1, "u1")
-        self._reproject = Kernel(gpu, "reproject_light")
+        self._reproject = Kernel(gpu, "reproject_light", **direct.defines)
         self._find_stale = Kernel(gpu, "stale_texels")
         self._seen: tuple[LightState | None, Float64[np.ndarray, "4 4"]] = None, np.eye(4)
         self._turn = 0
@@ -185,6 +195,7 @@ class LightHistory:
         direct.select(grid, self._reached, scene)
         self._keep(scene["real_surface_position"])
         grid.empty_list(direct.texels)
+        grid.empty_list(direct.spared)
         self._reproject.run(
             (list_threads(self._gpu, grid.texel_count),),
             shared,
@@ -196,6 +207,7 @@ class LightHistory:
             last_direct_rho=self._last_light.rho,
             Texels=self._reached,
             Needed=direct.texels,
+            Spared=direct.spared,
         )
         self._find_stale.run(
             self._grid.size,
@@ -275,7 +287,7 @@ class VirtualSurface:
             _caustics_on(grid, caustics),
             scene,
             radiance_out=self.radiance,
-            Texels=grid.virtual_texels,
+            ShownPixels=grid.shown_pixels,
             cone_irradiance=cones.virtual,
             cone_specular=cones.virtual_specular,
             screen_reflection=screen,

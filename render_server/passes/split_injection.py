@@ -7,7 +7,8 @@ from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, 
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.volumes import PlacedVolume
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 
 LIGHT_SUMS = 14  # per slot: shaders/common/split_sums.glsl
 
@@ -28,7 +29,7 @@ class RealAlbedo:
         if self.atlas.size != lights.real_atlas.size:
             self.atlas.release()
             self.atlas = texture_2d(self._gpu, lights.real_atlas.size, 4, "f2")
-        threads = (lights.tile_size, lights.tile_size)
+        threads = (list_threads(self._gpu, lights.tile_size**2),)
         for view in range(len(lights.real_views)):
             self._kernel.run(threads, scene, albedo_out=self.atlas, view_index=view)
 
@@ -65,7 +66,7 @@ class SplitInjection:
             "VirtualLight": virtual.delta_sums,
             "real_albedo": real_albedo,
         }
-        threads = (lights.tile_size, lights.tile_size)
+        threads = (list_threads(self._gpu, lights.tile_size**2),)
         for real_views, virtual_views in lights.views_of_lights:
             for view in real_views:
                 self._real.run(threads, sums, scene, view_index=view)

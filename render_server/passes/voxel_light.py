@@ -14,6 +14,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
+from deltalight.render_server.passes.volumes import MOST_VOLUMES
 from deltalight.render_server.passes.voxels import (
     LOWER_SURFELS,
     LOWER_VOLUME,
@@ -23,7 +24,7 @@ from deltalight.render_server.passes.voxels import (
 )
 from deltalight.render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
 
-SUPPORT_BYTES = 24
+SUPPORT_BYTES = 24 * MOST_VOLUMES
 
 SURFEL_LIGHT_BYTES = 2 * 48  # front and back
 GROUP_SUMS_BYTES = 32
@@ -48,6 +49,11 @@ class SurfelGroups:
         self._gpu = gpu
         self._grid = gpu.storage_buffer(group_grid_bytes(volume_size), LOWER_VOLUME)
         self._allocate(0)
+
+    def resize(self, size: int, count: int) -> None:
+        """Makes room for the groups of `count` volumes of `size` voxels an edge; `reset` is next."""
+        self._grid.release()
+        self._grid = self._gpu.storage_buffer(count * group_grid_bytes(size), LOWER_VOLUME)
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -177,7 +183,7 @@ class LightVoxels:
         return self._kernels[kind, gathered]
 
     def reset_support(self, bounds: np.ndarray[Any, np.dtype[np.int32]]) -> None:
-        """Resets the support of the delta to the voxels of the objects (min x, y, z, -max x, y, z)."""
+        """Resets the support of the delta to the voxels of the objects: min x, y, z, -max x, y, z of each volume."""
         self.support.write(bounds.tobytes())
 
     def release(self) -> None:
@@ -261,7 +267,7 @@ class GatherVoxels:
         if not self._gpu.is_software:
             return list_threads(self._gpu)
         edge = store.volume_size / 64
-        return max(SOFTWARE_WALKERS, round(SOFTWARE_WALKERS * edge * edge))
+        return max(SOFTWARE_WALKERS, round(SOFTWARE_WALKERS * edge * edge)) * store.volume_count
 
     def release(self) -> None:
         """Frees the programs."""

@@ -1,9 +1,7 @@
-"""The voxel volume: placement and mipmaps; sparse voxel sets, from triangles to filtered texels."""
+"""Mipmaps of voxel volumes; sparse voxel sets, from triangles to filtered texels."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import moderngl
 import numpy as np
@@ -21,7 +19,7 @@ from deltalight.render_server.gpu.kernel import (
     list_threads,
 )
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock, Vec3
+from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 from deltalight.render_server.scene.triangle_mesh import split_triangles
 
 MEGABYTE = 1_000_000
@@ -39,129 +37,16 @@ LARGEST_ITEM_BYTES = (
 )
 LOWER_VOLUME, LOWER_SURFELS = "method.volume_size", "method.volume_size or method.triangle_budget"
 
-SPARE_EDGE = (
-    0.125  # of a volume that stays while its objects move: the light around them changes that far at least
-)
-
 BORDER_VOXELS = 1e-3  # of rounding: this near, a triangle counts on both sides of a border
-SNAP_VOXELS = 0.01
 LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 
 
-@dataclass(frozen=True, eq=False)
-class VolumeBlock(Block):
-    """Uniform block `Volume` of shaders/common/volume.glsl."""
+def mipmap_shape(size: int, directions: int, count: int = 1) -> tuple[int, int, int]:
+    """Returns the size (x, y, z) of the texture of all levels and directions (shaders/common/volume.glsl).
 
-    volume_origin: Vec3
-    voxel_edge: Float
-    volume_size: Int
-    volume_levels: Int
-
-
-@dataclass(frozen=True, eq=False)
-class FarVolumeBlock(Block):
-    """Uniform block `FarVolume` of shaders/common/march.glsl: the coarse volume beyond; size 0 if unused."""
-
-    far_origin: Vec3
-    far_edge: Float
-    far_size: Int
-    far_levels: Int
-
-
-@dataclass(frozen=True)
-class VolumePlacement:
-    """A cube of `size`^3 voxels of edge `voxel_edge` m; its low corner `origin` (world, m) is snapped to voxels."""
-
-    origin: tuple[float, float, float]
-    voxel_edge: float
-    size: int
-
-    @property
-    def levels(self) -> int:
-        """Number of mip levels: halvings that leave whole cells, down to 2 or 3 cells per edge."""
-        levels, cells = 1, self.size
-        while cells % 2 == 0 and cells > 2:
-            cells //= 2
-            levels += 1
-        return levels
-
-    def block(self) -> VolumeBlock:
-        """Returns the placement's uniform block."""
-        return VolumeBlock(self.origin, self.voxel_edge, self.size, self.levels)
-
-    def far_block(self, *, is_used: bool) -> FarVolumeBlock:
-        """Returns the placement's block as the coarse volume beyond; cones end before it unless it `is_used`."""
-        return FarVolumeBlock(self.origin, self.voxel_edge, self.size if is_used else 0, self.levels)
-
-    def voxel_bounds(self, points: Float64[np.ndarray, "n 3"]) -> np.ndarray[Any, np.dtype[np.int32]]:
-        """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
-        voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
-        voxels = np.clip(voxels, 0, self.size - 1)
-        low, high = short_axis.bounds(voxels)
-        return np.concatenate([low, -high]).astype(np.int32)
-
-
-def place_volume(
-    low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"], size: int, edge_m: float | None
-) -> VolumePlacement:
-    """Places a cube around the objects' bounds: twice their longest edge ([P1]) unless `edge_m` is given.
-
-    Snapping to voxels keeps the grid fixed in the world while the objects move; rounding errors of a place on the
-    border between two voxels do not move it.
+    `count`: of volumes, side by side.
     """
-    edge = edge_m if edge_m is not None else 2.0 * float(np.max(high - low))
-    voxel = edge / size
-    origin = np.floor(((low + high) / 2 - edge / 2) / voxel + SNAP_VOXELS) * voxel
-    return VolumePlacement((float(origin[0]), float(origin[1]), float(origin[2])), voxel, size)
-
-
-def keep_placement(
-    old: VolumePlacement,
-    low: Float64[np.ndarray, "3"],
-    high: Float64[np.ndarray, "3"],
-    wanted: VolumePlacement,
-) -> bool:
-    """Returns whether objects that move may stay in the volume that was placed around them before.
-
-    They must keep away from its border by SPARE_EDGE of its edge, and its voxels must be of about the `wanted` size.
-    """
-    edge = old.size * old.voxel_edge
-    origin, spare = np.array(old.origin), SPARE_EDGE * edge
-    fits = bool((low >= origin + spare).all() and (high <= origin + edge - spare).all())
-    return fits and old.size == wanted.size and 0.8 < wanted.voxel_edge / old.voxel_edge < 1.25
-
-
-class PlacedVolume:
-    """A volume's current placement and its uniform block."""
-
-    def __init__(self, gpu: GpuContext, placement: VolumePlacement) -> None:
-        self._placement = placement
-        self._block = UniformBlock(gpu, placement.block())
-
-    @property
-    def placement(self) -> VolumePlacement:
-        """The current placement."""
-        return self._placement
-
-    @property
-    def bindings(self) -> dict[str, Binding]:
-        """The uniform block of the current placement."""
-        return {"Volume": self._block}
-
-    def place(self, placement: VolumePlacement) -> "PlacedVolume":
-        """Moves the volume and returns it."""
-        self._placement = placement
-        self._block.write(placement.block())
-        return self
-
-    def release(self) -> None:
-        """Frees the block."""
-        self._block.release()
-
-
-def mipmap_shape(size: int, directions: int) -> tuple[int, int, int]:
-    """Returns the size (x, y, z) of the texture of all levels and directions (shaders/common/volume.glsl)."""
-    return size, size, directions * size + math.ceil(directions / 2) * size // 2
+    return count * size, size, directions * size + math.ceil(directions / 2) * size // 2
 
 
 def occupancy_bytes(size: int) -> int:
@@ -206,19 +91,28 @@ class VoxelMipmap:
     """
 
     def __init__(self, gpu: GpuContext, size: int, directions: int) -> None:
-        shape = mipmap_shape(size, directions)
+        self._gpu = gpu
+        self.directions = directions
+        self._allocate(size, 1)
+
+    def resize(self, size: int, count: int) -> None:
+        """Makes room for `count` volumes of `size` voxels an edge, all empty."""
+        self.release()
+        self._allocate(size, count)
+
+    def _allocate(self, size: int, count: int) -> None:
+        gpu, shape = self._gpu, mipmap_shape(size, self.directions, count)
         limit = gpu.ctx.info["GL_MAX_3D_TEXTURE_SIZE"]
         if max(shape) > limit:
             raise DeltalightError(
                 f"This GPU's 3-D textures end at {limit} texels, {size}^3 voxels need {max(shape)}: "
                 "lower method.volume_size."
             )
-        self.directions = directions
         self.texture = gpu.ctx.texture3d(shape, 4, dtype="f2")
         self.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self.texture.repeat_x = self.texture.repeat_y = self.texture.repeat_z = False
         clear_volume(gpu, self.texture)
-        self.occupied = gpu.storage_buffer(occupancy_bytes(size), LOWER_VOLUME)
+        self.occupied = gpu.storage_buffer(count * occupancy_bytes(size), LOWER_VOLUME)
 
     def release(self) -> None:
         """Frees the texture and the buffer."""
@@ -233,16 +127,27 @@ class VoxelStore:
 
     def __init__(self, gpu: GpuContext, volume_size: int) -> None:
         self._gpu = gpu
-        self.volume_size = volume_size
-        self.grid = gpu.storage_buffer(volume_size**3 * 4, LOWER_VOLUME)
-        clear_buffer(gpu, self.grid)
+        self._allocate_grid(volume_size, 1)
         self._allocate(LEAST_SURFELS)
+        self.reset(0)
+
+    def _allocate_grid(self, size: int, count: int) -> None:
+        self.volume_size, self.volume_count = size, count
+        self.grid = self._gpu.storage_buffer(count * size**3 * 4, LOWER_VOLUME)
+        clear_buffer(self._gpu, self.grid)
+
+    def resize(self, size: int, count: int) -> None:
+        """Makes room for `count` volumes of `size` voxels an edge, and forgets all voxels."""
+        self.grid.release()
+        self._allocate_grid(size, count)
+        self._release_growing()
+        self._allocate(self.surfel_capacity)
         self.reset(0)
 
     @property
     def slot_capacity(self) -> int:
         """Greatest number of touched voxels."""
-        return min(self.surfel_capacity, self.volume_size**3)
+        return min(self.surfel_capacity, self.volume_count * self.volume_size**3)
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -313,12 +218,24 @@ class Voxelize:
 
     def run(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"], volume: PlacedVolume) -> None:
         """Fills the empty `store` with the surfels of the triangles inside the volume."""
-        pieces, bound = pieces_in_volume(corners, volume.placement)
-        store.reset(bound)
-        if not len(pieces):
-            return
+        self.run_all(store, [corners], volume)
+
+    def run_all(
+        self, store: VoxelStore, corners: Sequence[Float32[np.ndarray, "m 3 10"]], volume: PlacedVolume
+    ) -> None:
+        """Fills the empty `store`; `corners` are those of each volume."""
+        inside = [pieces_in_volume(own, each) for own, each in zip(corners, volume.placements, strict=True)]
+        store.reset(sum(bound for _, bound in inside))
+        for index, (pieces, bound) in enumerate(inside):
+            if len(pieces):
+                self._fill(store, pieces, bound, {**volume.bindings, "filled_volume": index})
+
+    def _fill(
+        self, store: VoxelStore, pieces: Float32[np.ndarray, "k 3 10"], bound: int, volume: Bindings
+    ) -> None:
+        """Adds the surfels of triangles in one of the volumes."""
         self._write(pieces, bound)
-        shared: Bindings = {**volume.bindings, "Triangles": self._triangles, "Pairs": self._pairs}
+        shared: Bindings = {**volume, "Triangles": self._triangles, "Pairs": self._pairs}
         self._find_pairs.run((len(pieces),), shared, triangle_count=len(pieces))
         self._clip.run((list_threads(self._gpu, bound),), shared, store.bindings)
 
@@ -461,9 +378,8 @@ class FilterVoxels:
         """Rebuilds all levels from level 0."""
         for level in range(1, volume.placement.levels):
             cells = volume.placement.size >> level
-            self._kernel.run(
-                (cells, cells, cells * DIRECTIONS), volume.bindings, mipmap=mipmap.texture, level=level
-            )
+            slabs = cells * DIRECTIONS * len(volume.placements)
+            self._kernel.run((cells, cells, slabs), volume.bindings, mipmap=mipmap.texture, level=level)
 
     def release(self) -> None:
         """Frees the program."""

@@ -4,8 +4,10 @@ A line `deltalight material VERSION SHA256`, then a .npz archive of arrays, of w
 """
 
 import hashlib
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -56,23 +58,27 @@ def read_material(path: Path) -> GaussianBrdf | PolynomialTexture:
     except OSError as error:
         raise DeltalightError(f"{path} cannot be read ({error.strerror}); {_ADVICE}.") from error
     if not head.startswith(_MAGIC) or len(head.split()) != 4:
-        raise DeltalightError(f"{path.name} is no precomputed material; {_ADVICE}.")
+        raise DeltalightError(f"{path} is no precomputed material; {_ADVICE}.")
     version, digest = head.split()[2:]
     if version != str(VERSION).encode():
         raise DeltalightError(
-            f"{path.name} is a precomputed material of version {version.decode(errors='replace'):.20}, and this "
+            f"{path} is a precomputed material of version {version.decode(errors='replace'):.20}, and this "
             f"release reads version {VERSION}; {_ADVICE}."
         )
+    if len(content) > _LARGEST_BYTES:
+        raise DeltalightError(
+            f"{path} is larger than {_LARGEST_BYTES >> 20} MB, which no material is; {_ADVICE}."
+        )
     if hashlib.sha256(content).hexdigest().encode() != digest:
-        raise DeltalightError(f"{path.name} is damaged or cut short; {_ADVICE} again.")
+        raise DeltalightError(f"{path} is damaged or cut short; {_ADVICE} again.")
     made = _made(_unpacked(content))
     if made is None:
-        raise DeltalightError(f"{path.name} holds no material that can be drawn; {_ADVICE} again.")
+        raise DeltalightError(f"{path} holds no material that can be drawn; {_ADVICE} again.")
     return made
 
 
-def _unpacked(content: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an archive; none if it is none."""
+def _unpacked(content: bytes) -> Mapping[str, object]:
+    """The members of an archive, arrays if it is a material's; none if it is none."""
     try:
         with ZipFile(BytesIO(content)) as archive:
             if sum(item.file_size for item in archive.infolist()) > _LARGEST_BYTES:
@@ -83,9 +89,10 @@ def _unpacked(content: bytes) -> dict[str, np.ndarray]:
         return {}
 
 
-def _made(arrays: dict[str, np.ndarray]) -> GaussianBrdf | PolynomialTexture | None:
+def _made(arrays: Mapping[str, Any]) -> GaussianBrdf | PolynomialTexture | None:
     """The material of these arrays; None if they are none."""
-    if any(each.dtype.kind != "f" for each in arrays.values()):
+    # A member that is no array comes as bytes.
+    if any(not isinstance(each, np.ndarray) or each.dtype.kind != "f" for each in arrays.values()):
         return None
     if arrays.keys() == {"coefficients"}:
         return _polynomial(arrays["coefficients"])

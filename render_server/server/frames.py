@@ -106,6 +106,12 @@ class FrameSource:
 class PairingSettings(StrictModel):
     """How streams are paired."""
 
+    together_ms: float = Field(
+        default=10.0,
+        ge=0,
+        le=1000,
+        description="How long a frame waits for those of the room's other cameras that are due, ms.",
+    )
     depth_tolerance_ms: float = Field(
         default=20.0,
         ge=0,
@@ -137,13 +143,19 @@ class FrameAssembler:
     """Takes decoded messages in any order and returns the newest complete frame.
 
     `needs_depth`: the scene's real geometry comes from depth. Payloads are decoded for the selected frame only.
-    `counts` counts the others: `superseded` (overtaken by a newer frame), `unpaired_pose` (passed through when the
-    wait for a pose timed out), `unpaired_depth` (dropped: no depth near its time).
+    `counts`, which several may share, counts the others: `superseded` (overtaken by a newer frame), `unpaired_pose`
+    (passed through when the wait for a pose timed out), `unpaired_depth` (dropped: no depth near its time).
     """
 
-    def __init__(self, settings: PairingSettings | None = None, *, needs_depth: bool = True) -> None:
+    def __init__(
+        self,
+        settings: PairingSettings | None = None,
+        *,
+        needs_depth: bool = True,
+        counts: Counter[str] | None = None,
+    ) -> None:
         self.needs_depth = needs_depth
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter() if counts is None else counts
         self._settings = settings or PairingSettings()
         self._colors: deque[_Held[ColorMessage]] = deque()
         self._depths: deque[_Held[DepthMessage]] = deque(maxlen=KEPT_MESSAGES)
@@ -155,12 +167,6 @@ class FrameAssembler:
         self._camera = _Unchanged(CameraModel.from_dict)
         self._depth_camera = _Unchanged(CameraModel.from_dict)
         self._board = _Unchanged(_board_spec)
-
-    def restarted(self) -> "FrameAssembler":
-        """Returns an assembler without messages, for another source; counts continue."""
-        fresh = FrameAssembler(self._settings, needs_depth=self.needs_depth)
-        fresh.counts = self.counts
-        return fresh
 
     def add(self, message: Message, parts: Sequence[memoryview], received_ns: int) -> None:
         """Stores a message until its partners arrive; ignores streams other than `TOPICS`."""

@@ -7,6 +7,7 @@ which owns the OpenGL context and does nothing but render and execute commands.
 import queue
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
@@ -25,7 +26,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_bytes
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.message_fields import Name
-from deltalight.protocol.messages import ControlRequest, StatsMessage
+from deltalight.protocol.messages import CamerasMessage, ControlRequest, StatsMessage
 from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
@@ -35,18 +36,21 @@ from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.renderer import SceneRenderer
-from deltalight.render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
+from deltalight.render_server.server.frames import FrameSource, PairingSettings
 from deltalight.render_server.server.renderer import Renderer
 from deltalight.render_server.server.session import RenderedFrame, RenderSession, SourceInUse
 
-GPU_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
+SHORT_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive
 STATS_INTERVAL_S = 1.0
 LAST_WORDS_MS = 100  # for what was sent at the end, where a subscriber is slow
 ANSWER_TIMEOUT_S = 20.0
 SNAPSHOT_TIMEOUT_S = 120.0  # a frame in many views and by several methods, in software
 
+WAITING_OF_A_TOPIC = 2
+
 Payload = dict[str, object]
+Sendable = RenderedFrame | CamerasMessage | StatsMessage
 
 log = structlog.get_logger()
 
@@ -132,7 +136,7 @@ def _refuse(request: ControlRequest) -> Payload:
 class Sender:
     """Encodes and publishes in its own thread, while the next frame is rendered.
 
-    OpenCV encodes without the interpreter lock. Two messages may wait; the renderer never does.
+    OpenCV encodes without the interpreter lock. Two messages of a topic may wait; the renderer never does.
     """
 
     def __init__(self, publisher: Publisher, jpeg_quality: int) -> None:
@@ -140,7 +144,8 @@ class Sender:
         self._publisher = publisher
         self._quality = jpeg_quality
         self._generation = 0  # pictures of earlier generations are not sent
-        self._waiting: queue.Queue[tuple[RenderedFrame | StatsMessage | None, int]] = queue.Queue(maxsize=2)
+        self._waiting: queue.SimpleQueue[tuple[Sendable | None, int]] = queue.SimpleQueue()
+        self._places = defaultdict[str, threading.Semaphore](lambda: threading.Semaphore(WAITING_OF_A_TOPIC))
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
         self._thread.start()
 
@@ -149,38 +154,47 @@ class Sender:
         self._waiting.put((None, self._generation))
         self._thread.join(timeout=1.0)
 
-    def offer(self, item: RenderedFrame | StatsMessage) -> None:
+    def offer(self, item: Sendable) -> None:
         """Queues an item, or counts it as dropped if sending is slower than rendering."""
-        try:
-            self._waiting.put_nowait((item, self._generation))
-        except queue.Full:
-            self.dropped += 1
+        self._queue(item, blocking=False)
 
     def say_last(self, item: StatsMessage) -> None:
         """Queues an item; waits for room."""
-        self._waiting.put((item, self._generation))
+        self._queue(item, blocking=True)
 
     def forget(self) -> None:
         """Discards all pictures offered so far."""
         self._generation += 1
+
+    def _queue(self, item: Sendable, *, blocking: bool) -> None:
+        place = self._places[_topic(item)]
+        if place.acquire(blocking=blocking):
+            self._waiting.put((item, self._generation))
+        else:
+            self.dropped += 1
 
     def _run(self) -> None:
         while True:
             item, generation = self._waiting.get()
             if item is None:
                 return
+            self._places[_topic(item)].release()
             try:
                 pieces = self._multipart(item)
-                if generation == self._generation or isinstance(item, StatsMessage):
+                if generation == self._generation or not isinstance(item, RenderedFrame):
                     self._publisher.send(pieces)
             except DeltalightError as fault:
                 log.warning("not sent", fault=str(fault))
 
-    def _multipart(self, item: RenderedFrame | StatsMessage) -> list[bytes]:
-        if isinstance(item, StatsMessage):
+    def _multipart(self, item: Sendable) -> list[bytes]:
+        if not isinstance(item, RenderedFrame):
             return encode(item)
         jpegs = [encode_color(picture, "jpeg", self._quality) for picture in item.pictures]
         return encode(item.message.model_copy(update={"encoding": "jpeg"}), jpegs)
+
+
+def _topic(item: Sendable) -> str:
+    return item.message.topic if isinstance(item, RenderedFrame) else item.topic
 
 
 def warm_up() -> None:
@@ -254,7 +268,7 @@ def serve(
         session = RenderSession(
             renderer,
             scene,
-            assembler=FrameAssembler(settings.pairing),
+            pairing=settings.pairing,
             name=settings.name,
             epoch=settings.epoch,
             renderer_name=renderer_name,
@@ -277,7 +291,9 @@ def serve(
 
 def _patience_s(session: RenderSession) -> float:
     """Returns how long to wait for a message."""
-    return GPU_TIMEOUT_S if session.is_waiting_for_gpu else RECEIVE_TIMEOUT_S
+    if session.has_picture:
+        return 0.0
+    return SHORT_TIMEOUT_S if session.is_waiting else RECEIVE_TIMEOUT_S
 
 
 def _loop(session: RenderSession, source: FrameSource, sender: Sender, commands: CommandQueue) -> None:
@@ -286,9 +302,13 @@ def _loop(session: RenderSession, source: FrameSource, sender: Sender, commands:
         for multipart in (source.latest(_patience_s(session)) or {}).values():
             session.receive(multipart)
         rendered = session.step()
+        is_due = time.monotonic() >= stats_due_s
+        cameras = session.cameras(if_changed=not is_due)
+        if cameras is not None:  # before pictures that name one of them
+            sender.offer(cameras)
         if rendered is not None:
             sender.offer(rendered)
-        if time.monotonic() >= stats_due_s:
+        if is_due:
             _offer_stats(session, sender)
             stats_due_s = time.monotonic() + STATS_INTERVAL_S
         commands.serve(session.execute)

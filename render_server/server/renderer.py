@@ -12,6 +12,7 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.started_frame import CameraFrame
 
 
 class OtherView(Protocol):
@@ -107,24 +108,24 @@ class Renderer(Protocol):
     def notices(self) -> Sequence[str]:
         """Sentences for the user; the list only grows."""
 
-    def submit(
+    def submit_cameras(
         self,
-        frame: ViewFrame,
+        taken: Sequence[CameraFrame],
         *,
         with_linear: bool = False,
         whole: bool = False,
         others: Sequence[ShownView] = (),
-    ) -> Pending:
-        """Starts the composite of one frame, at full size if `whole`, and the same in `others`.
+    ) -> Sequence[Pending]:
+        """Starts the pictures of a room's frames that are to be shown, at full size if `whole`, also in `others`.
 
-        Frames finish in the order of their starts.
+        They finish in the order of their starts.
         """
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size."""
 
-    def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
-        """Picks what the newest picture shows at a pixel, looking through the object `ignore`."""
+    def pick(self, x: float, y: float, ignore: str | None = None, camera: str | None = None) -> Pick:
+        """Picks what a camera's newest picture shows at a pixel, looking through the object `ignore`."""
 
     def room(self) -> Room:
         """Returns the real scene as the newest picture shows it."""

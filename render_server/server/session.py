@@ -22,6 +22,8 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import as_counts, as_sentence
 from deltalight.protocol.messages import (
     MAX_OTHERS,
+    CamerasMessage,
+    CameraStatus,
     CompositeMessage,
     ControlRequest,
     OtherPicture,
@@ -32,7 +34,8 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.gpu.lost_context import GpuResetError
-from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
+from deltalight.render_server.server.cameras import RoomCameras, Taken
+from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceOrder
 from deltalight.render_server.server.renderer import Pending, Renderer
 from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
 
@@ -46,13 +49,17 @@ log = structlog.get_logger()
 
 
 class PickOrder(StrictModel):
-    """A pixel of the composite (centres are at integers), and an object to look through."""
+    """A pixel of the composite (centres are at integers), and an object to look through.
+
+    `camera`: whose picture; None = the first one's.
+    """
 
     model_config = ConfigDict(strict=True)
 
     x: float
     y: float
     ignore: str | None = None
+    camera: str | None = None
 
 
 class WatchOrder(StrictModel):
@@ -77,8 +84,13 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class _Started:
-    """A frame in flight on the GPU, with id, revision and view of the scene that it was started with."""
+    """A frame in flight on the GPU, with id, revision and view of the scene that it was started with.
 
+    `name` is who the picture says that it is of.
+    """
+
+    name: str
+    camera: str
     frame: AssembledFrame
     pending: Pending
     scene_id: str | None
@@ -113,7 +125,7 @@ class RenderSession:
         renderer: Renderer,
         scene: SceneDocument,
         *,
-        assembler: FrameAssembler | None = None,
+        pairing: PairingSettings | None = None,
         name: str = "render-server",
         epoch: int | None = None,
         renderer_name: str = "",
@@ -130,8 +142,10 @@ class RenderSession:
         self.stopping = False
         self._watchers: dict[str, tuple[int, tuple[ShownView, ...]]] = {}  # when each said so, and what
         self._renderer = renderer
-        self._assembler = assembler or FrameAssembler()
-        self._assembler.needs_depth = _needs_depth(scene)
+        self._cameras = RoomCameras(
+            pairing, lambda fault: self._count_fault("bad_frames", fault), needs_depth=_needs_depth(scene)
+        )
+        self._told: Mapping[str, CameraStatus] = {}  # of the cameras, by name
         self._name = name
         self._epoch = epoch
         self._renderer_name = renderer_name
@@ -140,10 +154,10 @@ class RenderSession:
         self._use_source = use_source
         self._count_objects = count_objects
         self._clock_ns = clock_ns
-        self._newest: AssembledFrame | None = None
-        self._finished: RenderedFrame | None = None
-        self._started: _Started | None = None
-        self._rendered_ns: deque[int] = deque()
+        self._newest: tuple[Taken, ...] = ()
+        self._finished: deque[RenderedFrame] = deque()
+        self._started: tuple[_Started, ...] = ()
+        self._rendered: deque[tuple[int, str]] = deque()  # when, and the camera
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._logged_notices = 0
@@ -156,33 +170,34 @@ class RenderSession:
         except DeltalightError as fault:
             self._count_fault("bad_messages", fault)
             return
-        self._assembler.add(message, parts, multipart.received_ns)
+        self._cameras.add(message, parts, multipart)
 
     @property
-    def is_waiting_for_gpu(self) -> bool:
-        """Whether the next step is to finish a started frame."""
-        return self._started is not None
+    def has_picture(self) -> bool:
+        """Whether the next step returns a picture that is finished."""
+        return bool(self._finished)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the next step is to finish a started frame, or to start one that has waited for others."""
+        return bool(self._started) or self._cameras.is_waiting
 
     def step(self) -> RenderedFrame | None:
-        """Starts the newest frame, if one is ready, and returns the one started before (in software: itself).
+        """Starts the newest frames, if some are ready, and returns a picture of those started before.
 
-        A picture that a command finished comes first. A frame that cannot be rendered is counted and logged.
+        (In software, of themselves.) The pictures of several cameras come one by one, and before others are started,
+        as one does that a command finished. A frame that cannot be rendered is counted and logged.
 
         Raises:
             GpuResetError: the GPU was reset: this process renders nothing any more.
             Exception: `MAXIMUM_FAULTS_IN_A_ROW` unexpected faults without a picture: the renderer is broken, not the
                 frames, and only a restart of the process helps.
         """
-        if self._finished is not None:
-            finished, self._finished = self._finished, None
-            return finished
+        if self._finished:
+            return self._finished.popleft()
+        taken = self._cameras.take(self._clock_ns())
         try:
-            frame = self._assembler.take(self._clock_ns())
-        except Exception as fault:  # a node's data is no reason to end
-            self._count_fault("bad_frames", fault)
-            return None
-        try:
-            return self._render(frame)
+            return self._render(taken)
         except GpuResetError:
             self.counts["gpu_resets"] += 1
             raise
@@ -195,26 +210,43 @@ class RenderSession:
                 raise
         return None
 
+    def cameras(self, *, if_changed: bool = False) -> CamerasMessage | None:
+        """Returns the room's cameras; None where there are and were none.
+
+        `if_changed`: also None if nothing but their frames is another than the last time.
+        """
+        told, self._told = self._told, self._cameras.statuses
+        if not (told or self._told) or (if_changed and told == self._told):
+            return None
+        return CamerasMessage(node=self._name, capture_ns=self._clock_ns(), cameras=self._cameras.entries)
+
     def drops(self) -> dict[str, int]:
         """Returns the numbers of lost frames, by cause; topics come last, because nodes choose their number."""
-        return as_counts({**self._assembler.counts, **self.counts, **self._mailbox_drops()})
+        return as_counts({**self._cameras.counts, **self.counts, **self._mailbox_drops()})
 
     def stats(self, ends_by: DeltalightError | None = None) -> StatsMessage:
         """Returns the state of the session, which may be that it ends by a fault."""
         now_ns = self._clock_ns()
-        while self._rendered_ns and self._rendered_ns[0] < now_ns - RATE_WINDOW_S * 1e9:
-            self._rendered_ns.popleft()
-        is_running = bool(self._rendered_ns) and self._rendered_ns[-1] > now_ns - WAITING_AFTER_S * 1e9
+        while self._rendered and self._rendered[0][0] < now_ns - RATE_WINDOW_S * 1e9:
+            self._rendered.popleft()
+        is_running = bool(self._rendered) and self._rendered[-1][0] > now_ns - WAITING_AFTER_S * 1e9
         state: ProcessState = "degraded" if self._last_fault else "running" if is_running else "waiting"
         fault = self._last_fault if ends_by is None else str(ends_by)
         return StatsMessage(
             node=self._name,
             capture_ns=now_ns,
             state=state if ends_by is None else "stopping",
-            detail=as_sentence("; ".join(filter(None, (self._renderer_name, fault)))),
-            rates={"frames_per_s": len(self._rendered_ns) / RATE_WINDOW_S},
+            detail=as_sentence("; ".join(filter(None, (self._renderer_name, fault, *self._cameras.remarks)))),
+            rates=self._rates(),
             drops=self.drops(),
         )
+
+    def _rates(self) -> dict[str, float]:
+        """Returns the rate of the fastest camera's pictures and, of several cameras, that of each."""
+        counts = Counter(camera for _, camera in self._rendered)
+        fastest = max(counts.values(), default=0)
+        each = {f"frames_per_s {name}": count for name, count in counts.items() if self._cameras.are_several}
+        return {name: count / RATE_WINDOW_S for name, count in {"frames_per_s": fastest, **each}.items()}
 
     def execute(self, request: ControlRequest) -> dict[str, object]:
         """Executes a command between two frames and returns the payload of the reply.
@@ -273,7 +305,7 @@ class RenderSession:
 
     def _pick(self, request: ControlRequest) -> dict[str, object]:
         order = validate(PickOrder, request.payload, "the command pick")
-        return self._renderer.pick(order.x, order.y, order.ignore).as_dict()
+        return self._renderer.pick(order.x, order.y, order.ignore, order.camera).as_dict()
 
     def _room(self, request: ControlRequest) -> dict[str, object]:
         order = validate(RoomOrder, request.payload, "the command room")
@@ -282,11 +314,13 @@ class RenderSession:
 
     def _snapshot(self, request: ControlRequest) -> dict[str, object]:
         order = validate(SnapshotOrder, request.payload, "the command snapshot")
-        frame = self._newest
+        wanted = self._newest[:1] if order.camera is None else self._newest
+        frame = next((each.frame for each in wanted if order.camera in (None, each.camera)), None)
         if frame is None:
             raise DeltalightError("No frame has come yet; take the snapshot when there is a picture.")
         self._finish_started()
-        taken = take_snapshot(self._renderer, self.scene, frame.view, order)
+        room = [each.shown(is_shown=each.frame is frame) for each in self._newest]
+        taken = take_snapshot(self._renderer, self.scene, room, order)
         return {
             "frame_id": frame.color.frame_id,
             "capture_ns": frame.color.capture_ns,
@@ -299,42 +333,58 @@ class RenderSession:
         self._finish_started()
         source = self._use_source(order.endpoints)
         if source.is_another:
-            self._finished = self._newest = None  # of the previous source
-            self._assembler = self._assembler.restarted()
+            self._newest = ()  # of the previous source
+            self._finished.clear()
+            self._cameras.restart()
             self._renderer.forget_frames()
         return {"endpoints": list(source.endpoints)}
 
     def _finish_started(self) -> None:
-        """Waits for the frame on the GPU, so that a command can use it; the next step returns its picture."""
-        before, self._started = self._started, None
-        if before is not None:
-            self._finished = self._finish(before)
+        """Waits for the frames on the GPU, so that a command can use it; the next steps return their pictures."""
+        before, self._started = self._started, ()
+        self._finished.extend(self._finish(each) for each in before)
 
-    def _render(self, frame: AssembledFrame | None) -> RenderedFrame | None:
-        before, started = self._started, None
-        if frame is not None:
-            self._newest = frame
-            started = self._start(frame)  # a fault leaves the frame before in flight
+    def _render(self, taken: tuple[Taken, ...]) -> RenderedFrame | None:
+        before, started = self._started, tuple[_Started, ...]()
+        if taken:
+            self._newest = taken
+            started = self._start(taken)  # a fault leaves the frames before in flight
         self._started = started
-        if before is None and self._started is not None and self._started.pending.immediate:
-            before, self._started = self._started, None
-        return None if before is None else self._finish(before)
+        if not before and all(each.pending.immediate for each in self._started):
+            before, self._started = self._started, ()
+        self._finished.extend(self._finish(each) for each in before)
+        return self._finished.popleft() if self._finished else None
 
-    def _start(self, frame: AssembledFrame) -> "_Started":
+    def _start(self, taken: tuple[Taken, ...]) -> tuple["_Started", ...]:
+        """Starts a picture of each new frame; the others light the room."""
         view = self.scene.output.view
         others = tuple(each for each in self.watched if each != view)
-        pending = self._renderer.submit(frame.view, others=others)
-        return _Started(frame, pending, self.scene_id, self.scene.revision, view)
+        room = [each.shown(is_shown=each.is_new) for each in taken]
+        pending = self._renderer.submit_cameras(room, others=others)
+        are_several = self._cameras.are_several
+        return tuple(
+            _Started(
+                each.camera if are_several else self._name,
+                each.camera,
+                each.frame,
+                started,
+                self.scene_id,
+                self.scene.revision,
+                view,
+            )
+            for each, started in zip([each for each in taken if each.is_new], pending, strict=True)
+        )
 
     def _finish(self, started: "_Started") -> RenderedFrame:
         composite, frame = started.pending.finish(), started.frame
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._log_notices()
-        self._rendered_ns.append(self._clock_ns())
+        rendered_ns = self._clock_ns()
+        self._rendered.append((rendered_ns, started.camera))
         color = frame.color
         message = CompositeMessage(
-            node=self._name,
+            node=started.name,
             frame_id=color.frame_id,
             capture_ns=color.capture_ns,
             clock_offset_ns=color.clock_offset_ns,
@@ -347,7 +397,7 @@ class RenderSession:
             camera=composite.camera.to_dict(),
             world_from_camera=_rows(composite.world_from_camera),
             received_ns=frame.received_ns,
-            rendered_ns=self._rendered_ns[-1],
+            rendered_ns=rendered_ns,
             pass_times_ms=composite.pass_times_ms,
             reused_pass_times_ms=composite.reused_pass_times_ms,
             lights=tuple(composite.lights),
@@ -390,7 +440,7 @@ class RenderSession:
 
     def _use_scene(self, scene: SceneDocument, scene_id: str | None) -> dict[str, object]:
         self._renderer.set_scene(scene)
-        self._assembler.needs_depth = _needs_depth(scene)
+        self._cameras.need_depth(_needs_depth(scene))
         self.scene, self.scene_id = scene, scene_id
         self._keep_scene(scene)
         return {"revision": scene.revision}

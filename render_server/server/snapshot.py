@@ -1,6 +1,6 @@
 """Snapshots: one frame rendered into files in several views and by several methods, with linear radiance."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +17,7 @@ from deltalight.protocol.frames import ViewFrame, linear_color
 from deltalight.protocol.message_fields import Name
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.started_frame import CameraFrame
 
 CAMERA_VIEW = "camera"
 EXR_NAME = "composite.exr"
@@ -32,9 +33,13 @@ class SnapshotPicture(StrictModel):
 
 
 class SnapshotOrder(StrictModel):
-    """What to write into an existing folder; `exr` adds composite.exr (linear, the scene's own method)."""
+    """What to write into an existing folder; `exr` adds composite.exr (linear, the scene's own method).
+
+    `camera`: whose frame; None = the first one's.
+    """
 
     folder: Path
+    camera: str | None = None
     pictures: tuple[SnapshotPicture, ...] = Field(default=(), max_length=MAX_PICTURES, fail_fast=True)
     exr: bool = False
 
@@ -75,8 +80,10 @@ class SnapshotRenderer(Protocol):
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size."""
 
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> StartedPicture:
-        """Starts a composite, at full size if `whole`."""
+    def submit_cameras(
+        self, taken: Sequence[CameraFrame], *, with_linear: bool = False, whole: bool = False
+    ) -> Sequence[StartedPicture]:
+        """Starts the composites that are to be shown, at full size if `whole`."""
 
 
 @dataclass
@@ -98,11 +105,12 @@ class Snapshot:
 
 
 def take_snapshot(
-    renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame, order: SnapshotOrder
+    renderer: SnapshotRenderer, scene: SceneDocument, taken: Sequence[CameraFrame], order: SnapshotOrder
 ) -> Snapshot:
     """Writes the ordered pictures of one frame; afterwards the renderer shows `scene` and that frame again.
 
-    No frame may be in flight. Rendering the same frame again adds nothing to averages over frames.
+    `taken`: the room's frames, of which that one is to be shown. None may be in flight. Rendering the same frames
+    again adds nothing to averages over frames.
 
     Raises:
         DeltalightError: the folder does not exist.
@@ -117,32 +125,47 @@ def take_snapshot(
         for picture in order.pictures:
             file = f"{picture.name}.png"
             with snapshot.writing(picture.name, file):
-                write_png(folder / file, _picture(renderer, scene, frame, picture))
+                write_png(folder / file, _picture(renderer, scene, taken, picture))
         if order.exr:
             with snapshot.writing(EXR_NAME, EXR_NAME), replacing(folder / EXR_NAME) as temporary:
-                write_exr(temporary, _linear(renderer, scene, frame))
+                write_exr(temporary, _linear(renderer, scene, taken))
     finally:
         renderer.set_scene(scene)
         with suppress(DeltalightError):  # it was reported when the frame arrived
-            renderer.submit(frame).finish()
+            _composite(renderer, taken)
     return snapshot
 
 
 def _picture(
-    renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame, picture: SnapshotPicture
+    renderer: SnapshotRenderer, scene: SceneDocument, taken: Sequence[CameraFrame], picture: SnapshotPicture
 ) -> UInt8[np.ndarray, "h w 3"]:
     if picture.view == CAMERA_VIEW:
-        return renderer.sized(frame).color
+        return renderer.sized(_shown(taken)).color
     renderer.set_scene(_variant(scene, picture.view, picture.method))
-    return renderer.submit(frame, whole=True).finish().color
+    return _composite(renderer, taken, whole=True).color
 
 
 def _linear(
-    renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame
+    renderer: SnapshotRenderer, scene: SceneDocument, taken: Sequence[CameraFrame]
 ) -> Float32[np.ndarray, "h w 3"]:
     renderer.set_scene(_variant(scene, "composite", None))
-    composite = renderer.submit(frame, with_linear=True).finish()
-    return linear_color(frame, composite.color) if composite.linear is None else composite.linear
+    composite = _composite(renderer, taken, with_linear=True)
+    return linear_color(_shown(taken), composite.color) if composite.linear is None else composite.linear
+
+
+def _composite(
+    renderer: SnapshotRenderer,
+    taken: Sequence[CameraFrame],
+    *,
+    with_linear: bool = False,
+    whole: bool = False,
+) -> RenderedPicture:
+    (started,) = renderer.submit_cameras(taken, with_linear=with_linear, whole=whole)
+    return started.finish()
+
+
+def _shown(taken: Sequence[CameraFrame]) -> ViewFrame:
+    return next(each.frame for each in taken if each.is_shown)
 
 
 def _variant(scene: SceneDocument, view: str, method: dict[str, Any] | None) -> SceneDocument:

@@ -70,7 +70,10 @@ TAGS = [
     {"name": "lights", "description": "Where light comes from."},
     {"name": "method", "description": "How the real scene is relit."},
     {"name": "output", "description": "The picture that comes out."},
-    {"name": "assets", "description": "Uploaded meshes and environment maps, kept under their SHA-256."},
+    {
+        "name": "assets",
+        "description": "Uploaded meshes, environment maps and precomputed materials, kept under their SHA-256.",
+    },
     {
         "name": "live",
         "description": "The picture, what a place in it shows, and what the fish-eye camera sees.",

@@ -23,6 +23,7 @@ EventType = Literal[
     "snapshot",
     "notice",
     "rooms",
+    "cameras",
     "lost",
 ]
 IN_ALL_ROOMS: frozenset[EventType] = frozenset({"asset", "recording", "snapshot", "rooms"})

@@ -1,37 +1,37 @@
-"""The newest composite, shared by any number of viewers, each at its own pace."""
+"""The newest composite of each camera, shared by any number of viewers, each at its own pace."""
 
 import asyncio
 import threading
-import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal
 
-from deltalight.protocol.messages import CompositeMessage
+from deltalight.protocol.messages import CameraEntry, CamerasMessage, CompositeMessage
 from deltalight.protocol.scene_fields import ShownView
-from deltalight.services.api.live_frame import LiveFrame, LivePicture
+from deltalight.services.api.live_feed import CameraFeed
+from deltalight.services.api.live_frame import LiveFrame
 from deltalight.services.api.live_video import LiveCodec, LiveVideo, VideoPicture, VideoTrack
-from deltalight.services.live_message import PictureHeader
+from deltalight.services.storage.faults import NotFoundError
 
 WINDOW = 2  # frames in flight to one viewer before it has to acknowledge
 VIDEO_WINDOW = 4  # the same for small pictures that build on each other: a gap costs a key
-RATE_WINDOW_S = 3.0
-STALE_AFTER_S = 2.0
+NO_CAMERA = "none has sent a frame yet"
 
 
 class Viewer:
     """One viewer of the stream; `skipped` counts the frames that it was not sent.
 
-    It looks at `view`; None = the scene's own. `codec` is what it would like the pictures to be coded as.
+    It looks at `view`; None = the scene's own. `codec` is what it would like the pictures to be coded as, `camera`
+    whose pictures it sees; None = the first one's.
     """
 
-    def __init__(self, hub: "LiveHub", view: ShownView | None, codec: LiveCodec) -> None:
+    def __init__(self, hub: "LiveHub", view: ShownView | None, codec: LiveCodec, camera: str | None) -> None:
         self.skipped = 0
         self.view = view
         self.codec = codec
-        self._hub = hub
-        self._number = 0
+        self.camera = camera
+        self.hub = hub
+        self._last: LiveFrame | None = None
         self._track: VideoTrack | None = None
         self._coded: int | None = None  # its last picture in that track
 
@@ -43,37 +43,51 @@ class Viewer:
     def look_at(self, view: ShownView | None) -> None:
         """Look at another view, as soon as a frame shows it."""
         self.view = view
-        self._hub.note_views()
+        self.hub.note_views()
 
     def prefer(self, codec: LiveCodec) -> None:
         """Take pictures coded so from now on, where they are there."""
         if codec != self.codec:
             self.codec = codec
-            self._hub.wake()
+            self.hub.wake()
+
+    def turn_to(self, camera: str | None) -> None:
+        """See the pictures of another camera from now on.
+
+        Raises:
+            NotFoundError: there is no such camera.
+        """
+        self.hub.require(camera)
+        self.camera = camera
+        self.hub.wake()
 
     def leave(self) -> None:
         """Leave the encoded pictures that it followed."""
         if self._track is not None:
-            self._hub.video.leave(self._track)
+            self.hub.video.leave(self._track)
         self._track = self._coded = None
 
     async def next(self) -> LiveFrame | None:
         """Wait for a frame newer than this viewer's last; None = the stream has ended."""
-        frame = await self._hub.newer_than(self._number)
-        if frame is not None:
-            self._take(frame)
-        return frame
+        while not self.hub.has_ended:
+            arrived = self.hub.arrived
+            newest = self._newer()
+            if newest is not None:
+                self._take(newest)
+                return newest
+            await arrived.wait()
+        return None
 
     async def next_message(self) -> bytes | None:
         """Wait for the next message, in H.264 where that is wanted and there; None = the stream has ended."""
-        while not self._hub.has_ended:
-            arrived = self._hub.arrived
+        while not self.hub.has_ended:
+            arrived = self.hub.arrived
             picture = self._next_coded()
             if picture is not None:
                 self._take(picture.frame)
                 return picture.packed(self.skipped)
-            newest = self._hub.newest
-            if not self._is_coded and newest is not None and newest.number > self._number:
+            newest = None if self._is_coded else self._newer()
+            if newest is not None:
                 self._take(newest)
                 return newest.packed(self.view, self.skipped)
             await arrived.wait()
@@ -81,8 +95,8 @@ class Viewer:
 
     async def next_video(self) -> VideoPicture | None:
         """Wait for the next picture in H.264; None = the stream has ended, or there is no H.264 (any more)."""
-        while not self._hub.has_ended and self._hub.video.why_not is None:
-            arrived = self._hub.arrived
+        while not self.hub.has_ended and self.hub.video.why_not is None:
+            arrived = self.hub.arrived
             picture = self._next_coded()
             if picture is not None:
                 self._take(picture.frame)
@@ -95,14 +109,19 @@ class Viewer:
     def want_key(self) -> None:
         """Go on with a key: what came before was lost."""
         self._coded = None
-        self._hub.wake()
+        self.hub.wake()
 
     @property
     def _is_coded(self) -> bool:
         return self._track is not None and not self._track.has_failed
 
+    def _newer(self) -> LiveFrame | None:
+        """Return its camera's newest frame, unless that was its last."""
+        newest = self.hub.newest_of(self.camera)
+        return None if newest is None or newest is self._last else newest
+
     def _next_coded(self) -> VideoPicture | None:
-        newest = self._hub.newest
+        newest = self.hub.newest_of(self.camera)
         if newest is None:
             return None
         track = self._followed(newest)
@@ -113,23 +132,26 @@ class Viewer:
 
     def _followed(self, newest: LiveFrame) -> VideoTrack | None:
         """Follow the track of what this viewer sees, if it wants one; one that failed is not followed."""
-        view = newest.shown(self.view) if self.codec == "h264" and self._hub.video.why_not is None else None
-        if self._track is not None and self._track.view != view:
+        view = newest.shown(self.view) if self.codec == "h264" and self.hub.video.why_not is None else None
+        if self._track is not None and not (self._track.is_of(newest) and self._track.view == view):
             self.leave()
         if self._track is None and view is not None:
-            self._track = self._hub.video.join(view, newest)
+            self._track = self.hub.video.join(view, newest)
         return self._track if self._is_coded else None
 
     def _take(self, frame: LiveFrame) -> None:
-        missed = max(0, frame.number - self._number - 1) if self._number else 0
+        last = self._last
+        follows = last is not None and last.message.node == frame.message.node
+        missed = max(0, frame.number - last.number - 1) if last is not None and follows else 0
         self.skipped += missed
-        self._number = frame.number
-        self._hub.note_sent(missed)
+        self._last = frame
+        self.hub.note_sent(missed)
 
 
 class LiveHub:
-    """Holds only the newest frame; viewers that wait for a newer one do not delay each other.
+    """Holds only the newest frame of each camera; viewers that wait for a newer one do not delay each other.
 
+    A render server's only camera has no name in its composites; from the second one on, each names its own.
     `on_watch` is called in the event loop with the views that are looked at beside the scene's own, when they change,
     `on_failure` in any thread with why there is no H.264 any more.
     """
@@ -144,8 +166,10 @@ class LiveHub:
         self._on_watch = on_watch
         self.sent = 0
         self.skipped = 0
-        self._newest: LiveFrame | None = None
-        self._arrivals_s: deque[float] = deque()
+        self.received = 0  # of all cameras together
+        self._cameras: CamerasMessage | None = None
+        self._feeds: dict[str, CameraFeed] = {}  # replaced, never changed, so that all threads may look
+        self._last = CameraFeed()  # of the newest frame of any
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self.arrived = asyncio.Event()  # set, and made anew, when anything came or the stream ended
@@ -164,19 +188,25 @@ class LiveHub:
         Raises:
             DeltalightError: its header is invalid.
         """
-        now_s = time.monotonic()
+        node = message.node
         with self._lock:
-            self._arrivals_s.append(now_s)
-            number = 1 if self._newest is None else self._newest.number + 1
-            header = PictureHeader.of(message, number=number, frames_per_s=self._rate(), renderer=renderer)
-            headers = [header, *(header.model_copy(update=dict(other)) for other in message.others)]
-            pictures = {
-                each.view: LivePicture(each.model_dump_json().encode(), jpeg)
-                for each, jpeg in zip(headers, jpegs, strict=True)
-            }
-            frame = self._newest = LiveFrame(number, message, now_s, time.time_ns(), pictures)
+            feed = self._feeds.get(node) or CameraFeed()
+            frame = feed.publish(message, jpegs, renderer, node if self._names(node) else None)
+            self._feeds = {**self._feeds, node: feed}
+            self._last = feed
+            self.received += 1
         self.video.offer(frame)
         self._wake_soon()
+
+    def note_cameras(self, message: CamerasMessage) -> bool:
+        """Take which cameras there are (any thread); return whether that, or which of them live, is another."""
+        before = [(each.node, each.status) for each in self.cameras]
+        with self._lock:
+            self._cameras = message
+            kept = {each.node for each in self.cameras} if len(self.cameras) > 1 else {message.node}
+            self._feeds = {node: feed for node, feed in self._feeds.items() if node in kept}
+        self._wake_soon()
+        return before != [(each.node, each.status) for each in message.cameras]
 
     def close(self) -> None:
         """End the stream of every viewer (any thread)."""
@@ -190,9 +220,11 @@ class LiveHub:
         return len(self._viewers)
 
     @contextmanager
-    def viewer(self, view: ShownView | None = None, codec: LiveCodec = "jpeg") -> Iterator[Viewer]:
+    def viewer(
+        self, view: ShownView | None = None, codec: LiveCodec = "jpeg", camera: str | None = None
+    ) -> Iterator[Viewer]:
         """Join the stream for the duration of the block (in the event loop)."""
-        viewer = Viewer(self, view, codec)
+        viewer = Viewer(self, view, codec, camera)
         self._viewers.add(viewer)
         self.note_views()
         try:
@@ -210,50 +242,63 @@ class LiveHub:
             self._on_watch(watched)
 
     @property
-    def received(self) -> int:
-        """The number of frames that arrived."""
-        return 0 if self._newest is None else self._newest.number
+    def cameras(self) -> tuple[CameraEntry, ...]:
+        """The cameras that the render server named, in their order."""
+        return () if self._cameras is None else self._cameras.cameras
+
+    def require(self, camera: str | None) -> None:
+        """Refuse a camera that is not there.
+
+        Raises:
+            NotFoundError: the render server named no such camera.
+        """
+        names = [each.node for each in self.cameras]
+        if camera is None or camera in names:
+            return
+        there = f"there {'are' if len(names) > 1 else 'is'} {', '.join(names)}" if names else NO_CAMERA
+        raise NotFoundError(f"there is no camera {camera!r:.80}; {there}.")
+
+    def server_of(self, message: CompositeMessage) -> str:
+        """Return the name of the render server that a composite is from."""
+        server = self._cameras
+        return server.node if server is not None and self._names(message.node) else message.node
+
+    def feed(self, camera: str | None) -> CameraFeed:
+        """Return a camera's pictures; for None and one that is gone, those of the first camera that lives."""
+        cameras, feeds = self.cameras, self._feeds
+        if len(cameras) <= 1:
+            return self._last
+        if any(each.node == camera for each in cameras):
+            return feeds.get(str(camera)) or CameraFeed()
+        live = (feeds[each.node] for each in cameras if each.status == "live" and each.node in feeds)
+        return next(live, self._last)
+
+    def newest_of(self, camera: str | None) -> LiveFrame | None:
+        """Return the newest frame of what `feed` returns, if any arrived."""
+        return self.feed(camera).newest
 
     @property
     def newest(self) -> LiveFrame | None:
-        """The newest frame, if any arrived."""
-        return self._newest
-
-    async def newer_than(self, number: int) -> LiveFrame | None:
-        """Wait for a frame after `number`; None = the stream has ended."""
-        while not self.has_ended:
-            arrived = self.arrived
-            if self._newest is not None and self._newest.number > number:
-                return self._newest
-            await arrived.wait()
-        return None
+        """The first camera's newest frame, if any arrived."""
+        return self.newest_of(None)
 
     def note_sent(self, missed: int) -> None:
         """Count a frame that a viewer takes, and those that it missed since its last one."""
         self.sent += 1
         self.skipped += missed
 
-    def state(self) -> tuple[Literal["waiting", "ok", "stale"], float | None]:
+    def state(self, camera: str | None = None) -> tuple[Literal["waiting", "ok", "stale"], float | None]:
         """Return whether frames arrive, and the seconds since the newest did."""
-        if self._newest is None:
-            return "waiting", None
-        since_s = time.monotonic() - self._newest.arrived_s
-        return ("ok" if since_s < STALE_AFTER_S else "stale"), since_s
+        return self.feed(camera).state()
 
-    def frames_per_s(self) -> float | None:
+    def frames_per_s(self, camera: str | None = None) -> float | None:
         """Return the rate of arrival over the last seconds; None before the second frame."""
         with self._lock:
-            return self._rate()
+            return self.feed(camera).rate()
 
-    def _rate(self) -> float | None:
-        now_s = time.monotonic()
-        oldest_s = now_s - RATE_WINDOW_S
-        while len(self._arrivals_s) > 2 and self._arrivals_s[0] < oldest_s:
-            self._arrivals_s.popleft()
-        if len(self._arrivals_s) < 2:
-            return None
-        span_s = now_s - self._arrivals_s[0]  # up to now: the rate falls while frames stay away
-        return (len(self._arrivals_s) - 1) / span_s if span_s > 0 else None
+    def _names(self, node: str) -> bool:
+        """Whether a composite of this `node` names a camera."""
+        return len(self.cameras) > 1 and any(each.node == node for each in self.cameras)
 
     def _wake_soon(self) -> None:
         if self._loop is not None and not self._loop.is_closed():

@@ -1,4 +1,4 @@
-"""H.264 for viewers of the live picture: one encoder a view and size, shared by all who look at it."""
+"""H.264 for viewers of the live picture: one encoder a camera, view and size, shared by all who look at it."""
 
 import json
 import threading
@@ -46,7 +46,9 @@ class VideoPicture:
 
 
 class VideoTrack:
-    """The pictures of a view as H.264, encoded in a thread of their own: always the newest.
+    """The pictures of a camera in a view as H.264, encoded in a thread of their own: always the newest.
+
+    `node` is what their composites name.
 
     `publish` is called in that thread with what to do in the event loop, where all else here but `offer` happens.
     Where the encoder fails the track ends; `on_failure` is told why, in that thread.
@@ -54,10 +56,12 @@ class VideoTrack:
 
     def __init__(
         self,
+        node: str,
         view: ShownView,
         publish: Callable[[Callable[[], None]], None],
         on_failure: Callable[[str], None],
     ) -> None:
+        self.node = node
         self.view = view
         self.has_failed = False
         self.members = 0
@@ -70,6 +74,10 @@ class VideoTrack:
         self._is_closed = False
         self._coder = _Coder(view)
         self._thread = threading.Thread(target=self._run, name="live-video")
+
+    def is_of(self, frame: LiveFrame) -> bool:
+        """Whether it is of the camera of a frame."""
+        return self.node == frame.message.node
 
     def start(self, frame: LiveFrame) -> None:
         """Begin with a frame that has arrived."""
@@ -192,7 +200,7 @@ class LiveVideo:
         self, publish: Callable[[Callable[[], None]], None], on_failure: Callable[[str], None]
     ) -> None:
         self._publish, self._on_failure = publish, on_failure
-        self._tracks: dict[ShownView, VideoTrack] = {}
+        self._tracks: dict[tuple[str, ShownView], VideoTrack] = {}
 
     @cached_property
     def why_not(self) -> str | None:
@@ -201,20 +209,21 @@ class LiveVideo:
 
     @property
     def encoders(self) -> int:
-        """The number of views that are encoded."""
+        """The number of views that are encoded, each camera's for itself."""
         return len(self._tracks)
 
     def offer(self, frame: LiveFrame) -> None:
         """Encode a new frame's pictures that somebody looks at (any thread)."""
-        for view, track in self._tracks.copy().items():
-            if view in frame.pictures:
+        for track in self._tracks.copy().values():
+            if track.is_of(frame) and track.view in frame.pictures:
                 track.offer(frame)
 
     def join(self, view: ShownView, frame: LiveFrame) -> VideoTrack:
-        """Return the track of a view, which begins with `frame` if nobody looked at it before."""
-        track = self._tracks.get(view)
+        """Return the track of a frame's camera in a view, which begins with it if nobody looked there before."""
+        key = frame.message.node, view
+        track = self._tracks.get(key)
         if track is None:
-            track = self._tracks[view] = VideoTrack(view, self._publish, self._on_failure)
+            track = self._tracks[key] = VideoTrack(*key, self._publish, self._on_failure)
             track.start(frame)
         track.members += 1
         return track
@@ -224,7 +233,7 @@ class LiveVideo:
         track.members -= 1
         if track.members == 0:
             track.close()
-            del self._tracks[track.view]
+            del self._tracks[track.node, track.view]
 
     def close(self) -> None:
         """End all threads soon (any thread)."""

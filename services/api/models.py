@@ -110,13 +110,17 @@ class AssetAnswer(BaseModel):
 
     asset: str = Field(description="How scene documents name it.", examples=["sha256:2c26b46b68ffc68f..."])
     names: list[str] = Field(description="Names under which it was uploaded.")
-    kind: AssetKind = Field(description="`mesh` for objects and models, `map` for environment lights.")
+    kind: AssetKind = Field(
+        description="`mesh` for objects and models, `map` for environment lights, `material` for what "
+        "`material: {precomputed: ...}` names."
+    )
     format: str = Field(examples=["glb"])
     size_bytes: int
     uploaded: datetime
     facts: dict[str, Any] = Field(
         description="Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the "
-        "clips that it can play (name, duration_s). Map: width and height, pixels.",
+        "clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, "
+        "polynomial_texture), base_color, and lobes and roughness, or width and height in texels.",
         examples=[{"triangles": 1000, "vertices": 502, "minimum": [0, 0, 0], "maximum": [0.1, 0.1, 0.2]}],
     )
 

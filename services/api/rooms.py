@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import CompositeMessage, Message, StatsMessage
+from deltalight.protocol.messages import CamerasMessage, CompositeMessage, Message, StatsMessage
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services.api.camera_finder import CameraFinder
 from deltalight.services.api.context import Context
@@ -145,7 +145,7 @@ class _Builder:
         self._settings, self._store, self._keys, self._metrics = settings, store, keys, metrics
         self._problems, self._cameras = Problems(), CameraFinder()
         self._tickets = Tickets(store=store.tickets)
-        self._recordings = RecordingStore(store.folder / "recordings")
+        self._recordings = RecordingStore(store.recordings)
         self._videos = RecordingVideos(self._recordings)
         self._snapshots = SnapshotStore(store.folder / "snapshots")
         self._pools = make_pools()
@@ -235,6 +235,7 @@ def _sinks(context: Context, metrics: RoomMetrics) -> dict[str, Sink]:
     """Route composites to viewers, radiance to the fish-eye view, and reports to the watch and to event listeners."""
     return {
         "composite": lambda message, parts: _publish_composite(context, metrics, message, parts),
+        "cameras": lambda message, _parts: _publish_cameras(context, message),
         "radiance": context.fisheye.note,
         "stats": lambda message, _parts: _publish_report(context, message),
     }
@@ -245,7 +246,14 @@ def _publish_composite(
 ) -> None:
     if isinstance(message, CompositeMessage) and message.encoding == "jpeg":
         metrics.note_frame(context.room, (message.rendered_ns - message.received_ns) / 1e9)
-        context.live.publish(message, [bytes(part) for part in parts], context.watch.detail(message.node))
+        renderer = context.watch.detail(context.live.server_of(message))
+        context.live.publish(message, [bytes(part) for part in parts], renderer)
+
+
+def _publish_cameras(context: Context, message: Message) -> None:
+    if isinstance(message, CamerasMessage) and context.live.note_cameras(message):
+        cameras = [{"name": each.node, "status": each.status} for each in message.cameras]
+        context.events.publish("cameras", {"cameras": cameras})
 
 
 def _publish_report(context: Context, message: Message) -> None:

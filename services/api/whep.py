@@ -46,6 +46,14 @@ class Watcher:
     token_id: str | None
 
 
+@dataclass(frozen=True)
+class Look:
+    """What is watched: a view (None = the scene's own) of a camera (None = the first one)."""
+
+    view: ShownView | None
+    camera: str | None
+
+
 class WhepSessions:
     """The sessions of all rooms of a web process (in its event loop)."""
 
@@ -61,9 +69,7 @@ class WhepSessions:
             return NONE_ALLOWED
         return why_unavailable() or (NO_AIORTC if find_spec("aiortc") is None else None)
 
-    async def open(
-        self, hub: LiveHub, view: ShownView | None, offer: str, watcher: Watcher
-    ) -> tuple[str, str]:
+    async def open(self, hub: LiveHub, look: Look, offer: str, watcher: Watcher) -> tuple[str, str]:
         """Begin a session; return its id and the answer to the offer.
 
         Raises:
@@ -76,7 +82,7 @@ class WhepSessions:
         with ExitStack() as held:
             held.enter_context(self._place())
             held.enter_context(self._streams.slot(watcher.client))
-            peer = peer_of(held.enter_context(hub.viewer(view, "h264")), self._addresses())
+            peer = peer_of(held.enter_context(hub.viewer(look.view, "h264", look.camera)), self._addresses())
             try:
                 answer = await peer.answer(offer)
             except BaseException:

@@ -10,6 +10,7 @@ import typer
 
 from deltalight.services.commands.options import ConfigFile, Data, DatabaseAddress, NodeName, data_folder
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
+from deltalight.services.uncollected import uncollected
 
 if TYPE_CHECKING:
     from deltalight.protocol.keys import KeySettings
@@ -69,10 +70,11 @@ def serve(
     """Serve the dashboard at /, and scenes, assets, live video and state at /api/v1, until Ctrl-C."""
     if context.invoked_subcommand is not None:
         return
-    from deltalight.protocol.keys import KeySettings
-    from deltalight.services.api.serve import run_api
-    from deltalight.services.api.settings import ApiSettings
-    from deltalight.services.settings import load_configuration
+    with uncollected():
+        from deltalight.protocol.keys import KeySettings
+        from deltalight.services.api.serve import run_api
+        from deltalight.services.api.settings import ApiSettings
+        from deltalight.services.settings import load_configuration
 
     given: dict[str, Any] = {
         "host": host,

@@ -7,8 +7,11 @@ import typer
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.method_names import require_method
+from deltalight.services.child import NODE, SERVER, WEB, early_spares
 from deltalight.services.commands.options import MethodName
-from deltalight.services.ports import PAGE_PORT
+from deltalight.services.ports import PAGE_PORT, require_free
+
+EARLY = {SERVER: "server", NODE: "node", WEB: "api"}
 
 
 def demo(
@@ -30,11 +33,19 @@ def demo(
 ) -> None:
     """Play the shipped recording through node, render server and web process, and open the dashboard."""
     method = require_method(method)
-    from deltalight.services.demo import run_headless, run_live
-
-    if not headless:
-        run_live(method, port=port, with_browser=not no_browser)
+    if headless:
+        _write(method, frames, out, as_json=as_json)
         return
+    require_free(port, "dashboard", "--port")
+    with early_spares(EARLY) as spares:  # they import what they need while this process does
+        from deltalight.services.demo import run_live
+
+        run_live(method, port=port, with_browser=not no_browser, spares=spares)
+
+
+def _write(method: str, frames: int, out: Path | None, *, as_json: bool) -> None:
     if out is None:
         raise DeltalightError("A headless demo writes files; give a folder for them with --out.")
+    from deltalight.services.headless_demo import run_headless
+
     run_headless(method, frames, out, as_json=as_json)

@@ -11,7 +11,8 @@ from deltalight.protocol.errors import DeltalightError
 keys = typer.Typer(no_args_is_help=True, help="Manage keys for connections to other hosts.")
 
 Folder = Annotated[
-    Path | None, typer.Option(help="Folder of the keys; default: from [keys] in the configuration.")
+    Path | None,
+    typer.Option(help="Folder of the keys; default: that of `keys` in the configuration file."),
 ]
 
 

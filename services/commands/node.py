@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from deltalight.services.commands.options import ConfigFile
+from deltalight.services.uncollected import uncollected
 
 if TYPE_CHECKING:
     from deltalight.sensor_node.cameras.driver import Discovery
@@ -38,7 +39,7 @@ def node(
         bool,
         typer.Option(
             "--tracking",
-            help="Take the camera's pose from OpenTrackIO packets; [node.tracking] of the settings says where from.",
+            help="Take the camera's pose from OpenTrackIO packets, by `node.tracking` in the configuration file.",
         ),
     ] = False,
     calibration: Annotated[
@@ -76,7 +77,8 @@ def node(
         "tracking": {} if tracking else None,
         "fisheye": None if fisheye is None else {"source": fisheye},
     }
-    from deltalight.services.node_process import run_configured_node
+    with uncollected():
+        from deltalight.services.node_process import run_configured_node
 
     run_configured_node({key: value for key, value in given.items() if value is not None}, config_file)
 

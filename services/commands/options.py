@@ -51,6 +51,14 @@ ConfigFile = Annotated[
         help="Configuration file; default: ./deltalight.toml, then ~/.config/deltalight/deltalight.toml.",
     ),
 ]
+OneCamera = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        metavar="NAME",
+        help="Whose pictures, by its node's name, where a room has several cameras.",
+    ),
+]
 Data = Annotated[
     Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
 ]

@@ -17,7 +17,8 @@ def precompute(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="File that a material becomes, NAME.dlmat.", show_default=False)
+        Path | None,
+        typer.Option("--out", "-o", help="File that a material becomes, NAME.dlmat.", show_default=False),
     ] = None,
 ) -> None:
     """Compute the light transfer and the occlusion fields of a scene's objects, so that no picture waits for them.

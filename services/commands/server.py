@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from deltalight.services.commands.options import ConfigFile, NodeName
+from deltalight.services.uncollected import uncollected
 
 if TYPE_CHECKING:
     from deltalight.protocol.keys import KeySettings
@@ -46,9 +47,10 @@ def server(
     config_file: ConfigFile = None,
 ) -> None:
     """Render the frames of sensor nodes and publish the pictures, until Ctrl-C."""
-    from deltalight.protocol.keys import KeySettings
-    from deltalight.render_server.server.process import ServerSettings, run_server
-    from deltalight.services.settings import load_configuration
+    with uncollected():
+        from deltalight.protocol.keys import KeySettings
+        from deltalight.render_server.server.process import ServerSettings, run_server
+        from deltalight.services.settings import load_configuration
 
     configuration = load_configuration(config_file)
     key_settings = configuration.section("keys", KeySettings)

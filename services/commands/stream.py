@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.live import Live
 
-from deltalight.services.commands.options import ConfigFile
+from deltalight.services.commands.options import ConfigFile, OneCamera
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
 
 if TYPE_CHECKING:
@@ -29,12 +29,13 @@ def stream(
         typer.Option(
             envvar="DELTALIGHT_STREAM_TO",
             show_envvar=True,
-            help="Address of the media server, such as rtsp://HOST:8554/NAME or rtmp://HOST/live/NAME.",
+            help="Address of the media server: rtsp://HOST:8554/NAME, rtmp://HOST/live/NAME, or srt://HOST:8890?streamid=ID.",
         ),
     ],
     composites: Annotated[
         str, typer.Option(help="Endpoint at which the render server publishes relit pictures.")
     ] = endpoint(COMPOSITE_PORT),
+    camera: OneCamera = None,
     config_file: ConfigFile = None,
 ) -> None:
     """Send the relit picture to a media server (H.264), for many viewers, until Ctrl-C."""
@@ -42,11 +43,13 @@ def stream(
     from deltalight.protocol.keys import KeySettings
     from deltalight.protocol.receiver import Receiver
     from deltalight.services.h264 import why_unavailable
+    from deltalight.services.relit_pictures import composite_topic
     from deltalight.services.settings import load_configuration
+    from deltalight.services.srt import why_unavailable as why_no_srt
     from deltalight.services.stream_out import StreamOut, Target
 
     target = Target.parse(to)
-    reason = why_unavailable()
+    reason = why_unavailable() or (why_no_srt() if target.container == "mpegts" else None)
     if reason is not None:
         raise DeltalightError(reason)
     keys = load_configuration(config_file).section("keys", KeySettings).load([composites])
@@ -56,7 +59,7 @@ def stream(
         console.print(sentence, markup=False, highlight=False)
 
     with (
-        closing(Receiver([composites], ["composite"], keys=keys)) as receiver,
+        closing(Receiver([composites], [composite_topic(camera)], keys=keys)) as receiver,
         StreamOut(target, tell) as out,
     ):
         tell(f"Waiting for the first picture of {composites}.")

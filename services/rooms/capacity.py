@@ -1,6 +1,7 @@
 """How many rooms a device holds by what `deltalight gpu-check` measured, and whether a host's claim is true."""
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -20,6 +21,16 @@ USED_SHARE = 0.9  # of a device's memory; the rest is for the driver, and for wh
 CLAIMED_SHARE = 0.95  # of the claimed memory that must be there: drivers keep some to themselves
 PROBE_TIMEOUT_S = 60.0
 MAKE_REPORT = "make it on this host by `deltalight gpu-check --steps memory,speed`"
+# What reading JSON of another kind raises: text that is none, other keys and types, numbers beyond all, deep nesting.
+_NO_FIGURES = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    StopIteration,
+    OverflowError,
+    RecursionError,
+)
 _PROBE = """
 import json, sys
 from dataclasses import asdict
@@ -54,10 +65,13 @@ def load_figures(path: Path) -> RoomFigures:
         memory, speed = (report["steps"][step]["figures"] for step in ("memory", "speed"))
         methods = next(iter(speed["timed"].values()))
         frame_ms = max(max(method["frames_ms"].values()) for method in methods.values())
-        return RoomFigures(path, str(report["gpu"]), int(memory["room_bytes"]), float(frame_ms))
+        figures = RoomFigures(path, str(report["gpu"]), int(memory["room_bytes"]), float(frame_ms))
+        if figures.room_bytes < 1 or not 0 < figures.frame_ms < math.inf:
+            raise ValueError("a room takes memory and time")
+        return figures
     except OSError as fault:
         raise DeltalightError(f"{path} cannot be read ({fault.strerror}); {MAKE_REPORT}.") from fault
-    except (ValueError, KeyError, TypeError, AttributeError, StopIteration) as fault:
+    except _NO_FIGURES as fault:
         raise DeltalightError(f"{path} lacks memory or frame times of a room; {MAKE_REPORT}.") from fault
 
 

@@ -7,6 +7,7 @@ from typing import Protocol
 import structlog
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.message_fields import as_sentence
 from deltalight.services.rooms.status import RoomEndpoints, RoomList
 
 POLL_INTERVAL_S = 0.2
@@ -26,7 +27,8 @@ class RoomFollower:
 
     Calls `on_endpoints(room, endpoints)` for each room whose render server is another, newer one, or (None) is gone,
     and `on_change` when anything changed. Endpoints of an epoch before the newest are `refused`, and counted: a
-    directory or a render server that was cut off and comes back must not take the room over.
+    directory or a render server that was cut off and comes back must not take the room over. What it refuses or
+    cannot use is said once, and leaves the other rooms alone.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class RoomFollower:
         self._on_endpoints, self._on_change = on_endpoints, on_change
         self._epochs: dict[str, int] = {}  # the newest of each room
         self._followed: dict[str, RoomEndpoints | None] = {}
+        self._stale: dict[str, int] = {}  # the epoch of each room that was refused last
         self.refused = 0
         self.newest = RoomList(rooms=(), slots=())
         self.is_answered = True  # the last question
@@ -73,17 +76,23 @@ class RoomFollower:
 
     def _follow(self, room: str, endpoints: RoomEndpoints | None) -> None:
         if endpoints is not None and endpoints.epoch < self._epochs.get(room, 0):
-            self.refused += 1
-            log.warning(
-                "stale endpoints refused", room=room, epoch=endpoints.epoch, newest=self._epochs[room]
-            )
+            self._refuse(room, endpoints.epoch)
             return
         if endpoints == self._followed.get(room):
             return
         if endpoints is not None:
             self._epochs[room] = endpoints.epoch
         self._followed[room] = endpoints
-        self._on_endpoints(room, endpoints)
+        try:
+            self._on_endpoints(room, endpoints)
+        except DeltalightError as fault:
+            log.warning("the endpoints of a room cannot be used", room=room, fault=as_sentence(str(fault)))
+
+    def _refuse(self, room: str, epoch: int) -> None:
+        self.refused += 1
+        if self._stale.get(room) != epoch:
+            self._stale[room] = epoch
+            log.warning("stale endpoints refused", room=room, epoch=epoch, newest=self._epochs[room])
 
     def _run(self) -> None:
         while not self._stop.wait(POLL_INTERVAL_S):

@@ -14,7 +14,7 @@ from deltalight.protocol.source import Source
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.discovery import node_endpoint
-from deltalight.services.host import PREPARED, HostCommands, recording_of
+from deltalight.services.host import HostCommands, recording_of
 from deltalight.services.host_store import activate_document, open_store, write_scene
 from deltalight.services.rooms.capacity import load_figures
 from deltalight.services.rooms.directory import DirectoryServer
@@ -28,6 +28,7 @@ from deltalight.services.rooms.status import RoomNode
 from deltalight.services.settings import load_configuration
 from deltalight.services.storage.store import Store
 from deltalight.services.supervisor import POLL_INTERVAL_S, Supervisor
+from deltalight.services.warm_spare import PREPARED
 
 NODE_RETRY_S = 10.0
 

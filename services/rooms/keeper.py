@@ -6,6 +6,7 @@ that they have waited.
 
 import itertools
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Protocol
 
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.message_fields import as_sentence
 from deltalight.services.rooms.placer import NoSlotError, Placement, PlacementEvent, Placer, RoomOrder, Slot
 from deltalight.services.rooms.status import (
     Reason,
@@ -85,7 +87,9 @@ class _Room:
 class RoomKeeper:
     """Decides where rooms run; `notice` gets a line for each change. Any thread may call it.
 
-    What is drained stays so in the next keeper with this `memory`; what that refuses to keep is not drained.
+    What is drained stays so in the next keeper with this `memory`; what that refuses to keep is not drained. Epochs
+    begin with the milliseconds of the clock, so that those of the next keeper are newer: web processes of other hosts
+    go on following, and refuse what is older.
     """
 
     def __init__(
@@ -97,7 +101,7 @@ class RoomKeeper:
     ) -> None:
         self._placer, self._notice, self._memory = placer, notice, memory
         self._queue = itertools.count()
-        self._epochs = itertools.count(1)
+        self._epoch = time.time_ns() // 1_000_000  # the newest
         self._rooms = {plan.name: _Room(plan, next(self._queue)) for plan in plans}
         self._faults: Mapping[str, str] = {}  # of nodes
         drained = Drained() if memory is None else memory.load()
@@ -172,7 +176,7 @@ class RoomKeeper:
                 raise DeltalightError(f"the room {name} is {room.state}; move it when it runs.")
             if room.successor is not None:
                 raise DeltalightError(f"the room {name} moves to {room.successor.slot} already; wait for it.")
-            room.successor = self._placer.place(self._order(room), slot)
+            room.successor = self._place(room, slot)
             self._notice(f"room {name}: moves from {room.placement.slot} to {room.successor.slot}.")
 
     def drain_host(self, host: str) -> None:
@@ -225,10 +229,19 @@ class RoomKeeper:
             raise DeltalightError(f"there is no room {name[:80]}; did you mean {hint}?")
         return self._rooms[name]
 
-    def _order(self, room: _Room) -> RoomOrder:
+    def _place(self, room: _Room, slot: str | None = None) -> Placement:
+        """Start a room's next render server, with an epoch of its own."""
         sources = tuple(node.endpoint for node in room.plan.nodes)
         plan, avoid = room.plan, frozenset(self._drained_hosts)
-        return RoomOrder(plan.name, next(self._epochs), sources, plan.session_file, plan.labels, avoid)
+        self._epoch += 1
+        order = RoomOrder(plan.name, self._epoch, sources, plan.session_file, plan.labels, avoid)
+        try:
+            return self._placer.place(order, slot)
+        except NoSlotError:
+            self._epoch -= 1  # nothing was started with it; who waits asks ten times a second
+            raise
+        except OSError as fault:  # open files, processes, memory
+            raise DeltalightError(f"this host has no more of what it needs ({fault.strerror}).") from fault
 
     def _release(self, room: _Room) -> None:
         for placement in (room.placement, room.successor):
@@ -302,10 +315,10 @@ class RoomKeeper:
         """Start a room's next render server on another host; without a slot there, it ends and waits."""
         assert room.placement is not None
         try:
-            room.successor = self._placer.place(self._order(room))
-        except NoSlotError:
+            room.successor = self._place(room)
+        except DeltalightError as fault:
             self._release(room)
-            room.wait(f"Its host {host} is drained.")
+            room.wait(f"Its host {host} is drained: {fault}")
             room.queued = min(each.queued for each in self._rooms.values()) - 1
         where = "waits" if room.successor is None else f"moves to {room.successor.slot}"
         self._notice(f"room {room.plan.name}: leaves {host} and {where}.")
@@ -314,9 +327,11 @@ class RoomKeeper:
         waiting = [room for room in self._rooms.values() if room.state == "waiting" and not room.drained]
         for room in sorted(waiting, key=lambda each: each.queued):
             try:
-                placement = self._placer.place(self._order(room))
+                placement = self._place(room)
             except NoSlotError as fault:
                 room.why = f"It starts when a slot is free: {fault}"
+            except DeltalightError as fault:
+                room.why = f"It cannot be started now, and is tried again: {fault}"
             else:
                 room.run_as(placement)
                 self._notice(f"room {room.plan.name}: starts in {placement.slot}.")
@@ -345,7 +360,7 @@ class RoomKeeper:
             title=room.plan.title or room.plan.name,
             nodes=room.plan.nodes,
             state=room.state,
-            why=" ".join(filter(None, (room.why, *faults))),
+            why=as_sentence(" ".join(filter(None, (room.why, *faults)))),
             waits_for=room.waits_for,
             slot=None if placement is None else placement.slot,
             endpoints=endpoints,

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from deltalight.protocol.keys import Keys
 from deltalight.services import ports
@@ -38,7 +39,7 @@ class LocalPlacer:
         self._spare_due_s = 0.0
         self._forward = forward
         self._placed: dict[str, RenderProcess] = {}  # by slot
-        self._used_ports: set[int] = set()
+        self._used_ports = ports.used_ports()
 
     def slots(self) -> list[Slot]:
         """Return all slots."""
@@ -95,12 +96,10 @@ class LocalPlacer:
         return None if placed is None else placed.placement.room
 
     def _fresh_ports(self) -> list[int]:
-        """Choose ports that no placement has had, so that who still talks to a lost one reaches nobody else."""
-        while True:
-            found = ports.private_ports(2)
-            if self._used_ports.isdisjoint(found):
-                self._used_ports.update(found)
-                return found
+        """Choose ports that no late placement had, so that who still talks to a lost one reaches nobody else."""
+        found = ports.private_ports(2, avoid=self._used_ports)
+        self._used_ports.extend(found)
+        return found
 
     def _look_at(self, slot: str) -> list[PlacementEvent]:
         placed = self._placed[slot]
@@ -120,4 +119,6 @@ class LocalPlacer:
             self._spare_due_s = time.monotonic() + SPARE_AFTER_S
         is_due = self._placed and time.monotonic() >= self._spare_due_s
         if self._spare_spec is not None and self._spare is None and is_due:
-            self._spare = open_spare(self._spare_spec.arguments, self._spare_spec.warm)
+            self._spare_due_s = time.monotonic() + SPARE_AFTER_S
+            with suppress(OSError):  # no more open files or processes: rooms do without one
+                self._spare = open_spare(self._spare_spec.arguments, self._spare_spec.warm)

@@ -37,7 +37,7 @@ class RoomOrder:
 
 @dataclass(frozen=True)
 class Placement:
-    """A render server that was started: its slot, and its endpoints, which no other placement has had."""
+    """A render server that was started: its slot, and its endpoints, which no other late placement has had."""
 
     room: str
     epoch: int

@@ -4,6 +4,7 @@ Ray runs actors and knows who lives (its control plane); nothing of a frame pass
 """
 
 import os
+import re
 import socket
 import uuid
 from collections import Counter
@@ -12,6 +13,8 @@ from typing import Any
 
 from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.services.ports import LOOPBACK
+from deltalight.services.rooms.rooms_file import MAX_ROOMS
+from deltalight.services.rooms.status import HOST_PATTERN
 
 SLOT_RESOURCE = "render_slot"
 AUTO = "auto"
@@ -115,12 +118,15 @@ def _require_answer(address: str) -> None:
 
 
 def _slots(node: dict[str, Any]) -> int:
-    return int(node["Resources"].get(SLOT_RESOURCE, 0))
+    """Return how many slots a host offers: whole ones, and as many as there may be rooms at most."""
+    return int(min(MAX_ROOMS, node["Resources"].get(SLOT_RESOURCE, 0)))
 
 
 def _name(node: dict[str, Any]) -> str:
-    named = str(node["NodeName"])
-    return str(node["NodeManagerHostname"]) if named == node["NodeManagerAddress"] else named
+    """Return the name that a host was given, that which it has otherwise, or Ray's id where both write anything."""
+    named, own = str(node["NodeName"]), str(node["NodeManagerHostname"])
+    chosen = own if named == node["NodeManagerAddress"] else named
+    return chosen if re.fullmatch(HOST_PATTERN, chosen) else f"host-{node['NodeID']}"
 
 
 def _host(node: dict[str, Any], *, is_unique: bool) -> ClusterHost:

@@ -3,6 +3,7 @@
 import random
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -77,7 +78,7 @@ class RayPlacer:
         self._commands = commands
         self._forward = forward
         self._placed: dict[str, _Placed] = {}  # by slot
-        self._used: set[tuple[str, int]] = set()  # addresses and ports
+        self._used: dict[str, deque[int]] = {}  # ports, by address
 
     def slots(self) -> list[Slot]:
         """Return the slots of all hosts that live and are not refused."""
@@ -202,11 +203,12 @@ class RayPlacer:
         )
 
     def _fresh_endpoint(self, host: ClusterHost) -> str:
-        """Choose a port that no placement on the host has had; its actor sees whether it is free there."""
-        while (found := (host.address, random.choice(ports.PRIVATE_PORTS))) in self._used:
+        """Choose a port that no late placement on the host had; its actor sees whether it is free there."""
+        used = self._used.setdefault(host.address, ports.used_ports())
+        while (port := random.choice(ports.PRIVATE_PORTS)) in used:
             pass
-        self._used.add(found)
-        return reachable_endpoint(self._commands, *found)
+        used.append(port)
+        return reachable_endpoint(self._commands, host.address, port)
 
     def _look_at(self, slot: str, ready: set[Any]) -> list[PlacementEvent]:
         placed = self._placed[slot]

@@ -14,8 +14,14 @@ from deltalight.sensor_node.cameras.open import is_live
 
 MAX_ROOMS = 64
 MAX_NODES = 16  # that one render server reads
+MAX_DEVICE = 255
+MAX_ADDRESS = 1024  # characters of a source or an endpoint
+MAX_LABELS = 32  # of a room
 
-Device = Annotated[int, Field(ge=0)] | None
+Device = Annotated[int, Field(ge=0, le=MAX_DEVICE)] | None
+# As Ray, or Kubernetes, has them.
+LabelKey = Annotated[str, Field(min_length=1, max_length=317)]
+LabelValue = Annotated[str, Field(max_length=63)]
 
 
 class NodeEntry(StrictModel):
@@ -24,13 +30,16 @@ class NodeEntry(StrictModel):
     source: str | None = Field(
         default=None,
         min_length=1,
+        max_length=MAX_ADDRESS,
         description="Camera, dataset folder, .mcap recording or `synthetic`; relative to the rooms file.",
     )
     found: Name | None = Field(
         default=None, description="Name under which a node of another host announces itself."
     )
     endpoint: str | None = Field(
-        default=None, description="Where a node of another host publishes, `tcp://KEY@HOST:PORT`."
+        default=None,
+        max_length=MAX_ADDRESS,
+        description="Where a node of another host publishes, `tcp://KEY@HOST:PORT`.",
     )
 
     @model_validator(mode="after")
@@ -57,8 +66,10 @@ class RoomEntry(StrictModel):
         description="Scene document to import and show; null = the last one shown, else the recording's.",
     )
     title: str = Field(default="", max_length=200, description="For people; empty = its name.")
-    labels: dict[str, str] = Field(
-        default={}, description="Labels that its host on a cluster must have, such as the camera's network."
+    labels: dict[LabelKey, LabelValue] = Field(
+        default={},
+        max_length=MAX_LABELS,
+        description="Labels that its host on a cluster must have, such as the camera's network.",
     )
 
 
@@ -67,7 +78,7 @@ class RoomsFile(StrictModel):
 
     slots: (
         Annotated[int, Field(ge=1, le=MAX_ROOMS)]
-        | Annotated[tuple[Device, ...], Field(min_length=1)]
+        | Annotated[tuple[Device, ...], Field(min_length=1, max_length=MAX_ROOMS)]
         | Literal["auto"]
     ) = Field(
         default=1,

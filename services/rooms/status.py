@@ -7,6 +7,8 @@ from pydantic import Field
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.message_fields import Name
 
+HOST_PATTERN = "^[A-Za-z0-9][A-Za-z0-9._-]{0,252}$"  # of a host's name, which stands in addresses
+
 Reason = Literal["slot", "drained", "failed"]
 RoomState = Literal["waiting", "starting", "running", "failed"]
 

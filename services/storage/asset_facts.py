@@ -1,4 +1,4 @@
-"""Facts about a mesh or a map, found by loading it (in the worker)."""
+"""Facts about a mesh, a map or a precomputed material, found by loading it (in the worker)."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -93,3 +93,28 @@ def map_facts(path: Path) -> Facts:
             f"{path} has {width}x{height} pixels; a latitude-longitude map is twice as wide as high."
         )
     return {"width": width, "height": height}
+
+
+def material_facts(path: Path) -> Facts:
+    """Load a precomputed material; return its `model`, mean `base_color` (linear) and what it is made of.
+
+    A `measured_brdf` has `lobes` and the `roughness` of their mean, a `polynomial_texture` `width` and `height` in
+    texels.
+
+    Raises:
+        DeltalightError: the file is wrong; the sentence says how.
+    """
+    from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
+    from deltalight.render_server.scene.material_file import read_material
+
+    material = read_material(path)
+    if isinstance(material, GaussianBrdf):
+        return {
+            "model": "measured_brdf",
+            "base_color": _rounded(material.hemispherical_albedo),
+            "lobes": len(material.sigmas),
+            "roughness": round(material.roughness, 4),
+        }
+    height, width = material.albedo.shape[:2]
+    mean = material.albedo.mean(axis=(0, 1), dtype="float64")
+    return {"model": "polynomial_texture", "base_color": _rounded(mean), "width": width, "height": height}

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from deltalight.services.storage.faults import RejectedAssetError
 
-AssetKind = Literal["mesh", "map"]
+AssetKind = Literal["mesh", "map", "material"]
 Facts = dict[str, Any]  # facts about a loaded file, as JSON
 HEAD_BYTES = 4096
 MAX_NAME_LENGTH = 200
@@ -62,6 +62,10 @@ def _is_exr(head: bytes, _size: int) -> bool:
     return head[:4] == b"\x76\x2f\x31\x01"
 
 
+def _is_dlmat(head: bytes, _size: int) -> bool:
+    return head.startswith(b"deltalight material ")
+
+
 def _is_obj(head: bytes, _size: int) -> bool:
     return not _NOT_TEXT.search(head) and _OBJ_LINE.search(head) is not None
 
@@ -72,6 +76,7 @@ FORMATS = (
     AssetFormat("stl", "mesh", "model/stl", _is_stl),
     AssetFormat("hdr", "map", "image/vnd.radiance", _is_hdr),
     AssetFormat("exr", "map", "image/x-exr", _is_exr),
+    AssetFormat("dlmat", "material", "application/octet-stream", _is_dlmat),
     AssetFormat("obj", "mesh", "model/obj", _is_obj),  # last: the loosest rule
 )
 BY_NAME = {each.name: each for each in FORMATS}

@@ -16,7 +16,17 @@ MEMORY_LIMIT_BYTES = 3 << 30
 TIME_LIMIT_S = 60
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each thread's buffers count as memory
 
-Task = Literal["mesh", "map", "mesh-thumbnail", "map-thumbnail", "unzip", "recording", "shelf"]
+Task = Literal[
+    "mesh",
+    "map",
+    "material",
+    "mesh-thumbnail",
+    "map-thumbnail",
+    "material-thumbnail",
+    "unzip",
+    "recording",
+    "shelf",
+]
 
 
 def run_limited(

@@ -34,12 +34,22 @@ def _task(name: str) -> Callable[..., Facts]:
     if name == "shelf":
         return _write_shelf_item
     if name.endswith("-thumbnail"):
-        from deltalight.services.storage import thumbnails
+        from deltalight.services.storage import material_thumbnails, thumbnails
 
-        return thumbnails.draw_mesh if name == "mesh-thumbnail" else thumbnails.draw_map
-    from deltalight.services.storage import asset_facts
+        draw = {
+            "mesh": thumbnails.draw_mesh,
+            "map": thumbnails.draw_map,
+            "material": material_thumbnails.draw_material,
+        }
+        return draw[name.removesuffix("-thumbnail")]
+    from deltalight.services.storage.asset_facts import map_facts, material_facts, mesh_facts
 
-    return asset_facts.mesh_facts if name == "mesh" else asset_facts.map_facts
+    facts: dict[str, Callable[..., Facts]] = {
+        "mesh": mesh_facts,
+        "map": map_facts,
+        "material": material_facts,
+    }
+    return facts[name]
 
 
 def _write_shelf_item(path: Path, item: str) -> Facts:

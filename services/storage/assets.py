@@ -39,6 +39,11 @@ Probe = Callable[[Path, AssetKind, str], Facts]
 LEFT_OVER_AFTER_S = 24 * 3600  # no upload takes a day: older files were left by a killed process
 CONCURRENT_CHILDREN = 2  # each may use memory up to the limit of a child
 THUMBNAIL = "thumbnail.png"
+THUMBNAIL_TASKS: dict[AssetKind, Task] = {
+    "mesh": "mesh-thumbnail",
+    "map": "map-thumbnail",
+    "material": "material-thumbnail",
+}
 THUMBNAIL_BYTES = 1 << 20  # more than 256 x 256 pixels without any compression
 CHUNK_BYTES = 1 << 20
 MOST_SHELF_BYTES = 1 << 22  # of an object's file; the tests hold them below 1 MB
@@ -222,8 +227,7 @@ class AssetStore:
             return place
         with self._children:
             if read_cached(place) is None:
-                task: Task = "mesh-thumbnail" if asset.format.kind == "mesh" else "map-thumbnail"
-                self._draw(task, path, place, asset.names[0])
+                self._draw(THUMBNAIL_TASKS[asset.format.kind], path, place, asset.names[0])
         return place
 
     def _draw(self, task: Task, path: Path, place: Path, name: str) -> None:
@@ -335,7 +339,7 @@ class AssetNames:
 def _needed_kind(place: str) -> str:
     if place == "lights.environment.map":
         return "map"
-    return "precomputed" if place.endswith(".precomputed") else "mesh"
+    return "material" if place.endswith(".precomputed") else "mesh"
 
 
 def _digest_of(session: Session, place: str, asset: str) -> str:

@@ -91,8 +91,18 @@ def replace_object(name: str, value: object) -> Edit:
 
 
 def patch_object(name: str, patch: object) -> Edit:
-    """Return an edit that merges a patch into one object."""
-    return _edit_object(name, lambda old: merge_patch(old, patch))
+    """Return an edit that merges a patch into one object.
+
+    A patch from a material in numbers to a precomputed one, or back, replaces the material: they share no key.
+    """
+    return _edit_object(name, lambda old: merge_patch(_without_other_material(old, patch), patch))
+
+
+def _without_other_material(item: Document, patch: object) -> Document:
+    old, new = item.get("material"), patch.get("material") if isinstance(patch, Mapping) else None
+    if not (isinstance(old, Mapping) and isinstance(new, Mapping) and new):
+        return item
+    return {**item, "material": None} if ("precomputed" in old) != ("precomputed" in new) else item
 
 
 def _edit_object(name: str, change: Callable[[Document], Any]) -> Edit:

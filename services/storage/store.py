@@ -95,6 +95,16 @@ class Store:
         """The still that the dashboard shows until the first live picture comes; such a file may be missing."""
         return self.folder / "poster.jpg"
 
+    @property
+    def poster_before(self) -> Path:
+        """The camera's own picture of the poster's frame; such a file may be missing."""
+        return self.folder / "poster_before.jpg"
+
+    @property
+    def recordings(self) -> Path:
+        """The folder of recordings; it may be missing."""
+        return self.folder / "recordings"
+
     def close(self) -> None:
         """Close the database, and let others replace the folder's contents."""
         self._opened.close()

@@ -37,7 +37,7 @@ def draw_mesh(path: Path, out: str) -> Facts:
     """
     is_y_up = check_mesh_file(path) == ".glb"
     meshes = load_mesh(path)
-    _write(out, _reduced(_Shot(meshes, is_y_up=is_y_up).rays(SIZE * SAMPLES)))
+    write_picture(out, reduced(_Shot(meshes, is_y_up=is_y_up).rays(SIZE * SAMPLES)))
     return {}
 
 
@@ -54,7 +54,7 @@ def draw_map(path: Path, out: str) -> Facts:
     shown = small * (MIDDLE_GREY / mean / (1 + scaled))[..., None]
     picture = np.zeros((SIZE, SIZE, 4), np.float32)
     picture[SIZE // 4 : SIZE // 4 + SIZE // 2] = np.dstack([shown, np.ones_like(luminance)])
-    _write(out, picture)
+    write_picture(out, picture)
     return {}
 
 
@@ -151,14 +151,15 @@ def _texels(texture: np.ndarray, uv: Float32[np.ndarray, "n 2"]) -> Float32[np.n
     return np.asarray(coarse[row, column])
 
 
-def _reduced(pixels: Pixels) -> Pixels:
+def reduced(pixels: Pixels) -> Pixels:
     """Average the rays of each pixel; colour is that of the covered part."""
     mean = cv2.resize(pixels, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6)
     return np.asarray(mean)
 
 
-def _write(out: str, picture: Pixels) -> None:
+def write_picture(out: str, picture: Pixels) -> None:
+    """Write linear colour and coverage (1 = covered) as PNG in sRGB codes."""
     coded = srgb_code(picture[..., :3])
     codes = np.rint(255 * np.dstack([coded[..., ::-1], picture[..., 3]])).astype(np.uint8)
     Path(out).write_bytes(cv2.imencode(".png", codes)[1].tobytes())

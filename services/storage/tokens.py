@@ -96,11 +96,9 @@ class TokenStore:
                 raise NotFoundError(f"there is no token called `{name}`; list the tokens for their names.")
             session.delete(row)
 
-    @remembered
     def knows(self, token_id: str) -> bool:
-        """Whether a token of this id still exists."""
-        with self._database.reading() as session:
-            return session.get(TokenRow, token_id) is not None
+        """Whether a token of this id still exists; where the database is away, whether `verify` found it last."""
+        return self._row(token_id) is not None
 
     def verify(self, token: str) -> Token | None:
         """Return the metadata of a token, None if it is not valid.

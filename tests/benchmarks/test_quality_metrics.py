@@ -1,5 +1,6 @@
 """Metrics of the quality benchmark against closed forms."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.special import ndtri
@@ -7,7 +8,7 @@ from scipy.stats import norm
 
 from deltalight.benchmarks.ground_truth.benchmark_scene import ShadowEdge
 from deltalight.benchmarks.ground_truth.parts import looking
-from deltalight.benchmarks.quality.energy import energy_ratios
+from deltalight.benchmarks.quality.energy import Change, energy_ratios
 from deltalight.benchmarks.quality.error_view import error_view
 from deltalight.benchmarks.quality.figures import mean_figures
 from deltalight.benchmarks.quality.metrics import Comparison
@@ -73,7 +74,7 @@ def test_scaled_change_has_its_scale_as_energy(share: float) -> None:
     change = rng.uniform(-0.2, 0.2, (*SIZE, 3)).astype(np.float32)
     camera = without + np.float32(0.05)
     regions = Regions(part(slice(0, 24)), part(slice(0, 12)), part(slice(12, 24)))
-    energy = energy_ratios(camera + share * change, camera, without, without + change, regions)
+    energy = energy_ratios(camera + share * change, camera, [Change(without, without + change, regions)])
     assert energy.darkening == pytest.approx(share, abs=1e-4)
     assert energy.brightening == pytest.approx(share, abs=1e-4)
 
@@ -85,10 +86,25 @@ def test_noise_of_the_truth_is_not_light() -> None:
     without = np.full(size, 0.4, np.float32)
     with_objects, result = (without + rng.normal(0.002, 0.006, size).astype(np.float32) for _ in range(2))
     everywhere = np.ones(size[:2], bool)
-    energy = energy_ratios(
-        result, without, without, with_objects, Regions(everywhere, everywhere, ~everywhere)
-    )
+    regions = Regions(everywhere, everywhere, ~everywhere)
+    energy = energy_ratios(result, without, [Change(without, with_objects, regions)])
     assert energy.brightening == pytest.approx(1, abs=0.05)  # by the truth's own sign: 0.36
+
+
+def test_noise_that_a_lens_spreads_over_neighbours_is_no_light_either() -> None:
+    """And neither is that which lifts pixels over the threshold of change: light is measured by the other half."""
+    rng = np.random.default_rng(7)
+    size = (240, 320, 3)
+    without, cover = np.full(size, 0.4, np.float32), np.zeros(size[:2], np.float32)
+
+    def blurred_draw() -> np.ndarray:
+        noise = rng.normal(0, 0.012, size).astype(np.float32)
+        return without + np.float32(0.004) + cv2.GaussianBlur(noise, (0, 0), 0.6)
+
+    result, *halves = (blurred_draw() for _ in range(3))
+    changes = [Change(without, half, find_regions(without, half, cover)) for half in halves]
+    assert energy_ratios(result, without, changes).brightening == pytest.approx(1, abs=0.05)
+    assert energy_ratios(result, without, changes[:1]).brightening < 0.8
 
 
 def test_virtual_radiance_is_compared_on_objects_only() -> None:
@@ -96,7 +112,7 @@ def test_virtual_radiance_is_compared_on_objects_only() -> None:
     result = truth.copy()
     result[12:] *= 0.75
     regions = Regions(part(slice(0, 24)), part(slice(0, 12)), part(slice(12, 24)))
-    energy = energy_ratios(result, truth, truth, truth, regions)
+    energy = energy_ratios(result, truth, [Change(truth, truth, regions)])
     assert energy.virtual == pytest.approx(0.75)
     assert np.isnan(energy.darkening)
 

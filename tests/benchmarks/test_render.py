@@ -48,6 +48,14 @@ def test_depth_is_the_distance_of_the_table_along_the_axis(room: RoomRenderer) -
     assert np.all(depth_m > 0.3)
 
 
+def test_few_samples_are_right_in_the_mean(room: RoomRenderer) -> None:
+    """Mitsuba's stratified sampler is not."""
+    pose = scene_demo.world_from_camera(0)
+    few = np.mean([room.color(pose, spp=16, seed=seed) for seed in range(24)], axis=0)
+    many = room.color(pose, spp=512, seed=99)
+    assert few.mean() == pytest.approx(many.mean(), rel=0.004)
+
+
 def test_object_stands_where_the_scene_document_says(room: RoomRenderer) -> None:
     pose = scene_demo.world_from_camera(0)
     color = room.color(pose, spp=16, seed=1)

@@ -4,6 +4,7 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -171,6 +172,7 @@ def test_options_are_those_of_our_commands(resources: list[Resource]) -> None:
     assert checked == 2
 
 
+@cache
 def options_of_ray_start() -> set[str]:
     """Asked in a process of its own: Ray reads settings when it is imported, and other tests here need theirs."""
     listing = (

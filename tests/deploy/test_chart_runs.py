@@ -128,4 +128,6 @@ def test_the_commands_of_the_pods_show_a_room_that_another_host_renders() -> Non
         assert {slot["host"] for slot in web.get("/rooms").json()["slots"]} != {"local"}
         assert web.post("/recordings", json={}).status_code == 409, "the keeper's web process records"
         check_names(web.get("/metrics").text, [FLEET_BOARD])
-        assert httpx.get(f"http://127.0.0.1:{release.web}/api/v1/rooms").status_code == 401
+        assert (
+            httpx.get(f"http://127.0.0.1:{release.web}/api/v1/rooms", timeout=PATIENCE_S).status_code == 401
+        )

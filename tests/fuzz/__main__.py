@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of the decoders: `python -m tests.fuzz TARGET... --minutes 5`.
+"""Coverage-guided fuzzing of the decoders: `python -m tests.fuzz TARGET... --minutes 5`, or `--executions 1000000`.
 
 It needs atheris, which has wheels for Linux on x86-64 only. What fails is kept as a file in `kept/TARGET`, which the
 tests replay; the corpus grows in a folder of its own.
@@ -38,7 +38,7 @@ def main() -> None:
         grown = options.work / target
         grown.mkdir(parents=True, exist_ok=True)
         write_seeds(target, grown)
-        print(json.dumps(_fuzz(target, grown, 60 * options.minutes)), flush=True)
+        print(json.dumps(_fuzz(target, grown, options)), flush=True)
         if options.distil:
             _distil(target, grown)
 
@@ -49,6 +49,8 @@ def _options() -> argparse.Namespace:
         "targets", nargs="*", choices=[*TARGETS, []], metavar="TARGET", help=", ".join(TARGETS)
     )
     parser.add_argument("--minutes", type=float, default=2.0, help="for each target")
+    parser.add_argument("--executions", type=int, help="of each target, however long they take")
+    parser.add_argument("--seed", type=int, default=0, help="of the mutations; 0: another one each time")
     parser.add_argument("--work", type=Path, default=Path("build/fuzz"), help="folder of the grown corpus")
     parser.add_argument("--distil", action="store_true", help="renew the corpus that the tests replay")
     return parser.parse_args()
@@ -63,12 +65,13 @@ def write_seeds(target: str, grown: Path) -> None:
     (KEPT / target).mkdir(parents=True, exist_ok=True)
 
 
-def _fuzz(target: str, grown: Path, seconds: float) -> dict[str, object]:
-    """Run until the time is up, again after each crash of the process; return the figures."""
+def _fuzz(target: str, grown: Path, options: argparse.Namespace) -> dict[str, object]:
+    """Run until the time is up or enough was executed, again after each crash; return the figures."""
     began_s, executions, crashes, peak_mb, slowest_s = time.monotonic(), 0, 0, 0, 0
     before = _contents(KEPT / target)
-    while (left_s := round(seconds - (time.monotonic() - began_s))) > 0 and crashes < MOST_CRASHES:
-        code, told = run_fuzzer(target, grown, KEPT / target, f"-max_total_time={left_s}")
+    while (left := _left(options, time.monotonic() - began_s, executions)) and crashes < MOST_CRASHES:
+        seed = options.seed and options.seed + crashes
+        code, told = run_fuzzer(target, grown, KEPT / target, left, f"-seed={seed}")
         executions += told_figure(told, "number_of_executed_units")
         peak_mb = max(peak_mb, told_figure(told, "peak_rss_mb"))
         slowest_s = max(slowest_s, told_figure(told, "slowest_unit_time_sec"))
@@ -78,6 +81,7 @@ def _fuzz(target: str, grown: Path, seconds: float) -> dict[str, object]:
         print(told[-3000:], file=sys.stderr, flush=True)
     return {
         "target": target,
+        "seed": options.seed,
         "seconds": round(time.monotonic() - began_s),
         "executions": executions,
         "crashes": crashes,
@@ -86,6 +90,15 @@ def _fuzz(target: str, grown: Path, seconds: float) -> dict[str, object]:
         "slowest_s": slowest_s,
         "inputs": len(list(grown.iterdir())),
     }
+
+
+def _left(options: argparse.Namespace, passed_s: float, executions: int) -> str | None:
+    """Return libFuzzer's option for what is left to do; None if nothing is."""
+    if options.executions is None:
+        left, option = round(60 * options.minutes - passed_s), "-max_total_time"
+    else:
+        left, option = options.executions - executions, "-runs"
+    return f"{option}={left}" if left > 0 else None
 
 
 def run_fuzzer(target: str, grown: Path, kept: Path, *options: str) -> tuple[int, str]:

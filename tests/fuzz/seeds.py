@@ -20,7 +20,10 @@ from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.vectors import FOLDER, unframe_pieces
+from deltalight.render_server.scene.material_file import write_material
+from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
 from tests.fuzz.targets import RECORD_TOPICS, packed
+from tests.render_server.brdf_samples import grey_brdf
 from tests.render_server.gltf_samples import QUARTER_TURN, bent_bar
 from tests.services.test_gltf_zip import PIECES, RED_PNG, gltf
 
@@ -51,6 +54,7 @@ def seeds() -> Iterator[tuple[str, bytes]]:
         yield from _recordings(Path(folder))
         yield from _meshes(Path(folder))
         yield from _maps(Path(folder))
+        yield from _materials(Path(folder))
     yield from _archives()
 
 
@@ -153,6 +157,15 @@ def _maps(folder: Path) -> Iterator[tuple[str, bytes]]:
     cv2.imwrite(str(folder / "map.hdr"), light)
     yield "radiance", b"e" + (folder / "map.exr").read_bytes()
     yield "radiance", b"h" + (folder / "map.hdr").read_bytes()
+
+
+def _materials(folder: Path) -> Iterator[tuple[str, bytes]]:
+    path, paint = folder / "paint.dlmat", grey_brdf(0.2, (0.1, 0.1, 0.5))
+    texels = np.full((TERMS, 4, 6, 3), 0.1, np.float16)
+    for material in (paint, PolynomialTexture(texels)):
+        write_material(path, material)
+        yield "material", b"f" + path.read_bytes()
+        yield "material", b"a" + path.read_bytes().split(b"\n", 1)[1]
 
 
 def _archives() -> Iterator[tuple[str, bytes]]:

@@ -10,6 +10,7 @@ import struct
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ from deltalight.protocol.scene import parse_scene
 from deltalight.protocol.yaml_text import parse_yaml, yaml_text
 from deltalight.render_server.scene import asset_check, mesh_loading  # noqa: F401 - before atheris looks away
 from deltalight.services.recording_info import describe_recording
-from deltalight.services.storage.asset_facts import map_facts, mesh_facts
+from deltalight.services.storage.asset_facts import map_facts, material_facts, mesh_facts
 from deltalight.services.storage.gltf_zip import repack
 from deltalight.services.storage.recording_check import check_recording
 
@@ -170,6 +171,15 @@ def radiance(data: bytes) -> None:
     _on_file(data[1:], ".exr" if data[:1] == b"e" else ".hdr", _read_map)
 
 
+def material(data: bytes) -> None:
+    """A precomputed material: the file itself, or its archive under the right hash."""
+    arrays = data[1:]
+    head = (
+        b"" if data[:1] == b"f" else b"deltalight material 1 " + sha256(arrays).hexdigest().encode() + b"\n"
+    )
+    _on_file(head + arrays, ".dlmat", material_facts)
+
+
 def archive(data: bytes) -> None:
     """An uploaded .zip, of a glTF or a dataset folder: the file itself, or one of the given names and contents."""
     task = repack if data[:1] in (b"z", b"Z") else check_recording
@@ -179,7 +189,20 @@ def archive(data: bytes) -> None:
 
 TARGETS: dict[str, Callable[[bytes], None]] = {
     target.__name__: target
-    for target in (envelope, codecs, scene, yaml, lists, camera, mcap, gltf, mesh, radiance, archive)
+    for target in (
+        envelope,
+        codecs,
+        scene,
+        yaml,
+        lists,
+        camera,
+        mcap,
+        gltf,
+        mesh,
+        radiance,
+        material,
+        archive,
+    )
 }
 """By name."""
 

@@ -22,7 +22,7 @@ from deltalight.protocol.request import ReplyServer, RequestClient
 from deltalight.protocol.rights import allow
 
 ANY = "tcp://127.0.0.1:0"
-SETTLE_S = 5.0
+SETTLE_S = 30.0
 # What a refused receiver is given to get something by mistake: many reconnects and handshakes.
 PATIENCE_S = 0.8
 # Several attempts of libzmq to connect.

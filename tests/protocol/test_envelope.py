@@ -18,6 +18,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import (
     MAX_HEADER_BYTES,
     MESSAGE_TYPES,
+    OLDEST_SCHEMA_VERSION,
     SCHEMA_VERSION,
     ColorMessage,
     ControlReply,
@@ -115,10 +116,17 @@ def test_topic_is_stream_and_node() -> None:
     assert encode(color(), [np.zeros((2, 4, 3), np.uint8)])[0] == b"color.desk"
 
 
-@pytest.mark.parametrize("version", [0, 1, SCHEMA_VERSION - 1, SCHEMA_VERSION + 1, 999, -1])
-def test_another_version_is_refused_and_both_are_named(version: int) -> None:
-    with pytest.raises(EnvelopeError, match=rf"version {version} .* version {SCHEMA_VERSION}"):
+@pytest.mark.parametrize("version", [0, 1, OLDEST_SCHEMA_VERSION - 1, SCHEMA_VERSION + 1, 999, -1])
+def test_another_version_is_refused_and_all_are_named(version: int) -> None:
+    readable = f"versions {OLDEST_SCHEMA_VERSION} to {SCHEMA_VERSION}"
+    with pytest.raises(EnvelopeError, match=rf"version {version} .* {readable}"):
         unpack_header(header_of(color(), schema_version=version))
+
+
+def test_the_version_before_is_read() -> None:
+    assert OLDEST_SCHEMA_VERSION < SCHEMA_VERSION
+    read = unpack_header(header_of(color(), schema_version=OLDEST_SCHEMA_VERSION))
+    assert read == color(schema_version=OLDEST_SCHEMA_VERSION)
 
 
 @pytest.mark.parametrize("version", [None, True, 1.0, "1", [1]])

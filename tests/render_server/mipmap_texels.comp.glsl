@@ -21,6 +21,6 @@ layout(std430) writeonly buffer Found { float found[]; };
 
 void main() {
     uint i = gl_GlobalInvocationID.x;
-    if (i < uint(places.length())) found[i] = volume_sample(mipmap, volume_size, places[i].xyz, level, direction).r;
+    if (i < uint(places.length())) found[i] = volume_sample(mipmap, 0, volume_size, places[i].xyz, level, direction).r;
 }
 #endif

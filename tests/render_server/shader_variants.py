@@ -132,6 +132,22 @@ def render_several(case: Case, gpu: GpuContext, folder: Path) -> None:
         renderer.release()
 
 
+def render_apart(gpu: GpuContext, folder: Path, **method: Any) -> None:  # noqa: ANN401
+    """Renders objects that have volumes of their own, in the composite and as voxels."""
+    case = Case("exact", "model", "mirror")
+    document = scene_of(case, Stage(folder)).model_dump(mode="json", exclude_unset=True)
+    far = {**document["objects"][0], "id": "far", "pose": {"translation_m": [2.0, 0, 0]}}
+    document["objects"].append(far)
+    scene = changed(parse_scene(document), "method", method)
+    renderer = SceneRenderer(gpu, scene)
+    try:
+        for view in ("composite", "volume"):
+            renderer.set_scene(changed(scene, "output", {"view": view}))
+            renderer.render(frames_of(case)[0])
+    finally:
+        renderer.release()
+
+
 def render_with(
     plate: Plate, case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path, *more: dict[str, Any]
 ) -> None:
@@ -203,6 +219,8 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{f"{case} measured": partial(render_measured, case, {}) for case in MEASURED},
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
     **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
+    "objects far apart": render_apart,
+    "objects far apart, live": partial(render_apart, quality="live"),
     "by device": by_device,
     "image-based shading": image_based,
     "precomputed transfer": precomputed_transfer,

@@ -14,7 +14,7 @@ from scipy.optimize import curve_fit
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.shadow_maps import CASTER_CELL, ShadowMaps
-from deltalight.render_server.passes.voxels import VolumePlacement
+from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     Fields,

@@ -14,6 +14,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 from deltalight.render_server.server.snapshot import SnapshotOrder, SnapshotPicture, take_snapshot
+from deltalight.render_server.started_frame import CameraFrame
 from tests.render_server.protected_scenes import Case, scene_of
 from tests.render_server.scenes import Stage, psnr_db
 from tests.render_server.test_quality_tiers import seen
@@ -218,7 +219,12 @@ def test_a_size_that_was_shown_before_is_not_built_again(gpu: GpuContext, hurrie
 def test_snapshots_are_full_size(hurried: Walker, whole: Walker, tmp_path: Path) -> None:
     aside = 0.004 * (hurried.count % 8)
     order = SnapshotOrder(folder=tmp_path, pictures=(SnapshotPicture(name="now"),))
-    taken = take_snapshot(hurried.renderer, hurried.renderer.scene, seen(aside, hurried.count), order)
+    taken = take_snapshot(
+        hurried.renderer,
+        hurried.renderer.scene,
+        CameraFrame.numbered([seen(aside, hurried.count)]),
+        order,
+    )
     assert taken.files == ["now.png"]
     shown = cv2.cvtColor(cv2.imread(str(tmp_path / "now.png")), cv2.COLOR_BGR2RGB)
     assert psnr_db(shown, whole.show(aside).color) > 36

@@ -30,16 +30,14 @@ from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.methods.differential import SolutionVoxels
 from deltalight.render_server.methods.dvct import InjectedVoxels
 from deltalight.render_server.methods.voxel_volumes import DeltaVoxels
+from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
 from deltalight.render_server.passes.voxels import (
     LARGEST_ITEM_BYTES,
     LEAST_SURFELS,
-    PlacedVolume,
-    VolumePlacement,
     VoxelMipmap,
     VoxelStore,
     memory_statement,
     mipmap_shape,
-    place_volume,
     volume_memory_bytes,
 )
 from deltalight.render_server.renderer import SceneRenderer

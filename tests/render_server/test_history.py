@@ -11,7 +11,7 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_objects import Pose, Surface
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.voxels import VolumePlacement
+from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 from tests.render_server.scenes import (
     Stage,
@@ -92,7 +92,7 @@ def fresh(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> Composit
 
 def placement_of(renderer: SceneRenderer) -> VolumePlacement:
     assert renderer.graph is not None
-    placement = renderer.graph["volume placement"]
+    (placement,) = renderer.graph["volume placement"]
     assert isinstance(placement, VolumePlacement)
     return placement
 

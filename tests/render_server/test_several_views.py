@@ -20,6 +20,7 @@ from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.scene.depth_surface import depth_surface
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.started_frame import CameraFrame
 from deltalight.render_server.view import CameraView, resized_frame
 from tests.render_server.scenes import (
     HEIGHT,
@@ -227,3 +228,29 @@ def covering(mesh: TriangleMesh, points: np.ndarray) -> np.ndarray:
     edges = [(end - start, at - start) for start, end in ((a, b), (b, c), (c, a))]
     sides = [along[..., 0] * to[..., 1] > along[..., 1] * to[..., 0] for along, to in edges]
     return np.asarray((np.sum(sides, axis=0) % 3 == 0).sum(axis=1))
+
+
+def pictures(renderer: SceneRenderer, *taken: CameraFrame) -> list[np.ndarray]:
+    return [each.finish().color for each in renderer.submit_cameras(taken)]
+
+
+def test_a_frame_that_is_not_shown_lights_the_room_and_one_left_out_does_not(
+    made: Callable[..., SceneRenderer],
+) -> None:
+    behind, facing = seen_room(BEHIND), seen_room(FACING)
+    alone = made("depth").render(behind).color
+    together = [each.color for each in made("depth").render_views([behind, facing])]
+    renderer = made("depth")
+    (first,) = pictures(renderer, CameraFrame("a", behind), CameraFrame("b", facing, is_shown=False))
+    assert psnr_db(first, together[0]) > 50
+    assert psnr_db(first, alone) < 45
+    middle = (WIDTH / 2, HEIGHT / 2)
+    picks = [renderer.pick(*middle, camera=name).distance_m for name in ("a", "b", None)]
+    assert picks[0] == picks[2] != picks[1]
+    (second,) = pictures(renderer, CameraFrame("b", facing))
+    assert renderer.pick(*middle).distance_m == picks[1]
+    with pytest.raises(DeltalightError, match="Nothing was rendered"):
+        renderer.pick(*middle, camera="a")
+    assert psnr_db(second, facing.color) < 45, "the object is in it"
+    again = pictures(renderer, CameraFrame("a", behind), CameraFrame("b", facing))
+    assert all(psnr_db(one, other) > 50 for one, other in zip(again, together, strict=True))

@@ -15,6 +15,7 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
+from deltalight.render_server.started_frame import CameraFrame
 from tests.render_server.scenes import (
     Stage,
     ambient,
@@ -82,7 +83,12 @@ def test_each_picture_is_what_that_view_and_method_alone_would_show(
     ]
     renderer = SceneRenderer(gpu, with_view(document, "volume"))
     before = renderer.render(view).color
-    taken = take_snapshot(renderer, with_view(document, "volume"), view, order(folder, *pictures, exr=True))
+    taken = take_snapshot(
+        renderer,
+        with_view(document, "volume"),
+        CameraFrame.numbered([view]),
+        order(folder, *pictures, exr=True),
+    )
     after = renderer.render(frame(checkered(), frame_id=1)).color
     renderer.release()
     assert taken.errors == {}
@@ -116,7 +122,7 @@ def test_one_that_fails_is_named_and_the_others_are_written(
     taken = take_snapshot(
         renderer,
         document,
-        view,
+        CameraFrame.numbered([view]),
         order(
             folder,
             {"name": "huge", "method": too_large},
@@ -172,7 +178,7 @@ def test_what_is_averaged_over_frames_is_as_if_there_had_been_no_snapshot(
                 wanted = order(
                     folder, {"name": "dlpv", "method": DLPV}, {"name": "none", "method": NONE}, exr=True
                 )
-                assert take_snapshot(renderer, document, view, wanted).errors == {}
+                assert take_snapshot(renderer, document, CameraFrame.numbered([view]), wanted).errors == {}
         pictures.append(renderer.render(noisy_view(4)).color)
         renderer.release()
     np.testing.assert_array_equal(*pictures)
@@ -202,7 +208,8 @@ def test_a_frame_without_pose_is_the_cameras_picture_linear_too(
     document = everyday(stage)
     view = replace(frame(noisy()), pose=None)
     renderer = SceneRenderer(gpu, document)
-    assert take_snapshot(renderer, document, view, order(folder, {"name": "a"}, exr=True)).errors == {}
+    room = CameraFrame.numbered([view])
+    assert take_snapshot(renderer, document, room, order(folder, {"name": "a"}, exr=True)).errors == {}
     renderer.release()
     np.testing.assert_array_equal(read_png(folder / "a.png"), view.color)
     linear = read_linear(folder / "composite.exr")
@@ -221,5 +228,7 @@ def test_orders_that_cannot_be_carried_out_are_sentences(gpu: GpuContext, stage:
     document = everyday(stage)
     renderer = SceneRenderer(gpu, document)
     with pytest.raises(DeltalightError, match="There is no folder"):
-        take_snapshot(renderer, document, frame(), order(folder / "missing", {"name": "a"}))
+        take_snapshot(
+            renderer, document, CameraFrame.numbered([frame()]), order(folder / "missing", {"name": "a"})
+        )
     renderer.release()

@@ -10,7 +10,7 @@ import pytest
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.voxels import VolumePlacement, place_volume
+from deltalight.render_server.passes.volumes import VolumePlacement, place_volume
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.virtual_objects import VirtualObjects
 from tests.render_server.scenes import (

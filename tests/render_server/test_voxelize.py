@@ -10,14 +10,8 @@ from scipy import ndimage
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.gbuffer import triangle_corners
-from deltalight.render_server.passes.voxels import (
-    SURFEL_BYTES,
-    SURFELS_HEADER_BYTES,
-    PlacedVolume,
-    Voxelize,
-    VoxelStore,
-    place_volume,
-)
+from deltalight.render_server.passes.volumes import PlacedVolume, place_volume
+from deltalight.render_server.passes.voxels import SURFEL_BYTES, SURFELS_HEADER_BYTES, Voxelize, VoxelStore
 from tests.render_server.voxel_lab import VoxelLab, gpu_mesh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

@@ -11,17 +11,15 @@ from deltalight.render_server.gpu.kernel import Binding, Kernel
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 from deltalight.render_server.passes.gbuffer import MaterialTable, triangle_corners
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.volumes import FarVolumeBlock, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxel_light import LightVoxels
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     SURFEL_BYTES,
     SURFELS_HEADER_BYTES,
-    FarVolumeBlock,
     FilterVoxels,
     OccupyVoxels,
-    PlacedVolume,
     ResolveVoxels,
-    VolumePlacement,
     Voxelize,
     VoxelMipmap,
     VoxelStore,

@@ -71,8 +71,8 @@ def running(config: NodeConfig) -> Iterator[threading.Event]:
         yield stop
     finally:
         stop.set()
-        thread.join(1.5)
-        assert not thread.is_alive(), "the node did not end within a second"
+        thread.join(20)
+        assert not thread.is_alive(), "the node did not end"
     if errors:
         raise errors[0]
 

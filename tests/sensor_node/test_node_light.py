@@ -97,7 +97,7 @@ def messages_of(
         yield collect
     finally:
         stop.set()
-        thread.join(5)
+        thread.join(20)
         receiver.close()
         assert not thread.is_alive()
 
@@ -232,7 +232,7 @@ def test_a_node_with_keys_is_heard_by_those_it_trusts(take: Path, tmp_path: Path
         assert stranger.latest(0) is None
     finally:
         stop.set()
-        thread.join(5)
+        thread.join(20)
         stranger.close()
         receiver.close()
 

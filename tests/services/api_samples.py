@@ -30,7 +30,12 @@ class RenderServer:
     def __init__(self, port: int) -> None:
         self.renderer = InvertingRenderer()
         self.session = RenderSession(self.renderer, SceneDocument(name="as started", revision=7))
-        self._replies = ReplyServer(ports.endpoint(port), self._execute)
+        self._port = port
+        self.open()
+
+    def open(self) -> None:
+        """Answer, again too."""
+        self._replies = ReplyServer(ports.endpoint(self._port), self._execute)
 
     def _execute(self, request: object) -> dict[str, object]:
         if getattr(request, "op", "") == "clock":
@@ -68,13 +73,16 @@ def running_api(
         listener = listening(ports.LOOPBACK, port)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
-        while not server.started:
-            time.sleep(0.01)
-        with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=30) as client:
-            yield RunningApi(client, store, control_port, app)
-        server.should_exit = True
-        thread.join()
-        listener.close()
+        try:
+            while not server.started:
+                assert thread.is_alive(), "the web process did not start"
+                time.sleep(0.01)
+            with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60) as client:
+                yield RunningApi(client, store, control_port, app)
+        finally:  # its threads would log into the next tests
+            server.should_exit = True
+            thread.join()
+            listener.close()
 
 
 def sentence(response: httpx.Response, status: int) -> str:

@@ -24,6 +24,7 @@ from playwright.sync_api import (
     ConsoleMessage,
     Locator,
     Page,
+    expect,
     sync_playwright,
 )
 
@@ -67,7 +68,8 @@ NEEDS_BROWSER = [
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A running browser."""
+    """A running browser; `expect` waits for it as long as everything else does."""
+    expect.set_options(timeout=PATIENCE_S * 1000)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield browser

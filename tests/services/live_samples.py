@@ -26,6 +26,7 @@ from tests.services.api_samples import RenderServer, RunningApi, running_api
 from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera
 
 PERIOD_S = 0.02
+PATIENCE_S = 60.0  # on a busy machine
 AGE_S = 0.005
 NOISE = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
 LIGHT = {"type": "sphere", "position_m": [0.0, 0.0, 2.0], "intensity": [2.0, 1.0, 1.0], "radius_m": 0.1}
@@ -146,10 +147,10 @@ def live_api(
         server.close()
 
 
-def wait_for_frames(address: str, patience_s: float = 30) -> None:
+def wait_for_frames(address: str, patience_s: float = PATIENCE_S) -> None:
     deadline_s = time.monotonic() + patience_s
     # One client for all requests: each made anew takes 40 ms of processor time.
-    with httpx.Client(base_url=f"http://{address}/api/v1") as client:
+    with httpx.Client(base_url=f"http://{address}/api/v1", timeout=patience_s) as client:
         while time.monotonic() < deadline_s:
             with suppress(httpx.TransportError, KeyError):
                 if client.get("/health").json()["stream"]["status"] == "ok":
@@ -159,14 +160,15 @@ def wait_for_frames(address: str, patience_s: float = 30) -> None:
 
 
 def live_socket(address: str, query: str = "", **options: object) -> ClientConnection:
-    return connect(f"ws://{address}/api/v1/live{query}", compression=None, **options)  # type: ignore[arg-type]
+    options = {"compression": None, "open_timeout": PATIENCE_S, **options}
+    return connect(f"ws://{address}/api/v1/live{query}", **options)  # type: ignore[arg-type]
 
 
 def event_socket(address: str, query: str = "", **options: object) -> ClientConnection:
-    return connect(f"ws://{address}/api/v1/events{query}", **options)  # type: ignore[arg-type]
+    return connect(f"ws://{address}/api/v1/events{query}", **{"open_timeout": PATIENCE_S, **options})  # type: ignore[arg-type]
 
 
-def read_frame(socket: ClientConnection, timeout_s: float = 10) -> dict[str, Any]:
+def read_frame(socket: ClientConnection, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
     """The header of the next frame, whose picture is checked to be a JPEG."""
     message = socket.recv(timeout=timeout_s)
     assert isinstance(message, bytes)
@@ -177,7 +179,7 @@ def read_frame(socket: ClientConnection, timeout_s: float = 10) -> dict[str, Any
     return header
 
 
-def next_event(socket: ClientConnection, *types: str, timeout_s: float = 10) -> dict[str, Any]:
+def next_event(socket: ClientConnection, *types: str, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
     """The next event of one of these types."""
     deadline_s = time.monotonic() + timeout_s
     while True:

@@ -77,10 +77,11 @@ class Running:
         assert seen is not None
         return self._agreement_db(header.frame_id, seen)
 
-    def closest(self, seen: Picture) -> tuple[float, int]:
-        """PSNR from the JPEG that agrees most, dB, and its frame's id: of the newest 50."""
-        newest = sorted(self.stream.jpegs)[-50:]
-        return max((self._agreement_db(frame_id, seen), frame_id) for frame_id in newest)
+    def closest(self, seen: Picture, after: int | None = None) -> tuple[float, int]:
+        """PSNR from the JPEG that agrees most, dB, and its frame's id: of the newest 50, or of all after a frame."""
+        sent = sorted(self.stream.jpegs)
+        chosen = sent[-50:] if after is None else [frame_id for frame_id in sent if frame_id > after]
+        return max((self._agreement_db(frame_id, seen), frame_id) for frame_id in chosen)
 
     def _agreement_db(self, frame_id: int, seen: Picture) -> float:
         jpeg = memoryview(self.stream.jpegs[frame_id])

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 USERS = ("postgres", "nobody")  # in place of root, as whom it refuses to run
-READY_S = 30.0
+READY_S = 60.0
 
 
 def programs() -> Path | None:

@@ -19,6 +19,7 @@ from deltalight.protocol.scene_fields import ShownView
 from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.renderer import OtherView
 from deltalight.render_server.room_mesh import RoomMesh
+from deltalight.render_server.started_frame import CameraFrame
 from deltalight.services import ports
 
 NOWHERE = {"kind": "nothing", "object": None, "point_m": None, "normal": None, "distance_m": None}
@@ -135,19 +136,24 @@ class InvertingRenderer:
         self.notices: list[str] = []
         self.scenes: list[SceneDocument] = []
         self.sources_begun = 0
-        self.newest: ViewFrame | None = None
+        self.newest: dict[str, ViewFrame] = {}
+        self.rooms: list[list[tuple[str, int, bool]]] = []  # camera, frame, and whether it was to be shown
         self.ignored: str | None = None
         self.unfinished: list[int] = []
 
-    def submit(
+    def submit_cameras(
         self,
-        frame: ViewFrame,
+        taken: Sequence[CameraFrame],
         *,
         with_linear: bool = False,
         whole: bool = False,  # noqa: ARG002
         others: Sequence[ShownView] = (),
-    ) -> Started:
-        self.newest = frame
+    ) -> list[Started]:
+        self.rooms.append([(each.camera, each.frame.frame_id, each.is_shown) for each in taken])
+        self.newest = {each.camera: each.frame for each in taken}
+        return [self._start(each.frame, others, with_linear=with_linear) for each in taken if each.is_shown]
+
+    def _start(self, frame: ViewFrame, others: Sequence[ShownView], *, with_linear: bool) -> Started:
         if frame.frame_id in self.fails_at:
             raise RuntimeError("the volume fell over")
         pose = None if frame.pose is None else frame.pose.world_from_camera
@@ -166,18 +172,19 @@ class InvertingRenderer:
     def sized(self, frame: ViewFrame) -> ViewFrame:
         return frame
 
-    def pick(self, x: float, y: float, ignore: str | None = None) -> Picked:
-        if self.newest is None:
+    def pick(self, x: float, y: float, ignore: str | None = None, camera: str | None = None) -> Picked:
+        seen = next(iter(self.newest.values()), None) if camera is None else self.newest.get(camera)
+        if seen is None:
             raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
         self.ignored = ignore
-        return Picked(self.newest.frame_id, (x, y))
+        return Picked(seen.frame_id, (x, y))
 
     def room(self) -> RoomMesh:
         raise DeltalightError("No surface of the room is known yet; ask again when depth shows some.")
 
     def forget_frames(self) -> None:
         self.sources_begun += 1
-        self.newest = None
+        self.newest = {}
 
     def set_scene(self, scene: SceneDocument) -> None:
         if scene.name == "refused":

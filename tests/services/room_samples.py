@@ -7,7 +7,7 @@ from pathlib import Path
 from deltalight.services import ports
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
 from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
-from deltalight.services.rooms.status import RoomNode
+from deltalight.services.rooms.status import RoomList, RoomNode
 from tests.services.render_server_samples import Recorder
 
 
@@ -64,21 +64,33 @@ class StandInPlacer:
         """Have the render server of a room report."""
         self.events.append(PlacementEvent(self.of(room, slot).epoch, "reported", shows=shows))
 
-    def lose(self, room: str, *, slot: str | None = None, **kind: bool) -> None:
+    def lose(self, room: str, *, slot: str | None = None, detail: str = "It broke.", **kind: bool) -> None:
         """Have the render server of a room die."""
         placement = self.of(room, slot)
         del self.placed[placement.slot]
         self._end(placement.epoch)
-        self.events.append(PlacementEvent(placement.epoch, "lost", "It broke.", **kind))
+        self.events.append(PlacementEvent(placement.epoch, "lost", detail, **kind))
 
     def of(self, room: str, slot: str | None = None) -> Placement:
         """The placement of a room, in this slot if it is in two."""
         found = (each for each in self.placed.values() if each.room == room and slot in (None, each.slot))
         return next(found)
 
+    def report_all(self) -> None:
+        """Have all render servers report; other threads may place and release meanwhile."""
+        epochs = [placement.epoch for placement in list(self.placed.values())]
+        self.events += [PlacementEvent(epoch, "reported", shows=True) for epoch in epochs]
+
     def _end(self, epoch: int) -> None:
         if epoch in self.servers:
             self.servers.pop(epoch).close()
+
+
+class NoDirectory:
+    """For followers that are told what to follow."""
+
+    def rooms(self) -> RoomList:
+        raise AssertionError("it was told, and need not ask")
 
 
 def running(keeper: RoomKeeper, placer: StandInPlacer, *names: str) -> None:

@@ -23,7 +23,7 @@ from deltalight.services.rooms.directory import DirectoryClient
 from deltalight.services.rooms.status import RoomStatus
 from tests.services.conftest import ROOT
 
-PATIENCE_S = 90.0
+PATIENCE_S = 150.0
 ROOMS = """
 slots: 2
 nodes: {desk: {source: take.mcap}}
@@ -107,14 +107,7 @@ class Installation:
         """Wait until two rooms run and a spare has prepared itself: it takes no processor time any more."""
         wait_for(lambda: self.count_of("server") == 3)
         spare = max(self.process.children(recursive=True), key=lambda child: child.create_time())
-        used_s = [-1.0]
-
-        def is_idle() -> bool:
-            time.sleep(0.3)
-            used_s.append(sum(spare.cpu_times()[:2]))
-            return used_s[-1] == used_s[-2]
-
-        wait_for(is_idle)
+        wait_until_idle(spare)
 
     def kill(self, name: str) -> str:
         """Kill the room's render server; return the seconds until a viewer has a picture of the next, and by whom."""
@@ -143,6 +136,27 @@ def is_gone(process: psutil.Process) -> bool:
     return True
 
 
+def wait_until_idle(process: psutil.Process) -> None:
+    """Wait until a process has done what it had to do: all its threads sleep, and it takes no processor time."""
+    tasks = Path(f"/proc/{process.pid}/task")
+    used_s = [-1.0]
+
+    def is_idle() -> bool:
+        time.sleep(0.3)
+        used_s.append(sum(process.cpu_times()[:2]))
+        states = {state_of(thread) for thread in tasks.iterdir()}
+        return used_s[-1] == used_s[-2] and states <= {"S", ""}
+
+    wait_for(is_idle)
+
+
+def state_of(thread: Path) -> str:
+    """The letter of a thread's state in /proc; "" where it has ended."""
+    with suppress(OSError):
+        return (thread / "stat").read_text().rpartition(") ")[2][0]
+    return ""
+
+
 def connections(process: psutil.Process) -> list[object]:
     with suppress(psutil.Error):
         return list(process.net_connections("tcp"))
@@ -155,6 +169,14 @@ def started(folder: Path, *options: str) -> Iterator[Installation]:
     write_take(folder / "take.mcap", (96, 72), 5.0, frames=(0,) * 10)
     (folder / "scene.json").write_text(soaked_scene(choose_profile("small")).model_dump_json())
     (folder / "rooms.yaml").write_text(ROOMS)
+    with installed(folder, *options) as found:
+        wait_for(lambda: found.is_shown("hall") and found.is_shown("door"))
+        yield found
+
+
+@contextmanager
+def installed(folder: Path, *options: str) -> Iterator[Installation]:
+    """Run the rooms of `folder`/rooms.yaml; nothing of it is left afterwards."""
     page_port, rooms_port = ports.private_ports(2)
     command = [sys.executable, "-m", "deltalight.services.cli", "up", "--rooms", str(folder / "rooms.yaml")]
     command += ["--allow-software", "--data", str(folder / "data"), *options]
@@ -162,12 +184,11 @@ def started(folder: Path, *options: str) -> Iterator[Installation]:
     process = subprocess.Popen(command, cwd=ROOT)
     found = Installation(process, page_port, rooms_port)
     try:
-        wait_for(lambda: found.is_shown("hall") and found.is_shown("door"))
         yield found
         children = found.process.children(recursive=True)
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
-        assert psutil.wait_procs(children, timeout=5)[1] == []
+        assert process.wait(PATIENCE_S) == 130
+        assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
     finally:
         process.kill()
         process.wait()

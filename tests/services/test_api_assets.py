@@ -1,9 +1,9 @@
 """Uploads over REST: every format through the real check in a child process, and what is refused."""
 
 import gzip
+import hashlib
 import socket
 import struct
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,11 +13,15 @@ import numpy as np
 import pytest
 
 from deltalight.protocol.radiance_files import write_exr
+from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrdf
+from deltalight.render_server.scene.material_file import write_material
+from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
 from deltalight.services.storage.asset_sandbox import probe
 from deltalight.services.storage.faults import RejectedAssetError
 from tests.services.api_samples import UPLOAD, RunningApi, running_api, sentence
 from tests.services.conftest import ROOT
 from tests.services.storage_samples import TETRAHEDRON, glb, lying_glb
+from tests.services.test_api_scenes import wait_for
 
 PLY = b"""ply
 format ascii 1.0
@@ -72,6 +76,7 @@ def exr(folder: Path) -> bytes:
 
 @pytest.mark.slow
 def test_meshes_are_taken_and_described(api: RunningApi) -> None:
+    before = api.client.get("/assets").json()
     glb_file = (ROOT / "services" / "demo_assets" / "object.glb").read_bytes()
     answer = upload(api.client, glb_file, "knot.glb")
     assert answer.status_code == 201, answer.text
@@ -83,13 +88,9 @@ def test_meshes_are_taken_and_described(api: RunningApi) -> None:
         answer = upload(api.client, content, name)
         assert answer.status_code == 201, answer.text
         assert answer.json()["facts"]["maximum"][:2] == [1.0, 1.0]
-    assert [each["format"] for each in api.client.get("/assets").json()] == [
-        "stl",
-        "stl",
-        "ply",
-        "obj",
-        "glb",
-    ]
+    listed = api.client.get("/assets").json()
+    assert [each["format"] for each in listed[:5]] == ["stl", "stl", "ply", "obj", "glb"]
+    assert listed[5:] == before
 
 
 def test_maps_are_taken_and_must_be_twice_as_wide_as_high(api: RunningApi, tmp_path: Path) -> None:
@@ -102,6 +103,54 @@ def test_maps_are_taken_and_must_be_twice_as_wide_as_high(api: RunningApi, tmp_p
         "/scenes", json={"lights": {"mode": "environment", "environment": {"map": "room.hdr"}}}
     )
     assert scene.status_code == 201
+
+
+def paint(folder: Path) -> bytes:
+    """A measured paint: a red base under one white lobe."""
+    made = GaussianBrdf(np.array([0.4, 0.1, 0.1]), np.array([0.2]), np.full((1, RISE_TERMS, 3), 0.05))
+    write_material(folder / "paint.dlmat", made)
+    return (folder / "paint.dlmat").read_bytes()
+
+
+def sealed(arrays: bytes) -> bytes:
+    """A material's file of any content, with its right hash."""
+    return b"deltalight material 1 " + hashlib.sha256(arrays).hexdigest().encode() + b"\n" + arrays
+
+
+def test_precomputed_materials_are_taken_and_used_by_scenes(api: RunningApi, tmp_path: Path) -> None:
+    answer = upload(api.client, paint(tmp_path), "paint.dlmat")
+    assert answer.status_code == 201, answer.text
+    found = answer.json()
+    assert (found["kind"], found["format"], found["facts"]["model"]) == ("material", "dlmat", "measured_brdf")
+    assert found["facts"]["base_color"][0] > 0.4  # the base, and what the lobe reflects
+    assert upload(api.client, paint(tmp_path), "paint.dlmat").status_code == 200
+    mesh = upload(api.client, TETRAHEDRON + b"# painted\n", "painted.obj").json()["asset"]
+    item = {"id": "ball", "asset": mesh, "material": {"precomputed": "paint.dlmat"}}
+    scene = api.client.post("/scenes", json={"objects": [item]}).json()
+    assert scene["document"]["objects"][0]["material"] == {"precomputed": found["asset"]}
+    path = Path(
+        api.store.assets.localised(api.store.scenes.get(scene["id"]).document).objects[0].material.precomputed
+    )  # type: ignore[union-attr]
+    assert path.read_bytes() == paint(tmp_path)
+    assert f"used by scene {scene['id']}" in sentence(api.client.delete(f"/assets/{found['asset']}"), 409)
+    for place, wrong in (
+        ({"asset": found["asset"]}, "needs a mesh"),
+        ({"material": {"precomputed": mesh}}, "needs a material"),
+    ):
+        refused = api.client.patch(f"/scenes/{scene['id']}/objects/ball", json=place)
+        assert wrong in sentence(refused, 422)
+
+
+def test_a_polynomial_texture_map_is_taken(api: RunningApi, tmp_path: Path) -> None:
+    texels = np.zeros((TERMS, 4, 6, 3), np.float16)
+    texels[0] = 0.5
+    write_material(tmp_path / "coin.dlmat", PolynomialTexture(texels))
+    found = upload(api.client, (tmp_path / "coin.dlmat").read_bytes(), "coin.dlmat").json()
+    assert (found["facts"]["model"], found["facts"]["width"], found["facts"]["height"]) == (
+        "polynomial_texture",
+        6,
+        4,
+    )
 
 
 def test_the_same_file_again_is_200_and_comes_back_byte_for_byte(api: RunningApi) -> None:
@@ -149,6 +198,11 @@ def test_an_asset_in_use_is_not_deleted(api: RunningApi) -> None:
         (b"v 0 0 0\nf 1 2 3\n", "gap.obj", "gap.obj"),
         (b"v 0 0 1e30\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "far.obj", "beyond 10 km"),
         (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 30000 +X 60000\n" + bytes(100), "bomb.hdr", "bomb.hdr"),
+        (b"deltalight material 1 0000\nPK", "paint.dlmat", "paint.dlmat is damaged or cut short"),
+        (b"deltalight material 9 0000\nPK", "paint.dlmat", "version 9, and this release reads version 1"),
+        (b"deltalight material \xff\xfe\n", "paint.dlmat", "paint.dlmat is no precomputed material"),
+        (sealed(b"PK\x03\x04"), "paint.dlmat", "holds no material that can be drawn"),
+        (b"deltalight material 1 0\n", "chair.glb", "is a DLMAT file and not GLB"),
         (b"", "empty.glb", "no file of a known format"),
         (TETRAHEDRON, "/", "needs the file's own name"),
     ],
@@ -189,15 +243,8 @@ def test_an_upload_that_breaks_off_leaves_nothing(api: RunningApi) -> None:
             f"POST /api/v1/assets?name=a.glb HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Length: 1000\r\n"
             "Content-Type: application/octet-stream\r\n\r\nglTF".encode()
         )
-        for _ in range(200):
-            if left_over(api):
-                break
-            time.sleep(0.02)
-    for _ in range(200):
-        if not left_over(api):
-            break
-        time.sleep(0.02)
-    assert left_over(api) == []
+        wait_for(lambda: left_over(api) != [])
+    wait_for(lambda: left_over(api) == [])
     assert "internal" not in api.client.get("/state").json()["refused"]
 
 

@@ -12,14 +12,22 @@ import websockets
 from deltalight.protocol.envelope import encode
 from deltalight.services.api.events import QUEUE_EVENTS, EventHub
 from tests.services.api_samples import UPLOAD, RenderServer
-from tests.services.live_samples import LiveApi, event_socket, live_api, next_event, report
+from tests.services.live_samples import PATIENCE_S, LiveApi, event_socket, live_api, next_event, report
 from tests.services.storage_samples import TETRAHEDRON
+from tests.services.test_api_scenes import wait_for
 
 
 @pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory, module_database: str | None) -> Iterator[LiveApi]:
+def shared(tmp_path_factory: pytest.TempPathFactory, module_database: str | None) -> Iterator[LiveApi]:
     with live_api(tmp_path_factory.mktemp("data"), database=module_database) as running:
         yield running
+
+
+@pytest.fixture
+def live(shared: LiveApi) -> LiveApi:
+    """With a render server that answers."""
+    wait_for(lambda: shared.client.get("/state").json()["render_server"] == "answers")
+    return shared
 
 
 def test_a_client_is_greeted_and_hears_every_change_of_scenes(live: LiveApi) -> None:
@@ -101,9 +109,10 @@ def test_a_silent_render_server_is_heard_as_pending(live: LiveApi) -> None:
         assert next_event(socket, "picture")["state"] == "pending"
         again = RenderServer(live.control_port)
         try:
-            shown = next_event(socket, "picture", timeout_s=20)
+            shown = next_event(socket, "picture")
         finally:
             again.close()
+            live.server.open()
     assert (shown["state"], shown["revision"]) == ("shown", 2)
 
 
@@ -111,7 +120,7 @@ def test_who_sends_something_is_closed(live: LiveApi) -> None:
     with event_socket(live.address) as socket:
         socket.send("hello?")
         with pytest.raises(websockets.ConnectionClosed):
-            list(iter(lambda: socket.recv(timeout=5), None))
+            list(iter(lambda: socket.recv(timeout=PATIENCE_S), None))
 
 
 def test_a_slow_client_loses_the_oldest_and_is_told_how_many() -> None:
@@ -138,7 +147,7 @@ def test_events_come_from_any_thread_and_hold_what_json_can_say() -> None:
         body = {"at": datetime(2026, 1, 2, tzinfo=UTC), "rate": float("nan")}
         with hub.listening() as queue:
             threading.Timer(0.05, hub.publish, ("recording", body)).start()
-            event: dict[str, object] = json.loads(await asyncio.wait_for(queue.next(), 5))
+            event: dict[str, object] = json.loads(await asyncio.wait_for(queue.next(), 30))
             return event
 
     assert asyncio.run(listen()) == {"type": "recording", "at": "2026-01-02T00:00:00Z", "rate": None}

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from deltalight.sensor_node.cameras.driver import FoundCamera, MissingSupport
 from deltalight.services import ports
 from deltalight.services.api import camera_finder
 from deltalight.services.api.fisheye import lights_in_picture
-from tests.services.api_samples import sentence
+from tests.services.api_samples import running_api, sentence
 from tests.services.conftest import IDENTITY
 from tests.services.live_samples import LiveApi, live_api
 
@@ -106,10 +107,14 @@ def test_every_kind_of_light_has_a_place() -> None:
         assert max(light.color_linear) == pytest.approx(1.0)
 
 
+def test_without_a_fisheye_camera_there_is_neither_picture_nor_light(tmp_path: Path) -> None:
+    with running_api(tmp_path) as api:
+        for path in ("/fisheye", "/fisheye.jpg"):
+            assert "fish-eye" in sentence(api.client.get(path), 404)
+
+
 def test_picture_and_lights_come_by_rest(live: LiveApi) -> None:
     client = live.client
-    assert "fish-eye" in sentence(client.get("/fisheye"), 404)
-    assert "fish-eye" in sentence(client.get("/fisheye.jpg"), 404)
     wait_for_light(live, live.stream.publisher, radiance())
     answer = client.get("/fisheye").json()
     assert (answer["width"], answer["height"]) == (PICTURE_EDGE, PICTURE_EDGE)
@@ -127,7 +132,7 @@ def parts() -> list[bytes]:
 
 def wait_for_light(live: LiveApi, publisher: Publisher, message: RadianceMessage) -> None:
     """Send until the API shows the light of this node."""
-    for _ in range(100):
+    for _ in range(600):
         publisher.send(encode(message, parts()))
         if live.client.get("/fisheye").json().get("node") == message.node:
             return

@@ -26,7 +26,7 @@ def serving(folder: Path) -> Iterator[httpx.Client]:
     with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:
         patch.setattr("deltalight.services.api.static_page.DASHBOARD", folder)
         port = stack.enter_context(running_api(folder.parent / "data")).client.base_url.port
-        yield stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}"))
+        yield stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60))
 
 
 @pytest.fixture(scope="module")

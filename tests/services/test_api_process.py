@@ -96,7 +96,7 @@ def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_p
             assert rendered()["output"]["view"] == "delta"  # type: ignore[index]
             assert client.get(address).json()["revision"] == 3
             second_api.send_signal(signal.SIGTERM)
-            assert second_api.wait(timeout=20) == ENDED_BY_SIGTERM
+            assert second_api.wait(timeout=60) == ENDED_BY_SIGTERM
     control_client.close()
 
 
@@ -140,7 +140,7 @@ def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
             stderr=subprocess.PIPE,
             text=True,
         )
-        with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1") as client:
+        with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60) as client:
             wait_for(lambda client=client: client.get("/health").status_code == 200)  # type: ignore[misc]
             assert "token is needed" in sentence(client.get("/scenes"), 401)
             if outputs:
@@ -148,7 +148,7 @@ def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
                 scenes = client.get("/scenes", headers={"Authorization": f"Bearer {token}"}).json()
                 assert [scene["active"] for scene in scenes] == [True]  # there is something to begin with
         running.terminate()
-        outputs.append(running.communicate(timeout=20))
+        outputs.append(running.communicate(timeout=60))
     assert "shown this once: deltalight-" in outputs[0][0]
     assert outputs[1][0] == ""
     assert "nothing is encrypted" in outputs[1][1]

@@ -148,7 +148,7 @@ def test_a_video_is_made_in_the_background_and_can_be_stopped(
     def add(self: VideoWriter, *picture: Any) -> None:  # noqa: ANN401
         added(self, *picture)
         is_encoding.set()
-        assert go_on.wait(20)
+        assert go_on.wait(60)
 
     monkeypatch.setattr(VideoWriter, "add", add)
     monkeypatch.setattr(recording_videos, "WAIT_S", 0.1)
@@ -156,7 +156,7 @@ def test_a_video_is_made_in_the_background_and_can_be_stopped(
         path, get = "/recordings/take/video", api.client.get
         assert get(path).json() == {"state": "absent", "progress": 0.0, "detail": ""}
         assert api.client.post(path).json()["state"] == "making"
-        assert is_encoding.wait(10)
+        assert is_encoding.wait(60)
         waiting = get(f"{path}.mp4")
         assert "is being made" in sentence(waiting, 503)
         assert waiting.headers["retry-after"] == "5"
@@ -190,7 +190,7 @@ def test_an_end_of_the_service_leaves_nothing_of_a_video(
     monkeypatch.setattr(VideoWriter, "add", add)
     with running_api(tmp_path) as api:
         api.client.post("/recordings/take/video").raise_for_status()
-        assert is_encoding.wait(10)
+        assert is_encoding.wait(60)
     assert not list((folder / ".cache").glob("*.mp4"))
 
 

@@ -67,8 +67,6 @@ def source(server: Recorder) -> object:
 def test_a_recording_is_shown_moved_through_and_left(
     client: httpx.Client, server: Recorder, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    wait_for(lambda: bool(server.payloads("set_source")))
-    assert source(server) is None, "what a killed service left is put right"
     assert client.get("/replay").json()["recording"] is None
     shown = client.put("/replay", json={"recording": "take", "position_s": 0.5, "playing": False})
     assert shown.status_code == 200, shown.text
@@ -101,6 +99,14 @@ def test_a_recording_is_shown_moved_through_and_left(
     assert "no recording is replayed" in sentence(client.patch("/replay", json={"playing": True}), 409)
 
 
+def test_what_a_killed_service_left_is_put_right(api: RunningApi, client: httpx.Client) -> None:
+    wait_for(lambda: client.get("/state").json()["render_server"] == "silent")
+    server = Recorder(api.control_port)
+    wait_for(lambda: bool(server.payloads("set_source")))
+    assert source(server) is None
+    server.close()
+
+
 def test_one_replay_takes_the_place_of_another(client: httpx.Client, server: Recorder) -> None:
     first = client.put("/replay", json={"recording": "take"})
     assert first.status_code == 200, first.text
@@ -120,6 +126,7 @@ def test_a_dead_replay_gives_live_back(client: httpx.Client, server: Recorder) -
 
 
 def test_a_render_server_that_comes_back_is_told_again(api: RunningApi, client: httpx.Client) -> None:
+    wait_for(lambda: client.get("/state").json()["render_server"] == "silent")
     first = Recorder(api.control_port)
     wait_for(lambda: client.get("/state").json()["render_server"] == "answers")
     client.put("/replay", json={"recording": "take"}).raise_for_status()

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import structlog
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import connect
 
+from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.follower import RoomFollower
@@ -22,7 +24,7 @@ from tests.deploy.test_deploy import DEPLOY, check_names
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.live_samples import StandInStream
 from tests.services.render_server_samples import Recorder
-from tests.services.room_samples import StandInPlacer, plans, running
+from tests.services.room_samples import NoDirectory, StandInPlacer, plans, running
 from tests.services.test_api_scenes import wait_for
 
 FLEET_BOARD = DEPLOY / "grafana" / "boards" / "fleet.json"
@@ -131,7 +133,7 @@ def test_a_change_does_not_wait_for_a_server_that_died_while_it_was_sent(house: 
     address = f"/rooms/door/scenes/{scene}"
     sending = threading.Thread(target=lambda: house.api.client.patch(address, json={"name": "late"}))
     sending.start()
-    assert stuck.is_busy.wait(10)
+    assert stuck.is_busy.wait(60)
     epoch = house.placer.of("door").epoch
     del house.placer.servers[epoch]  # it never answers again, and nobody ends it
     house.replaced("door")
@@ -288,15 +290,31 @@ def test_a_stale_epoch_is_refused_and_counted() -> None:
     follower = RoomFollower(
         NoDirectory(), lambda _room, found: followed.append(None if found is None else found.epoch)
     )
-    for epoch in (3, 3, 5, 4, None, 4, 6):
-        follower.take(room_at(epoch))
+    with structlog.testing.capture_logs() as lines:
+        for epoch in (3, 3, 5, 4, None, 4, 6):
+            follower.take(room_at(epoch))
     assert followed == [3, 5, None, 6]
     assert follower.refused == 2
+    assert [line["epoch"] for line in lines] == [4], "said once, not five times a second"
 
 
-class NoDirectory:
-    def rooms(self) -> RoomList:
-        raise AssertionError("it was told, and need not ask")
+def test_endpoints_that_cannot_be_used_leave_the_other_rooms_alone() -> None:
+    followed: list[str] = []
+
+    def follow(room: str, _endpoints: RoomEndpoints | None) -> None:
+        if room == "hall":
+            raise DeltalightError("that is no endpoint")
+        followed.append(room)
+
+    follower = RoomFollower(NoDirectory(), follow)
+    (hall,) = room_at(3).rooms
+    told = RoomList(rooms=(hall, hall.replaced(name="door")), slots=())
+    with structlog.testing.capture_logs() as lines:
+        follower.take(told)
+        follower.take(told)
+    assert followed == ["door"]
+    assert [(line["room"], line["fault"]) for line in lines] == [("hall", "that is no endpoint")]
+    assert follower.newest == told
 
 
 def test_a_server_of_another_epoch_gets_nothing(house: House) -> None:

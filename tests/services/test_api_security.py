@@ -247,7 +247,7 @@ def test_large_documents_are_refused_before_they_are_read(open_api: RunningApi) 
 
 def test_the_description_is_open_and_names_no_secret(guarded: RunningApi) -> None:
     root = f"http://{guarded.client.base_url.host}:{guarded.client.base_url.port}"
-    schema = httpx.get(f"{root}/openapi.json").json()
+    schema = httpx.get(f"{root}/openapi.json", timeout=60).json()
     assert "/api/v1/scenes/{scene_id}" in schema["paths"]
 
 

@@ -82,7 +82,23 @@ def test_auto_needs_figures() -> None:
         )
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({**report(), "steps": {}}), None])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        json.dumps({**report(), "steps": {}}),
+        None,
+        "[" * 100_000,
+        json.dumps(report(room_bytes=0)),
+        json.dumps(report(room_bytes=-GIB)),
+        json.dumps(report()).replace(str(GIB), "Infinity"),
+        json.dumps(report()).replace("4.0", "0.0").replace("1.0", "0").replace("0.5", "0"),
+        json.dumps(report()).replace("4.0", "1e999"),
+        json.dumps(report()).replace("4.0", "NaN"),
+    ],
+)
 def test_reports_without_figures_are_refused(tmp_path: Path, text: str | None) -> None:
     path = tmp_path / "report.json"
     if text is not None:

@@ -6,8 +6,10 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.text import Text
 from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -89,6 +91,21 @@ def test_every_command_is_there_and_has_help() -> None:
         done = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="deltalight")
         assert done.exit_code == 0, done.output
         assert f"Usage: deltalight {command} " in " ".join(done.output.split())
+
+
+def options_below(command: Any, name: str = "deltalight") -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - typer's own click
+    for option in command.params:
+        yield f"{name} {option.name}", option
+    for below, each in getattr(command, "commands", {}).items():
+        yield from options_below(each, f"{name} {below}")
+
+
+def test_help_is_shown_as_it_is_written_and_out_has_a_short_form() -> None:
+    """Brackets are markup, which the help would leave out."""
+    for name, option in options_below(get_command(app)):
+        written = getattr(option, "help", None) or ""
+        assert Text.from_markup(written).plain == written, name
+        assert "--out" not in option.opts or "-o" in option.opts, name
 
 
 def test_help_has_a_short_form_and_ends_with_examples_that_can_be_run() -> None:

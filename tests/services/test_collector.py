@@ -9,12 +9,10 @@ import pytest
 
 from deltalight.protocol.codecs import encode_color
 from deltalight.protocol.envelope import encode
-from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.publisher import Publisher
 from deltalight.services import collector as collector_module
-from deltalight.services import demo, ports
+from deltalight.services import ports
 from deltalight.services.collector import CompositeCollector, summarize
-from tests.services.api_samples import RenderServer
 from tests.services.conftest import HEIGHT, WIDTH
 from tests.services.live_samples import StandInStream, composite, report
 
@@ -63,15 +61,9 @@ class Rig:
 @pytest.fixture
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     monkeypatch.setattr(collector_module, "CONTROL_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(collector_module, "ALIVE_TIMEOUT_S", 0.2)
     made = Rig(None)
     yield made
     made.close()
-
-
-class NoSupervisor:
-    def poll(self) -> None:
-        """Nothing runs that could die."""
 
 
 def test_a_finished_run_does_not_need_the_servers_answer(rig: Rig) -> None:
@@ -97,37 +89,3 @@ def test_settled_figures_leave_out_the_first_half(rig: Rig) -> None:
     assert figures["frames_per_s"] == pytest.approx(5 / 0.075)
     assert figures["settled_frames_per_s"] == pytest.approx(400)
     assert (figures["age_median_ms"], figures["settled_age_median_ms"]) == (410.0, 110.0)
-
-
-def test_a_frame_may_take_as_long_as_the_renderer_is_at_work(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(demo, "FIRST_FRAME_TIMEOUT_S", 0.05)
-    with pytest.raises(DeltalightError, match="Only 0 of 1 composites"):
-        demo._collect(rig.collector, NoSupervisor(), 1)  # type: ignore[arg-type]
-    server = RenderServer(rig.control)
-    try:
-        asked = 0
-        answer = rig.collector.is_rendering
-
-        def at_work() -> bool:
-            nonlocal asked
-            asked += 1
-            assert answer(), "it answers"
-            if asked == 3:
-                rig.send_composites(1)
-            return True
-
-        monkeypatch.setattr(rig.collector, "is_rendering", at_work)
-        demo._collect(rig.collector, NoSupervisor(), 1)  # type: ignore[arg-type]
-        assert asked == 3
-    finally:
-        server.close()
-
-
-def test_patience_grows_with_the_slowest_frame(rig: Rig) -> None:
-    rig.send_composites(1)
-    rig.collector._began_s = 0.0
-    rig.collector.arrivals_s = [120.0, 130.0]
-    assert rig.collector.slowest_s == 120
-    assert demo._patience_s(rig.collector) == 360

@@ -61,7 +61,6 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
 
 @pytest.fixture
 def page(guarded: LiveApi, browser: Browser) -> Iterator[Page]:
-    expect.set_options(timeout=PATIENCE_S * 1000)
     with browser.new_context(viewport=SIZE, color_scheme="dark") as context:  # type: ignore[arg-type]
         page = context.new_page()
         complaints = complaints_of(page, expected=("status of 401",))

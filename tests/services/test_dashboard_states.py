@@ -12,10 +12,9 @@ import pytest
 from playwright.sync_api import Browser, Route, WebSocketRoute, expect
 
 from deltalight import __version__
-from deltalight.services.demo import POSTER
+from deltalight.services.demo import POSTER, POSTER_BEFORE
 from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
-    PATIENCE_S,
     SCREENSHOTS,
     SIZE,
     STAND_IN_PERIOD_S,
@@ -52,7 +51,6 @@ def stack(live: LiveApi) -> Stack:
 
 
 def seat(stack: Stack, browser: Browser, **options: object) -> Iterator[Desk]:
-    expect.set_options(timeout=PATIENCE_S * 1000)
     with browser.new_context(color_scheme="dark", **options) as context:  # type: ignore[arg-type]
         desk = Desk(stack, context.new_page())
         yield desk
@@ -202,13 +200,20 @@ def test_a_still_is_shown_until_the_first_live_picture(live: LiveApi, stack: Sta
     page.page.add_init_script(NO_H264)
     page.page.add_init_script(HELD_DECODER)
     shutil.copyfile(POSTER, live.api.store.poster)
+    shutil.copyfile(POSTER_BEFORE, live.api.store.poster_before)
     try:
         page.page.goto(f"http://{stack.address}/")
         page.until(lambda: still.count() and still.evaluate("each => each.naturalWidth"), "the still")
     finally:
         live.api.store.poster.unlink()
+        live.api.store.poster_before.unlink()
     assert still.bounding_box() == page.page.locator(".picture").bounding_box(), "it fills the picture"
     expect(page.page.locator(".picture-banner")).to_contain_text("A still picture")
+    before = page.named("img", "The camera's picture")
+    page.until(lambda: before.evaluate("each => each.naturalWidth"), "what was before")
+    covers = "each => getComputedStyle(each).clipPath"
+    first = before.evaluate(covers)
+    page.until(lambda: before.evaluate(covers) != first, "the split moves")
     page.photograph("poster")
     page.page.evaluate("release()")
     page.shows_newest()

@@ -23,7 +23,7 @@ from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.services import ports
 from deltalight.services.api.serve import listening
-from deltalight.services.demo import POSTER, RECORDING, SCENE, demo_plan, demo_scene
+from deltalight.services.demo import POSTER, POSTER_BEFORE, RECORDING, SCENE, demo_plan, demo_scene
 from deltalight.services.host import HostPlan
 from deltalight.services.host_store import session_file
 from deltalight.services.supervisor import Supervisor
@@ -72,9 +72,10 @@ def test_headless_demo_writes_composites_sheet_and_video(cli_process: RunCli, tm
     assert all(record["age_ms"] > 0 for record in records)
 
 
-def test_the_poster_is_small_and_of_the_pictures_shape() -> None:
-    assert POSTER.stat().st_size < 60_000
-    picture = cv2.imread(str(POSTER))
+@pytest.mark.parametrize("path", [POSTER, POSTER_BEFORE])
+def test_the_poster_is_small_and_of_the_pictures_shape(path: Path) -> None:
+    assert path.stat().st_size < 60_000
+    picture = cv2.imread(str(path))
     assert picture is not None
     assert picture.shape == (480, 640, 3)
 
@@ -173,13 +174,13 @@ def demo(page_port: int, *options: str) -> Iterator[str]:
         assert len(children) == 3
         yield f"{ports.LOOPBACK}:{page_port}"
         demo.send_signal(signal.SIGINT)
-        output, error = demo.communicate(timeout=20)
+        output, error = demo.communicate(timeout=PATIENCE_S)
     finally:
         demo.kill()  # its children end with it
     assert demo.returncode == 130
     assert "Traceback" not in error
     assert f"http://127.0.0.1:{page_port}" in output
-    assert psutil.wait_procs(children, timeout=1)[1] == []
+    assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
     assert ports.is_free(page_port)
 
 
@@ -188,8 +189,12 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     """The first as people start it; in the second, a change by REST is in the next picture that is begun."""
     (page_port,) = ports.private_ports(1)
     with demo(page_port) as address:
-        assert httpx.get(f"http://{address}/api/v1/settings").json()["has_poster"]
-        assert httpx.get(f"http://{address}/api/v1/poster.jpg").content == POSTER.read_bytes()
+        with httpx.Client(base_url=f"http://{address}/api/v1", timeout=PATIENCE_S) as client:
+            assert client.get("/settings").json()["has_poster"]
+            assert client.get("/poster.jpg").content == POSTER.read_bytes()
+            assert client.get("/poster-before.jpg").content == POSTER_BEFORE.read_bytes()
+            (recording,) = client.get("/recordings").json()
+        assert (recording["id"], recording["frames"]) == ("demo", 30)
     with demo(page_port, "--method", "paper") as address:
         check_changes(address)
 

@@ -73,7 +73,7 @@ def test_each_kind_of_reset_is_a_sentence(status: int, words: str) -> None:
 def test_a_reset_ends_the_session_at_once_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = InvertingRenderer()
     session = session_of(renderer)
-    monkeypatch.setattr(renderer, "submit", lambda *_, **__: check_reset(GUILTY))
+    monkeypatch.setattr(renderer, "submit_cameras", lambda *_, **__: check_reset(GUILTY))
     feed(session, 1)
     with pytest.raises(GpuResetError) as caught:
         session.step()

@@ -33,7 +33,7 @@ from tests.services.moving_samples import (
 )
 
 LEAST_PSNR_DB = 36.0  # of a picture from its JPEG; the encoder's constant quality gives 38 to 42
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 
 
 class Viewer:
@@ -260,14 +260,16 @@ def test_the_dashboard_shows_what_the_jpeg_shows(live: Running, browser: Browser
         page.goto(f"http://{live.address}/")
         page.get_by_role("tab", name="Performance").click()
         page.get_by_text("H.264, ").wait_for(timeout=PATIENCE_S * 1000)
-        page.wait_for_timeout(1500)  # until the still picture is refined
-        shown = page.get_by_role("img", name="Live picture", exact=True).evaluate(
-            "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]"
-        )
-        seen = np.array(shown, np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
-        jpeg = memoryview(live.stream.jpegs[max(live.stream.jpegs)])
-        agreement_db = psnr_db(seen, decode_color(jpeg, "jpeg", seen.shape))
+        agreement_db, deadline_s = 0.0, time.monotonic() + PATIENCE_S
+        while agreement_db <= LEAST_PSNR_DB and time.monotonic() < deadline_s:  # what stands still is refined
+            page.wait_for_timeout(100)
+            shown = page.get_by_role("img", name="Live picture", exact=True).evaluate(
+                "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]"
+            )
+            seen = np.array(shown, np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
+            jpeg = decode_color(memoryview(live.stream.jpegs[max(live.stream.jpegs)]), "jpeg", seen.shape)
+            agreement_db = psnr_db(seen, jpeg)
         assert agreement_db > LEAST_PSNR_DB, agreement_db
-        bias = seen.astype(float).mean((0, 1)) - decode_color(jpeg, "jpeg", seen.shape).mean((0, 1))
+        bias = seen.astype(float).mean((0, 1)) - jpeg.mean((0, 1))
         assert np.abs(bias).max() < 1.0, "colours are neither stretched nor turned"
         assert complaints == []

@@ -19,7 +19,7 @@ from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 from deltalight.services import ports
 from tests.services.conftest import ROOT, RunCli
 
-LIMIT_S = 30.0
+LIMIT_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def node_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         yield process
     finally:
         process.send_signal(signal.SIGTERM)
-        process.wait(10)
+        process.wait(LIMIT_S)
         if process.stderr is not None:
             process.stderr.close()
 

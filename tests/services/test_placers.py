@@ -1,17 +1,21 @@
 """What every placer promises, kept with real processes, by Ray's too: slots, losses, endpoints, no orphans."""
 
+import errno
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
 import psutil
 import pytest
 
+from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.host import HostCommands
+from deltalight.services.rooms import local_placer
 from deltalight.services.rooms.local_placer import Command, LocalPlacer
 from deltalight.services.rooms.placer import (
     NoSlotError,
@@ -36,7 +40,7 @@ while True:
     time.sleep(0.05)
 """
 REFUSING = "import sys; print('deltalight: The scene is wrong; mend it.', file=sys.stderr); sys.exit(2)"
-PATIENCE_S = 20.0
+PATIENCE_S = 90.0
 
 
 KINDS = (
@@ -160,6 +164,32 @@ def test_closing_leaves_no_process(placer: AnyPlacer) -> None:
     processes = [psutil.Process(each) for each in placer.process_ids().values()]
     placer.close()
     assert not any(process.is_running() for process in processes)
+
+
+def test_a_spare_that_cannot_be_started_is_missed_by_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing(*_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(local_placer, "SPARE_AFTER_S", 0.0)
+    monkeypatch.setattr(local_placer, "open_spare", refusing)
+    with closing(LocalPlacer((None,), reporting, spare=ChildSpec("spare", ("-c", "")))) as placer:
+        placer.place(order("hall", 1))
+        assert until(placer, lambda event: event.kind == "reported").shows
+        assert placer.spare_id is None
+
+
+def test_ports_never_run_out_and_late_ones_are_not_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "PRIVATE_PORTS", range(20_000, 20_010))
+    monkeypatch.setattr(ports, "REMEMBERED_PORTS", 4)
+    late: set[str] = set()
+    with closing(LocalPlacer((None,), lambda *_: ChildSpec("room", ("-c", "")))) as placer:
+        for epoch in range(1, 8):  # ten ports would last for five
+            placement = placer.place(order("hall", epoch))
+            used = {placement.publish, placement.control}
+            assert len(used) == 2
+            assert not used & late
+            late = used
+            until(placer, lambda event: event.kind == "lost")
 
 
 def test_a_room_takes_a_host_with_its_labels_that_is_not_drained() -> None:

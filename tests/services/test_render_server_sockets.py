@@ -23,7 +23,7 @@ from tests.services.storage_samples import TETRAHEDRON
 from tests.services.test_session import InvertingRenderer
 
 FRAMES_PER_S = 100
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 class Node:

@@ -39,7 +39,7 @@ def test_what_is_replayed_and_recorded_again_is_the_same(tmp_path: Path) -> None
             status = Recorder(RecordJob(tmp_path / "b.mcap", (endpoint,), frames=20), print).run(Event())
         finally:
             process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=20)
+        _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in error
     again = open_source(tmp_path / "b.mcap")

@@ -1,16 +1,22 @@
 """Which room runs where: slots, losses, moves and drains, with a placer that places nothing."""
 
+import errno
+import time
 from pathlib import Path
 
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlReply
+from deltalight.protocol.payloads import encode_control
+from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.keeper import MAXIMUM_FAILED_STARTS, RoomKeeper
-from deltalight.services.rooms.status import RoomStatus
+from deltalight.services.rooms.placer import Placement, RoomOrder
+from deltalight.services.rooms.status import RoomList, RoomStatus
 from deltalight.services.storage.drained import Drained, DrainedStore
 from deltalight.services.storage.faults import StorageFaultError
 from deltalight.services.storage.store import Store
-from tests.services.room_samples import StandInPlacer, plans, running
+from tests.services.room_samples import NoDirectory, StandInPlacer, plans, running
 
 
 @pytest.fixture
@@ -66,6 +72,76 @@ def test_a_lost_room_is_placed_again_before_those_that_wait_with_a_newer_epoch(
     assert epoch(keeper, "hall") > before
     assert epoch(keeper, "door") == other
     assert rooms(keeper)["hall"].restarts == 1
+
+
+def test_a_room_that_waits_uses_up_no_epochs(keeper: RoomKeeper, placer: StandInPlacer) -> None:
+    running(keeper, placer, "hall", "door")
+    newest = epoch(keeper, "door")
+    for _ in range(1000):
+        keeper.poll()
+    keeper.drain("hall")
+    keeper.poll()
+    assert epoch(keeper, "attic") == newest + 1
+
+
+def test_the_next_keeper_is_followed_and_the_one_before_refused(tmp_path: Path) -> None:
+    """Web processes of other hosts outlive the keeper; they know endpoints by their epochs."""
+    followed: list[int | None] = []
+    follower = RoomFollower(
+        NoDirectory(), lambda _room, found: followed.append(None if found is None else found.epoch)
+    )
+    lists: list[RoomList] = []
+    for _ in range(2):
+        keeper = RoomKeeper(plans(tmp_path, "hall"), StandInPlacer())
+        for _loss in range(3):
+            keeper.poll()
+            lists.append(keeper.status())
+            keeper.drain("hall")
+            keeper.start("hall")
+        time.sleep(0.01)  # no keeper starts within milliseconds of the one before
+    for found in lists:
+        follower.take(found)
+    assert follower.refused == 0
+    assert len(followed) == len(set(followed)) == 6
+    follower.take(lists[0])
+    assert follower.refused == 1
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        (DeltalightError("no key; make one."), "tried again: no key"),
+        (OSError(errno.EMFILE, "Too many open files"), "no more of what it needs (Too many open files)"),
+    ],
+)
+def test_a_room_that_cannot_be_started_is_tried_again_and_ends_no_other(
+    keeper: RoomKeeper, placer: StandInPlacer, monkeypatch: pytest.MonkeyPatch, fault: Exception, why: str
+) -> None:
+    place = placer.place
+
+    def refusing(order: RoomOrder, slot: str | None = None) -> Placement:
+        if order.room == "hall":
+            raise fault
+        return place(order, slot)
+
+    monkeypatch.setattr(placer, "place", refusing)
+    running(keeper, placer, "door", "attic")
+    assert states(keeper) == ["waiting", "running", "running"]
+    assert why in rooms(keeper)["hall"].why
+    monkeypatch.undo()
+    keeper.drain("attic")
+    running(keeper, placer, "hall")
+    assert states(keeper) == ["running", "running", "waiting"]
+
+
+def test_what_a_server_said_last_is_cut_to_what_a_directory_can_tell(
+    keeper: RoomKeeper, placer: StandInPlacer
+) -> None:
+    running(keeper, placer, "hall")
+    placer.lose("hall", detail="x" * 5_000_000, refused=True)
+    keeper.poll()
+    answer = ControlReply(node="rooms", capture_ns=0, id="1", ok=True, payload=keeper.status().model_dump())
+    assert sum(map(len, encode_control(answer))) < 10_000
 
 
 def test_a_room_that_ran_is_never_given_up(keeper: RoomKeeper, placer: StandInPlacer) -> None:

@@ -3,12 +3,14 @@
 Each host is a raylet of this machine; render servers, sockets and pictures are real.
 """
 
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,10 +20,18 @@ import pytest
 
 from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.ray_cluster import LOOPBACK_ONLY, NO_STATISTICS, OBJECT_STORE_BYTES, RayCluster
-from tests.services.rooms_installation import Installation, is_gone, settled, started, wait_for
+from tests.services.rooms_installation import (
+    PATIENCE_S,
+    Installation,
+    is_gone,
+    settled,
+    started,
+    wait_for,
+    wait_until_idle,
+)
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.slow(seconds=15),
     pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
 ]
 # A host that is silent for a second and a half is dead (Ray's default is 15 s).
@@ -41,16 +51,27 @@ class Hosts:
         from ray.cluster_utils import Cluster
 
         self.cluster = Cluster()
-        self._nodes: dict[str, Any] = {}
+        self.networks: dict[str, str | None] = {}  # of the hosts that live, by their labels
+        self.raylets: list[psutil.Process] = []  # of these and of those that were killed
+        self._raylets: dict[str, psutil.Process] = {}
+        self._numbers = itertools.count(1)
         self._add(include_dashboard=False, _system_config=HEALTH_CHECKS)
 
-    def add(self, name: str, **more: object) -> psutil.Process:
-        """Start a host, and return its raylet."""
-        self._nodes[name] = self._add(node_name=name, resources={"render_slot": 1}, **more)
-        return self.raylet(name)
+    def add(self, name: str = "", **labels: str) -> str:
+        """Start a host; return its name, which no host has had before."""
+        name = name or f"host{next(self._numbers)}"
+        node = self._add(node_name=name, resources={"render_slot": 1}, labels=labels)
+        self.networks[name] = labels.get("network")
+        self._raylets[name] = psutil.Process(node.all_processes["raylet"][0].process.pid)
+        self.raylets.append(self._raylets[name])
+        return name
 
     def raylet(self, name: str) -> psutil.Process:
-        return psutil.Process(self._nodes[name].all_processes["raylet"][0].process.pid)
+        return self._raylets[name]
+
+    def kill(self, name: str) -> None:
+        os.kill(self.raylet(name).pid, signal.SIGKILL)
+        del self.networks[name]
 
     def _add(self, **more: object) -> Any:  # noqa: ANN401 (Ray's)
         common = {"num_cpus": 0, "node_ip_address": "127.0.0.1", "object_store_memory": OBJECT_STORE_BYTES}
@@ -60,8 +81,8 @@ class Hosts:
 @pytest.fixture(scope="module")
 def hosts() -> Iterator[Hosts]:
     hosts = Hosts()
-    hosts.add("alpha", labels={"network": "east"})
-    hosts.add("beta")
+    hosts.add(network="east")
+    hosts.add()
     yield hosts
     hosts.cluster.shutdown()
 
@@ -70,11 +91,43 @@ def hosts() -> Iterator[Hosts]:
 def installation(hosts: Hosts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installation]:
     options = ("--placer", "ray", "--ray-address", hosts.cluster.address)
     with started(tmp_path_factory.mktemp("rooms"), *options) as found:
-        found.hosts = [hosts.raylet("alpha"), hosts.raylet("beta")]
+        found.hosts = hosts.raylets
         yield found
-        running = [process for host in found.hosts for process in rendering(host)]
+        living = [hosts.raylet(name) for name in hosts.networks]
+        running = [process for host in hosts.raylets for process in rendering(host)]
     assert [process for process in running if not is_gone(process)] == []
-    assert hosts.raylet("gamma").is_running()  # a cluster that others started goes on
+    assert living
+    assert [host for host in living if is_gone(host)] == []  # a cluster that others started goes on
+
+
+def arrange(hosts: Hosts, installation: Installation, *rooms: str) -> None:
+    """Bring it about that two hosts take rooms, that these rooms run there, and that the others are drained."""
+    directory = installation.directory
+    for host in {slot.host for slot in directory.rooms().slots if slot.drained}:
+        directory.host_command("undrain-host", host)
+    for room in directory.rooms().rooms:
+        if room.name not in rooms:
+            directory.command("drain", room.name)
+    for name in hosts.networks.keys() - slots(installation).keys():  # refused
+        hosts.kill(name)
+    while len(hosts.networks) < 2:
+        hosts.add()
+    wait_for(lambda: slots(installation).keys() == hosts.networks.keys())
+    for name in rooms:
+        directory.command("start", name)
+        wait_for(partial(installation.is_shown, name))
+    wait_for(lambda: set(slots(installation).values()) - {None} == set(rooms))
+
+
+def slots(installation: Installation) -> dict[str, str | None]:
+    """The room of each host."""
+    return {slot.host: slot.room for slot in installation.directory.rooms().slots}
+
+
+def host_of(installation: Installation, room: str) -> str:
+    slot = installation.room(room).slot
+    assert slot is not None
+    return slot.partition("/")[0]
 
 
 def rendering(host: psutil.Process) -> list[psutil.Process]:
@@ -93,13 +146,10 @@ def epoch(installation: Installation, room: str) -> int:
 
 def kill_host(hosts: Hosts, installation: Installation, room: str) -> float:
     """Kill the raylet of a room's host; return the seconds until a viewer has a picture from another."""
-    before = installation.room(room)
-    assert before.slot is not None
-    assert before.endpoints is not None
-    server, raylet = installation.server(room), hosts.raylet(before.slot.partition("/")[0])
-    os.kill(raylet.pid, signal.SIGKILL)
+    before, server = epoch(installation, room), installation.server(room)
+    hosts.kill(host_of(installation, room))
     killed_s = time.monotonic()
-    shown_s = installation.shown_after(room, before.endpoints.epoch)
+    shown_s = installation.shown_after(room, before)
     wait_for(lambda: is_gone(server))
     return shown_s - killed_s
 
@@ -107,24 +157,26 @@ def kill_host(hosts: Hosts, installation: Installation, room: str) -> float:
 def test_two_rooms_run_on_two_hosts_and_the_third_waits_and_says_why(
     hosts: Hosts, installation: Installation
 ) -> None:
-    slots = {installation.room(name).slot for name in ("hall", "door")}
-    assert slots == {"alpha/1", "beta/1"}
-    waits = installation.room("attic")
-    assert (waits.state, "all 2 slots are in use" in waits.why) == ("waiting", True)
+    arrange(hosts, installation, "hall", "door")
+    used = {installation.room(name).slot for name in ("hall", "door")}
+    assert used == {f"{name}/1" for name in hosts.networks}
+    installation.directory.command("start", "attic")
+    wait_for(lambda: "all 2 slots are in use" in installation.room("attic").why)
+    assert installation.room("attic").state == "waiting"
     joined = RayCluster(hosts.cluster.address, 0)
     found = {host.name: (host.slots, host.labels.get("network")) for host in joined.hosts()}
     joined.close()
-    assert found == {"alpha": (1, "east"), "beta": (1, None)}
+    assert found == {name: (1, network) for name, network in hosts.networks.items()}
 
 
 def test_a_killed_render_server_is_replaced_by_the_spare_of_its_host(
     hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    arrange(hosts, installation, "hall")
     slot, before = installation.room("hall").slot, settled(installation, "hall")
-    assert slot is not None
-    host = slot.partition("/")[0]
-    wait_for(lambda: sum("server" in each.cmdline() for each in rendering(hosts.raylet(host))) == 2)
-    time.sleep(3)  # it prepares itself
+    raylet = hosts.raylet(host_of(installation, "hall"))
+    wait_for(lambda: len(servers(raylet)) == 2)
+    wait_until_idle(max(servers(raylet), key=lambda server: server.create_time()))
     said = installation.kill("hall")
     with capsys.disabled():
         print(f"\na render server of a host that lives was replaced after {said}")
@@ -132,18 +184,20 @@ def test_a_killed_render_server_is_replaced_by_the_spare_of_its_host(
     assert (installation.room("hall").slot, settled(installation, "hall")) == (slot, before)
 
 
+def servers(host: psutil.Process) -> list[psutil.Process]:
+    return [process for process in rendering(host) if "server" in process.cmdline()]
+
+
 def test_rooms_of_killed_hosts_return_on_others_with_equal_pictures(
     hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    arrange(hosts, installation, "hall")
     follower = RoomFollower(installation.directory, lambda _room, _endpoints: None)
     stale = installation.directory.rooms()
-    for name in ("attic", "door"):
-        installation.directory.command("drain", name)
-    wait_for(lambda: sum(slot.room is None for slot in installation.directory.rooms().slots) == 1)
     before, gaps_s = settled(installation, "hall"), []
-    for name in ("gamma", "delta"):
+    for _ in range(2):
         gaps_s.append(kill_host(hosts, installation, "hall"))
-        installation.hosts.append(hosts.add(name))
+        hosts.add()
         assert settled(installation, "hall") == before
     with capsys.disabled():
         print(f"\nrooms of killed hosts were away for {', '.join(f'{gap_s:.2f} s' for gap_s in gaps_s)}")
@@ -155,38 +209,33 @@ def test_rooms_of_killed_hosts_return_on_others_with_equal_pictures(
 def test_a_room_of_a_killed_host_waits_for_a_slot_and_says_so(
     hosts: Hosts, installation: Installation
 ) -> None:
-    installation.directory.command("start", "door")
-    wait_for(lambda: installation.is_shown("door"))
+    arrange(hosts, installation, "hall", "door")
     other, picture = epoch(installation, "hall"), settled(installation, "hall")
-    slot = installation.room("door").slot
-    assert slot is not None
     server = installation.server("door")
-    os.kill(hosts.raylet(slot.partition("/")[0]).pid, signal.SIGKILL)
+    hosts.kill(host_of(installation, "door"))
     wait_for(lambda: installation.room("door").state == "waiting")
     wait_for(lambda: "all 1 slots are in use" in installation.room("door").why)
     wait_for(lambda: is_gone(server))
     assert (epoch(installation, "hall"), settled(installation, "hall")) == (other, picture)
-    hosts.add("liar", labels={"gpu": "NVIDIA-H100-80GB-HBM3"})
+    liar = hosts.add("liar", gpu="NVIDIA-H100-80GB-HBM3")
     wait_for(
         lambda: "The host liar is refused: it claims the device NVIDIA-H100" in installation.room("door").why
     )
-    assert "liar" not in {slot.host for slot in installation.directory.rooms().slots}
-    installation.hosts.append(hosts.add("epsilon"))
+    assert liar not in slots(installation)
+    hosts.add()
     wait_for(lambda: installation.is_shown("door"))
 
 
-def test_a_drained_host_is_emptied(installation: Installation) -> None:
-    installation.directory.command("drain", "door")
-    wait_for(lambda: any(slot.room is None for slot in installation.directory.rooms().slots))
+def test_a_drained_host_is_emptied(hosts: Hosts, installation: Installation) -> None:
+    arrange(hosts, installation, "hall")
     leaves, picture = installation.room("hall").slot, settled(installation, "hall")
-    assert leaves is not None
-    host = leaves.partition("/")[0]
+    host = host_of(installation, "hall")
     installation.directory.host_command("drain-host", host)
     wait_for(lambda: installation.room("hall").slot not in (None, leaves))
     wait_for(lambda: installation.is_shown("hall"))
     assert settled(installation, "hall") == picture
-    slots = installation.directory.host_command("undrain-host", host).slots
-    assert not any(slot.drained for slot in slots)
+    after = installation.directory.host_command("undrain-host", host).slots
+    assert not any(slot.drained for slot in after)
 
 
 ALONE = """
@@ -215,7 +264,7 @@ def test_a_cluster_of_its_own_is_on_loopback_and_ends_with_its_process(*, is_kil
         else:
             told.write("end\n")
             told.flush()
-        process.wait(20)
+        process.wait(PATIENCE_S)
     wait_for(lambda: all(map(is_gone, daemons)))
 
 
@@ -246,7 +295,7 @@ def test_an_actor_without_keeper_ends_its_render_server(tmp_path: Path) -> None:
     )
     assert process.stdout is not None
     server = psutil.Process(int(process.stdout.readline()))
-    assert process.wait(20) == 1
+    assert process.wait(PATIENCE_S) == 1
     wait_for(lambda: is_gone(server))
     assert list(tmp_path.iterdir()) == []
     process.stdout.close()

@@ -42,6 +42,10 @@ def test_a_number_of_slots_is_so_many_on_the_first_device(tmp_path: Path) -> Non
     assert loaded(tmp_path, text).devices == (None, None, None)
 
 
+HALL = "nodes: {a: {%s}}\nrooms: {hall: {nodes: [a]%s}}"
+BOMB = "a0: &a0 [x]\n" + "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 9))
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
@@ -68,6 +72,14 @@ def test_a_number_of_slots_is_so_many_on_the_first_device(tmp_path: Path) -> Non
         ),
         ("nodes: {a: {source: s}}\nroom: {}", "the nearest known key is `rooms`"),
         ("- hall", "must hold keys and values"),
+        (HALL % ("source: s", "") + f"\nslots: {[0] * 65}", "`slots` is wrong"),
+        (HALL % ("source: s", "") + "\nslots: [1000000000000]", "`slots` is wrong"),
+        (HALL % ("source: " + "s" * 2000, ""), "`nodes.a.source` is wrong"),
+        (HALL % (f"endpoint: 'tcp://{'h' * 2000}:1'", ""), "`nodes.a.endpoint` is wrong"),
+        (HALL % ("source: s", f", labels: {{a: {'v' * 64}}}"), "`rooms.hall.labels.a` is wrong"),
+        (HALL % ("source: s", f", labels: {dict.fromkeys(range(33), 'v')}"), "`rooms.hall.labels"),
+        (BOMB, "is not valid YAML"),
+        ("nodes: " + "[" * 1000, "is not valid YAML"),
         ("nodes: {a: [", "is not valid YAML"),
     ],
 )

@@ -13,7 +13,6 @@ from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.server import frames
-from deltalight.render_server.server.frames import FrameAssembler
 from deltalight.render_server.server.session import (
     MAXIMUM_FAULTS_IN_A_ROW,
     WATCHED_NS,
@@ -47,7 +46,6 @@ def session(renderer: InvertingRenderer, kept: list[SceneDocument]) -> RenderSes
     return RenderSession(
         renderer,
         SceneDocument(name="first", revision=3),
-        assembler=FrameAssembler(),
         renderer_name="abacus",
         keep_scene=kept.append,
         mailbox_drops=lambda: {"color.cam": 4},
@@ -259,7 +257,7 @@ def test_watched_views_come_with_each_composite_as_long_as_they_are_watched(
         rendered = session.step()
         assert rendered is not None
         assert len(rendered.pictures) == len(rendered.message.part_rules())
-        np.testing.assert_array_equal(rendered.pictures[0], 255 - renderer.newest.color)  # type: ignore[union-attr]
+        np.testing.assert_array_equal(rendered.pictures[0], 255 - renderer.newest["cam"].color)
         return [rendered.message.view, *(other.view for other in rendered.message.others)]
 
     assert shown(1) == ["composite"]
@@ -329,11 +327,11 @@ def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
         feed(session, number)
         rendered = session.step()
         assert (None if rendered is None else rendered.message.frame_id) == (None, 0)[number]
-    assert session.is_waiting_for_gpu
+    assert session.is_waiting
     last = session.step()
     assert last is not None
     assert last.message.frame_id == 1
-    assert not session.is_waiting_for_gpu
+    assert not session.is_waiting
 
 
 def test_pick_asks_the_renderer(session: RenderSession, renderer: InvertingRenderer) -> None:

@@ -285,6 +285,15 @@ def test_another_method_begins_with_its_defaults(store: Store) -> None:
     assert other.document.method.name == "none"
 
 
+def test_a_patch_to_another_kind_of_material_replaces_it() -> None:
+    numbers, asset = {"base_color": [1, 0, 0], "roughness": 0.5}, {"precomputed": "sha256:00"}
+    for old, new in ((numbers, asset), (asset, numbers)):
+        document = {"objects": [{"id": "a", "material": old}]}
+        assert patch_object("a", {"material": new})(document)["objects"][0]["material"] == new
+    rough = patch_object("a", {"material": {"roughness": 1}})({"objects": [{"id": "a", "material": numbers}]})
+    assert rough["objects"][0]["material"] == {**numbers, "roughness": 1}
+
+
 def test_merge_patch_does_what_its_standard_says() -> None:
     # The example of RFC 7396, section 3, and cases of its appendix A.
     target = {"title": "Goodbye!", "author": {"givenName": "John", "familyName": "Doe"}, "tags": ["a", "b"]}

@@ -1,5 +1,11 @@
-"""The way out to a media server: real receivers (FFmpeg, listening by RTSP and RTMP) in processes of their own."""
+"""The way out to a media server: real receivers in processes of their own.
 
+FFmpeg listens by RTSP and RTMP, `srt-live-transmit` (Debian's srt-tools) by SRT.
+"""
+
+import os
+import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -13,22 +19,28 @@ import numpy as np
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services import h264, ports, stream_out
-from deltalight.services.stream_out import NO_SRT, StreamOut, Target
+from deltalight.services import h264, ports, srt, stream_out
+from deltalight.services.srt import SrtAddress
+from deltalight.services.stream_out import StreamOut, Target
 from tests.services.conftest import ROOT, RunCli
 from tests.services.moving_samples import HEIGHT, WIDTH, MovingStream, picture, psnr_db
 
 LEAST_PSNR_DB = 35.0
 PATIENCE_S = 60.0
+BY_SRT = pytest.mark.skipif(not shutil.which("srt-live-transmit"), reason="srt-tools is not installed")
 PHASES = 40
 # Decodes what comes, and keeps each picture in a folder.
 RECEIVER = """
+import subprocess
 import sys
 from pathlib import Path
 import av
 import numpy as np
 from deltalight.services.h264 import rgb_picture
 url, folder, options = sys.argv[1], Path(sys.argv[2]), dict(each.split("=") for each in sys.argv[3:])
+if url.startswith("srt:"):
+    command = ["srt-live-transmit", "-q", url + "&mode=listener", "file://con"]
+    url = subprocess.Popen(command, stdout=subprocess.PIPE).stdout
 with av.open(url, options=options) as container:
     for number, frame in enumerate(container.decode(video=0)):
         np.save(folder / "part.npy", rgb_picture(frame))
@@ -37,6 +49,7 @@ with av.open(url, options=options) as container:
 LISTENING = {
     "rtsp": {"rtsp_flags": "listen", "listen_timeout": "60"},
     "rtmp": {"listen": "1", "analyzeduration": "100000"},
+    "srt": {"analyzeduration": "100000"},
 }
 
 
@@ -47,7 +60,7 @@ class Receiver:
         folder.mkdir()
         options = [f"{key}={value}" for key, value in LISTENING[url.partition(":")[0]].items()]
         command = [sys.executable, "-c", RECEIVER, url, str(folder), *options]
-        self._process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+        self._process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True)
         self._folder = folder
 
     @property
@@ -55,7 +68,7 @@ class Receiver:
         return [np.load(path) for path in sorted(self._folder.glob("0*.npy"))]
 
     def close(self) -> None:
-        self._process.kill()
+        os.killpg(self._process.pid, signal.SIGKILL)  # what it started too
         self._process.wait()
 
 
@@ -85,14 +98,21 @@ def agreements_db(pictures: list[np.ndarray]) -> list[float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["rtsp", "rtmp"])
+@pytest.mark.parametrize(
+    ("scheme", "path"),
+    [
+        ("rtsp", "/live/room"),
+        ("rtmp", "/live/room"),
+        pytest.param("srt", "?passphrase=0123456789ab", marks=BY_SRT),
+    ],
+)
 def test_pictures_arrive_and_resume_when_the_receiver_comes_back(
-    scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scheme: str, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stream_out, "FIRST_WAIT_S", 0.3)
     monkeypatch.setattr(stream_out, "LONGEST_WAIT_S", 0.6)
     (port,) = ports.private_ports(1)
-    url, told = f"{scheme}://{ports.LOOPBACK}:{port}/live/room", list[str]()
+    url, told = f"{scheme}://{ports.LOOPBACK}:{port}{path}", list[str]()
     with StreamOut(Target.parse(url), told.append) as out:
         for part in ("before", "after"):
             with receiving(url, tmp_path / part) as receiver:
@@ -171,10 +191,48 @@ def test_wrong_addresses_are_one_sentence(cli: RunCli) -> None:
         done = cli("stream", "--to", url)
         assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
         assert "rtsp://HOST:8554/NAME" in done.stderr
-    with pytest.raises(DeltalightError, match=NO_SRT.split(";", maxsplit=1)[0]):
-        Target.parse("srt://media.example:8890?streamid=publish:room")
     target = Target.parse("rtmp://me:secret@[::1]:1935/live/key?token=x")
     assert target.shown == "rtmp://[::1]:1935"
+
+
+@pytest.mark.parametrize(
+    ("query", "what"),
+    [
+        ("", "a host and a port"),
+        (":8890?mode=listener", "takes streamid, passphrase, pbkeylen, latency, each once, not 'mode'"),
+        (":8890?latency=1&latency=2", "each once"),
+        (":8890?latency=soon", "latency of an SRT address is 0 to 30000"),
+        (":8890?passphrase=short", "passphrase of an SRT address has 10 to 79 bytes"),
+        (":8890?pbkeylen=17", "16, 24 or 32"),
+        (":8890?streamid=", "streamid of an SRT address has 1 to 512 bytes"),
+    ],
+)
+def test_wrong_addresses_of_srt_are_one_sentence(query: str, what: str) -> None:
+    with pytest.raises(DeltalightError, match=re.escape(what)):
+        Target.parse(f"srt://media.example{query}")
+
+
+def test_access_control_of_srt_is_passed_on_as_it_is() -> None:
+    address = SrtAddress.parse("srt://media.example:8890?streamid=#!::m=publish,r=room&latency=200")
+    assert address.options == ((srt.STREAM_ID, "#!::m=publish,r=room"), (srt.PEER_LATENCY, 200))
+
+
+@BY_SRT
+def test_a_wrong_passphrase_is_told(tmp_path: Path) -> None:
+    (port,) = ports.private_ports(1)
+    url, told = f"srt://{ports.LOOPBACK}:{port}?passphrase=", list[str]()
+    with (
+        receiving(f"{url}0123456789ab", tmp_path / "got"),
+        StreamOut(Target.parse(f"{url}ba9876543210"), told.append) as out,
+    ):
+        show_until(out, lambda: any("Incorrect passphrase" in each for each in told))
+    assert "9876543210" not in "".join(told)
+
+
+def test_without_libsrt_a_sentence_says_so(cli: RunCli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(srt, "LIBRARIES", ())
+    done = cli("stream", "--to", "srt://media.example:8890?streamid=publish:room")
+    assert (done.returncode, done.stderr.strip()) == (2, f"deltalight: {srt.NO_LIBRARY}")
 
 
 def test_without_pyav_a_sentence_says_so(cli: RunCli, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,10 +13,9 @@ import psutil
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.child import ChildSpec
-from deltalight.services.host import PREPARED
+from deltalight.services.child import ChildSpec, early_spares
 from deltalight.services.supervisor import Supervisor
-from deltalight.services.warm_spare import SPARE_VARIABLE
+from deltalight.services.warm_spare import PREPARED, SPARE_VARIABLE
 
 SLEEP_FOREVER = "import time\nwhile True: time.sleep(60)"
 IGNORE_SIGTERM = f"import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n{SLEEP_FOREVER}"
@@ -145,13 +144,24 @@ def test_a_dead_spare_is_nobodys_replacement(monkeypatch: pytest.MonkeyPatch) ->
         assert supervisor.process_ids()["a"] not in {first, spare}
 
 
+def test_early_spares_become_the_first_processes_and_others_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PREPARED, "ping", ())
+    with early_spares({"a": "ping", "b": "ping"}) as spares:
+        spec = ChildSpec.deltalight("a", "ping", "--help")
+        with Supervisor([spec], forward=lambda _line: None, spares=spares) as supervisor:
+            assert supervisor.process_ids() == {"a": spares["a"].pid}
+            assert spares["a"].wait(timeout=60) == 0
+        assert spares["b"].poll() is None
+    assert spares["b"].poll() is not None
+
+
 def test_a_spare_ends_with_its_supervisor() -> None:
     waiting = subprocess.Popen(
         [sys.executable, "-c", WARM_CHILD], stdin=subprocess.PIPE, env={**os.environ, SPARE_VARIABLE: ""}
     )
     assert waiting.stdin is not None
     waiting.stdin.close()
-    assert waiting.wait(timeout=20) == 0
+    assert waiting.wait(timeout=60) == 0
 
 
 def test_all_that_spares_prepare_is_there() -> None:

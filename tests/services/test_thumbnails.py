@@ -6,11 +6,23 @@ import cv2
 import numpy as np
 import pytest
 
+from deltalight.protocol.frames import srgb_code
 from deltalight.protocol.radiance_files import write_exr
+from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrdf
+from deltalight.render_server.scene.material_file import write_material
+from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
 from deltalight.services.storage.asset_sandbox import run_limited
 from deltalight.services.storage.faults import RejectedAssetError
 from deltalight.services.storage.store import Store
-from deltalight.services.storage.thumbnails import SIZE
+from deltalight.services.storage.thumbnails import (
+    AMBIENT_LIGHT,
+    FILL,
+    FILL_LIGHT,
+    KEY,
+    KEY_LIGHT,
+    MARGIN,
+    SIZE,
+)
 from tests.services.api_samples import UPLOAD, running_api, sentence
 from tests.services.storage_samples import TETRAHEDRON, glb, trusting_probe, upload
 from tests.services.test_gltf_zip import FILES, packed
@@ -44,7 +56,7 @@ def wall() -> bytes:
 def drawn(folder: Path, name: str, content: bytes) -> np.ndarray:
     path, out = folder / name, folder / "out.png"
     path.write_bytes(content)
-    kind = "map" if path.suffix in (".hdr", ".exr") else "mesh"
+    kind = {".hdr": "map", ".exr": "map", ".dlmat": "material"}.get(path.suffix, "mesh")
     run_limited(f"{kind}-thumbnail", path, name, str(out), output_bytes=1 << 20)  # type: ignore[arg-type]
     picture = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)
     assert picture is not None
@@ -116,6 +128,37 @@ def test_a_map_is_shown_whole_whatever_its_kind_and_brightness(tmp_path: Path) -
     assert (dark[..., 3] == 255).all()
     assert np.abs(dark - bright).max() <= 2
     assert dark[:32, :, 0].mean() > dark[-32:, :, 0].mean() + 20
+
+
+def test_a_measured_paint_is_a_lit_ball(tmp_path: Path) -> None:
+    """A diffuse one shows the closed form where the key light meets it head-on; a lobe adds a highlight."""
+    base = np.array([0.5, 0.2, 0.1])
+    matt = GaussianBrdf(base, np.zeros(0), np.zeros((0, RISE_TERMS, 3)))
+    coated = GaussianBrdf(base, np.array([0.15]), np.full((1, RISE_TERMS, 3), 0.05))
+    pictures = []
+    for name, made in (("matt", matt), ("coated", coated)):
+        write_material(tmp_path / name, made)
+        pictures.append(drawn(tmp_path, f"{name}.dlmat", (tmp_path / name).read_bytes()))
+    way = KEY / np.linalg.norm(KEY)
+    column, row = (
+        round((SIZE / 2) * (1 + sign * part / MARGIN) - 0.5) for sign, part in ((1, way[0]), (-1, way[1]))
+    )
+    fill = FILL_LIGHT * max(0.0, float(way @ FILL) / float(np.linalg.norm(FILL)))
+    expected = srgb_code((base * (KEY_LIGHT + AMBIENT_LIGHT + fill)).astype(np.float32)[None])[0]
+    assert pictures[0][row, column, 2::-1] / 255 == pytest.approx(expected, abs=0.01)
+    assert pictures[0][0, 0, 3] == 0
+    assert (pictures[1].astype(int) - pictures[0]).max() > 40
+
+
+def test_a_polynomial_texture_map_is_upright_and_keeps_its_shape(tmp_path: Path) -> None:
+    coefficients = np.zeros((TERMS, 8, 16, 3), np.float16)
+    coefficients[0, :4, :, 0] = coefficients[0, 4:, :, 2] = 0.8  # red above blue
+    write_material(tmp_path / "map", PolynomialTexture(coefficients))
+    picture = drawn(tmp_path, "map.dlmat", (tmp_path / "map").read_bytes())
+    assert (picture[: SIZE // 4 - 1, :, 3] == 0).all()
+    assert (picture[SIZE // 4 + 1 : 3 * SIZE // 4 - 1, :, 3] == 255).all()
+    assert picture[SIZE // 3, SIZE // 2, 2] > 100 > picture[SIZE // 3, SIZE // 2, 0]
+    assert picture[2 * SIZE // 3, SIZE // 2, 0] > 100 > picture[2 * SIZE // 3, SIZE // 2, 2]
 
 
 def test_a_mesh_that_lies_or_is_none_is_refused(tmp_path: Path) -> None:

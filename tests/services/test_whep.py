@@ -25,7 +25,7 @@ from tests.services.live_samples import live_socket
 from tests.services.moving_samples import Picture, Running, moving_api, psnr_db
 
 LEAST_PSNR_DB = 35.0  # of a picture from its JPEG; those of the WebSocket agree as much
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 SDP = {"Content-Type": "application/sdp"}
 
 
@@ -176,7 +176,7 @@ def test_a_session_ends_with_its_peer_and_with_one_that_never_comes(
     asyncio.run(watch())
     monkeypatch.setattr(aioice.ice, "CONSENT_INTERVAL", 0.1)
     asyncio.run(fall_silent())
-    monkeypatch.setattr(webrtc, "CONNECT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(webrtc, "CONNECT_TIMEOUT_S", 1.0)
     answer = live.api.client.post("/whep", content=made_offer("video"), headers=SDP)
     assert answer.status_code == 201
     assert viewers(live) == 1
@@ -330,7 +330,6 @@ def test_chromium_shows_what_the_jpeg_shows(live: Running) -> None:
         page.goto(f"http://{live.address}/openapi.json")
         shown = page.evaluate(WATCH)
         seen = np.array(shown["pixels"], np.uint8).reshape(shown["height"], shown["width"], 4)[..., :3]
-        agreement_db, frame_id = live.closest(seen)
+        agreement_db, _ = live.closest(seen, after=before)
     assert agreement_db > LEAST_PSNR_DB
     assert psnr_db(seen, np.roll(seen, 2, axis=1)) < agreement_db, "a shift by two pixels would show"
-    assert frame_id > before

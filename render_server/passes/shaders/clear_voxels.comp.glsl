@@ -11,8 +11,8 @@ uniform bool free_slots;    // also release the slots
 
 void main() {
     for (uint i = first_item(); i < slot_count; i += items_apart()) {
-        ivec3 v = voxel_of_index(touched[i], volume_size);
-        for (int k = 0; k < DIRECTIONS; ++k) imageStore(mipmap, v + ivec3(0, 0, k * volume_size), vec4(0.0));
+        ivec3 v = enter_volume_of(touched[i], volume_size);
+        for (int k = 0; k < DIRECTIONS; ++k) imageStore(mipmap, level_base(0, k) + v, vec4(0.0));
         if (free_slots) grid[touched[i]] = 0u;
     }
 }

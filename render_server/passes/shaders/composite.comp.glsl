@@ -194,10 +194,10 @@ void compose(ivec2 pixel) {
 void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
     uint block = uint(scale * scale);
-    uint count = (whole ? uint(grid.x * grid.y) : listed_count()) * block;
-    for (uint i = first_item(); i < count; i += items_apart()) {
+    uint count = (whole ? uint(grid.x * grid.y) : listed_count()) * block, i = first_item();
+    if (i < count) do {
         uint index = whole ? i / block : texels[i / block];
         ivec2 pixel = pixel_in_block(texel_of_index(index, grid.x), int(i % block), scale);
         if (all(lessThan(pixel, size))) compose(pixel);
-    }
+    } while ((i += items_apart()) < count);
 }

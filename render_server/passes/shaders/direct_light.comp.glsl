@@ -1,5 +1,6 @@
 // Direct irradiance of the real surface at each pixel without and with the virtual objects (docs/method.md 3, direct), and
-// the light lobes on declared specular surfaces.
+// the light lobes on declared specular surfaces. SPARED: where the light without the objects is known, and no shadow of
+// theirs falls.
 #include "common/lit_pixels.glsl"
 #include "common/light_reach.glsl"
 #include "common/brdf.glsl"
@@ -34,8 +35,10 @@ void light(ivec2 pixel, ivec2 size) {
     vec4 kept = keeps_unblocked ? imageLoad(direct_mu, pixel) : vec4(0.0);
     bool known = kept.a > 0.0 && !shadow_may_reach(position.xyz, normal.xyz, bias);
     if (reached) {
+#ifndef SPARED
         vec3 v = normalize(camera_position - position.xyz);
-        for (int i = 0; i < (known ? 0 : light_count); ++i) {
+        int i = 0;
+        if (!known && light_count > 0) do {
             vec3 l; float radius;
             vec3 across = light_at(lights[i], position.xyz, normal.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
@@ -51,9 +54,11 @@ void light(ivec2 pixel, ivec2 size) {
                 s_mu += lobe * seen.x;
                 s_rho += lobe * arrives;
             }
-        }
+        } while (++i < light_count);
+#endif
     }
     if (known) { e_mu = e_rho = kept.rgb; unshadowed = kept.a; }
+    enter_volume(position.xyz);
     float fade = volume_fade(volume_coordinate(position.xyz));
     if (reached && fade > 0.0)
         e_rho += fade * caustic_irradiance(pixel, size, REAL_LAYER, position.xyz, normal.xyz, position.w);
@@ -68,9 +73,9 @@ void light(ivec2 pixel, ivec2 size) {
 void main() {
     ivec2 size = textureSize(real_surface_position, 0);
     int grid_width = (size.x + scale - 1) / scale;
-    uint block = uint(scale * scale);
-    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
+    uint block = uint(scale * scale), count = listed_count() * block, i = first_item();
+    if (i < count) do {
         ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
         if (all(lessThan(pixel, size))) light(pixel, size);
-    }
+    } while ((i += items_apart()) < count);
 }

@@ -98,6 +98,7 @@ void unmix(ivec2 pixel) {
 
 void main() {
     int width = textureSize(real_surface_position, 0).x;
-    for (uint i = first_item(); i < listed_count(); i += items_apart())
-        unmix(texel_of_index(texels[i], width));
+    uint i = first_item();
+    if (i < listed_count()) do unmix(texel_of_index(texels[i], width));
+    while ((i += items_apart()) < listed_count());
 }

@@ -1,12 +1,12 @@
 // Reflections at the pixels of smooth objects, from those of the quads around that were traced on the same surface.
 #include "common/geometry.glsl"
 #include "common/continuation.glsl"
-#include "common/work_list.glsl"
+#include "common/shown_pixels.glsl"
+#include "common/walk.glsl"
 
 layout(local_size_x = 64) in;
 uniform sampler2D object_coverage;
 uniform sampler2D traced;
-uniform int scale;
 uniform float pixel_size;   // m at 1 m depth
 layout(rgba16f) writeonly uniform image2D reflected;
 #include "common/quads.glsl"
@@ -32,13 +32,7 @@ vec4 filled(ivec2 pixel) {
     return sum / max(total, 1e-6);
 }
 
-// The pixels of the texels that show an object.
 void main() {
-    ivec2 size = textureSize(object_coverage, 0);
-    int grid_width = (size.x + scale - 1) / scale;
-    uint block = uint(scale * scale);
-    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
-        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
-        if (is_covered(pixel)) imageStore(reflected, pixel, filled(pixel));
-    }
+    uint i = first_item();
+    if (i < pixels_shown()) do imageStore(reflected, shown_pixel(i), filled(shown_pixel(i))); while ((i += items_apart()) < pixels_shown());
 }

@@ -17,9 +17,10 @@ vec4 front_to_back(vec4 front, vec4 back) {
 void main() {
     int cells = volume_size >> level;
     ivec3 id = ivec3(gl_GlobalInvocationID);
-    int k = id.z / cells;
-    if (id.x >= cells || id.y >= cells || k >= DIRECTIONS) return;
-    ivec3 cell = ivec3(id.xy, id.z - k * cells);
+    int slab = id.z / cells, k = slab % DIRECTIONS;
+    if (id.x >= cells || id.y >= cells || slab >= volume_count * DIRECTIONS) return;
+    work_in_volume(slab / DIRECTIONS);
+    ivec3 cell = ivec3(id.xy, id.z - slab * cells);
     int along = k >> 1, u = (along + 1) % 3, v = (along + 2) % 3;
     ivec3 step_along = ivec3(0), step_u = ivec3(0), step_v = ivec3(0);
     step_along[along] = 1; step_u[u] = 1; step_v[v] = 1;

@@ -50,6 +50,6 @@ void gather(int slot) {
 }
 
 void main() {
-    uint count = groups_held();
-    for (uint i = first_item(); i < count; i += items_apart()) gather(int(i));
+    uint count = groups_held(), i = first_item();
+    if (i < count) do gather(int(i)); while ((i += items_apart()) < count);
 }

@@ -21,8 +21,8 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
     uint entry = group_entry(floatBitsToUint(s.uv_voxel.z), n);
     int slot = group_slot(entry);
     if (slot < 0) return;
+    vec3 corner = block_corner(entry), place = volume_coordinate(s.position_area.xyz) - corner;
     float weight = s.position_area.w / (voxel_edge * voxel_edge);
-    vec3 place = volume_coordinate(s.position_area.xyz) - block_corner(entry);
     int at = slot * GROUP_SUMS;
     atomicAdd(group_sums[at + GROUP_AREA], fixed_point(weight));
     for (int j = 0; j < 3; ++j) {

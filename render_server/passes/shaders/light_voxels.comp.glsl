@@ -46,7 +46,7 @@ const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no su
 #endif
 #ifdef REAL_DELTA
 layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 per slot
-layout(std430) buffer Support { int support[6]; };        // bounds of changed voxels: min xyz, -max xyz
+layout(std430) buffer Support { int support[]; };        // of each volume, bounds of changed voxels: min xyz, -max xyz
 #endif
 
 #ifdef GATHERED
@@ -78,7 +78,8 @@ vec2 light_fraction(Light light, vec3 p, vec3 n) { return visibility(light, p, n
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     vec3 p = s.position_area.xyz + n * voxel_edge * LIFT;
     mu = rho = vec3(0.0);
-    for (int i = 0; i < light_count; ++i) {
+    int i = 0;
+    if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
         vec3 to_light; float radius;
         vec3 across = light_at(lights[i], p, n, to_light, radius);
         float cosine = dot(n, to_light);
@@ -86,7 +87,7 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
         vec2 v = light_fraction(lights[i], p, n);
         mu += across * cosine * v.x;
         rho += across * cosine * arriving(lights[i], p, v, 0.0);
-    }
+    } while (++i < light_count);
     if (keep_light) {
 #ifndef REAL_RHO
         surfel_lights[own].direct_mu = vec4(mu, 0.0);
@@ -204,13 +205,14 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 
 void light(Surfel s, uint own, vec3 n) {
     uint voxel = floatBitsToUint(s.uv_voxel.z);
+    ivec3 v = enter_volume_of(voxel, volume_size);
     vec3 radiance = outgoing(s, n, own);
 #if defined(REAL_DELTA) || defined(GATHERED)
     if (radiance == vec3(0.0)) return;
 #endif
 #ifdef REAL_DELTA
-    ivec3 v = voxel_of_index(voxel, volume_size);
-    for (int j = 0; j < 3; ++j) { atomicMin(support[j], v[j]); atomicMin(support[3 + j], -v[j]); }
+    int held = 6 * volume;
+    for (int j = 0; j < 3; ++j) { atomicMin(support[held + j], v[j]); atomicMin(support[held + 3 + j], -v[j]); }
 #endif
     float area = s.position_area.w, opaque = 1.0;
 #if defined(VIRTUAL) && defined(MATERIAL_MAPS)
@@ -225,10 +227,11 @@ void light(Surfel s, uint own, vec3 n) {
 }
 
 void main() {
-    uint count = surfels_held();
-    for (uint i = first_item(); i < count; i += items_apart()) {
+    uint count = surfels_held(), i = first_item();
+    if (i < count) do {
         Surfel s = surfels[i];
-        light(s, 2u * i, s.normal_material.xyz);
-        if (s.uv_voxel.w > 0.5) light(s, 2u * i + 1u, -s.normal_material.xyz);
-    }
+        uint sides = s.uv_voxel.w > 0.5 ? 2u : 1u;   // a loop: software renderers would run a branch for all
+        uint side = 0u;
+        do light(s, 2u * i + side, side == 0u ? s.normal_material.xyz : -s.normal_material.xyz); while (++side < sides);
+    } while ((i += items_apart()) < count);
 }

@@ -3,12 +3,24 @@
 #include "common/geometry.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
+#define APPENDS_PIXELS
+#include "common/shown_pixels.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(rgba16i) writeonly uniform iimage2D sample_pixels_out;
 uniform sampler2D object_coverage;
 uniform ivec2 picture_pixels;
 uniform int scale;
+
+// Lists the `count` pixels of a texel that show an object.
+void append_shown(ivec2 texel, uint count) {
+    uint place = count > 0u ? room_for_pixels(count) : 0u;
+    for (int i = 0; i < (count > 0u ? scale * scale : 0); ++i) {
+        ivec2 pixel = pixel_in_block(texel, i, scale);
+        if (all(lessThan(pixel, picture_pixels)) && texelFetch(object_coverage, pixel, 0).r > 0.0)
+            put_pixel(place++, pixel);
+    }
+}
 
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
@@ -17,6 +29,7 @@ void main() {
     ivec4 best = ivec4(-1);
     ivec2 hidden = ivec2(-1);
     vec3 nearest = vec3(1e9);
+    uint shown_here = 0u;
     for (int j = 0; j < scale; ++j)
         for (int i = 0; i < scale; ++i) {
             ivec2 pixel = texel * scale + ivec2(i, j);
@@ -24,6 +37,7 @@ void main() {
             vec2 d = vec2(i, j) - 0.5 * float(scale - 1);
             float away = dot(d, d);
             float shown = texelFetch(object_coverage, pixel, 0).r;
+            shown_here += uint(shown > 0.0);
             bool known = texelFetch(real_surface_position, pixel, 0).w > 0.0;
             if (away < nearest.x && shown < 1.0 && known) { nearest.x = away; best.xy = pixel; }
             if (away < nearest.z && shown == 1.0 && known) { nearest.z = away; hidden = -2 - pixel; }
@@ -32,4 +46,5 @@ void main() {
     if (best.x < 0) best.xy = hidden;
     imageStore(sample_pixels_out, texel, best);
     if (best.z >= 0) append_texel(texel, low.x);
+    append_shown(texel, shown_here);
 }

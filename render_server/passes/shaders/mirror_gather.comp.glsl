@@ -26,7 +26,7 @@ float open_fraction(vec3 from, vec3 to) {
     for (int i = 0; i < 1024; ++i) {
         vec3 at = sample_point(w);
         if (travelled(w) > end || coverage >= WALL) break;
-        if (inside_volume(at)) coverage += slice_fraction(w) * directional_sample(mipmap_mu, volume_size, at, w).a;
+        if (inside_volume(at)) coverage += slice_fraction(w) * sample_near(mipmap_mu, at, w).a;
         w.plane += 1;
         w.ahead = vec3(0.0);
     }
@@ -37,6 +37,7 @@ void gather(ivec2 texel) {
     vec3 position = texelFetch(hit_position, texel, 0).xyz;
     vec4 normal = texelFetch(hit_normal, texel, 0);
     Mirror m = mirror_at(mirror_pixel(texelFetch(sample_pixels, texel, 0)));
+    enter_volume(position);
     vec3 q = volume_coordinate(position);
     vec3 e_mu, e_rho;
     diffuse(q, normal.xyz, WHOLE, true, e_mu, e_rho);

@@ -9,7 +9,7 @@
 layout(local_size_x = 64) in;
 
 void mark(int level, ivec3 corner, uint bits) {
-    int word = corner_word(volume_size, level, corner);
+    int word = volume * mipmap_words(volume_size) + corner_word(volume_size, level, corner);
     if ((occupied[word] & bits) != bits) atomicOr(occupied[word], bits);
 }
 
@@ -24,7 +24,7 @@ void occupy(ivec3 cell, int level) {
 
 void main() {
     for (uint i = first_item(); i < slot_count; i += items_apart()) {
-        ivec3 v = voxel_of_index(touched[i], volume_size);
+        ivec3 v = enter_volume_of(touched[i], volume_size);
         for (int level = 0; level < volume_levels; ++level) occupy(v >> level, level);
     }
 }

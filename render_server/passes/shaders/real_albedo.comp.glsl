@@ -4,8 +4,9 @@
 #include "common/environment.glsl"
 #include "common/volume.glsl"
 #include "common/real_radiance.glsl"
+#include "common/map_texels.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D albedo_out;
 uniform sampler2D real_light_normal;
 uniform int view_index;
@@ -13,18 +14,25 @@ uniform float bias_real;   // m
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
-// Real direct and ambient light. The map's own light reaches its texels by definition.
+// Irradiance of a light that nothing blocks.
+vec3 unblocked(Light light, vec3 p, vec3 n) {
+    vec3 to_light; float radius;
+    vec3 across = light_at(light, p, n, to_light, radius);
+    return across * max(dot(n, to_light), 0.0);
+}
+
+// Real direct and ambient light. The map's own light reaches its texels by definition, so its shadows are not looked for.
 vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
-    for (int i = 0; i < light_count; ++i) {
-        bool own = i == light_of_view(view_index);
-        vec3 to_light; float radius;
-        vec3 across = light_at(lights[i], p, n, to_light, radius);
-        float cosine = dot(n, to_light);
-        if (cosine <= 0.0) continue;
-        e += across * cosine * (own ? 1.0 : real_visibility(lights[i], p, n, bias_real));
-    }
-    return e;
+    int own = light_of_view(view_index);
+    vec3 of_own = unblocked(lights[own], p, n);
+    int j = 0;
+    if (light_count > 1) do {
+        if (j == own) e += of_own;   // sums in the lights' order
+        Light light = lights[j < own ? j : j + 1];
+        e += unblocked(light, p, n) * real_visibility(light, p, n, bias_real);
+    } while (++j < light_count - 1);
+    return own == light_count - 1 ? e + of_own : e;
 }
 
 const float SNAP_REACH = 0.5;   // voxels: split_inject searches a touched voxel this near (SNAP along each axis)
@@ -35,22 +43,28 @@ bool reaches_volume(vec3 p, float around) {
     return distance(q, clamp(q, vec3(0.0), vec3(float(volume_size)))) <= around / voxel_edge + SNAP_REACH;
 }
 
+bool is_wanted(LightView view, ivec2 texel) {
+    float depth = first_depth(real_light_depth, view, texel);
+    vec2 s = texel_lateral(view, texel);
+    return depth != NOTHING && reaches_volume(ray_point(view, s, depth), hit_spread(view, s, depth));
+}
+
+vec3 albedo_at(LightView view, ivec2 texel) {
+    vec3 p = ray_point(view, texel_lateral(view, texel), first_depth(real_light_depth, view, texel));
+    if (!camera_sees(p)) return unseen_albedo(p);
+    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+    vec3 to_light; float radius;
+    light_at(lights[light_of_view(view_index)], p, to_light, radius);
+    if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
+    return clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
+}
+
 void main() {
     LightView view = light_views[view_index];
-    if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy);
-    float depth = first_depth(real_light_depth, view, texel);
-    if (depth == NOTHING) return;
-    vec2 s = texel_lateral(view, texel);
-    vec3 p = ray_point(view, s, depth);
-    if (!reaches_volume(p, hit_spread(view, s, depth))) return;
-    vec3 albedo = unseen_albedo(p);
-    if (camera_sees(p)) {
-        vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
-        vec3 to_light; float radius;
-        light_at(lights[light_of_view(view_index)], p, to_light, radius);
-        if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
-        albedo = clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
-    }
-    imageStore(albedo_out, texel, vec4(albedo, 1.0));
+    uint i = next_wanted(view, first_item());
+    if (i < texels_of(view)) do {
+        ivec2 texel = map_texel(view, i);
+        imageStore(albedo_out, texel, vec4(albedo_at(view, texel), 1.0));
+        i = next_wanted(view, i + items_apart());
+    } while (i < texels_of(view));
 }

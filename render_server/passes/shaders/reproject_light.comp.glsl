@@ -1,7 +1,8 @@
 // Direct light of the last frame in the texels that select_direct_texels listed, at the pixels that see the same surfaces
 // as then, and no edge of a shadow. Lists the texels that have others; and in turn one tile in `turns`, so that errors of
-// resampling do not add up.
-#include "common/geometry.glsl"
+// resampling do not add up. Where objects moved, lists apart those that keep all of their light without the objects, and
+// that no shadow reaches.
+#include "common/light_reach.glsl"
 #include "common/reprojection.glsl"
 #include "common/work_list.glsl"
 
@@ -9,6 +10,7 @@ layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D direct_mu_out;
 layout(rgba16f) writeonly uniform image2D direct_rho_out;
 layout(std430) buffer Needed { uint needed_count; uint needed[]; };   // as Texels
+layout(std430) buffer Spared { uint spared_count; uint spared[]; };   // as Texels
 uniform sampler2D last_direct_mu;
 uniform sampler2D last_direct_rho;
 uniform ivec2 low_resolution_size;
@@ -49,9 +51,20 @@ bool reproject(ivec2 pixel) {
     return kept || position.w <= 0.0;
 }
 
-void keep_unblocked(ivec2 pixel) {
-    bool same = texelFetch(last_position, pixel, 0) == texelFetch(real_surface_position, pixel, 0);
-    imageStore(direct_mu_out, pixel, same ? texelFetch(last_direct_mu, pixel, 0) : vec4(0.0));
+// What the pixels of a texel show of the real scene, and whether all of them keep their light.
+struct Block { vec3 low; vec3 high; float nearest; bool kept; };
+
+void keep_unblocked(ivec2 pixel, inout Block b) {
+    vec4 position = texelFetch(real_surface_position, pixel, 0);
+    bool same = texelFetch(last_position, pixel, 0) == position;
+    vec4 mu = same ? texelFetch(last_direct_mu, pixel, 0) : vec4(0.0);
+    imageStore(direct_mu_out, pixel, mu);
+    if (position.w <= 0.0) return;
+    b = Block(min(b.low, position.xyz), max(b.high, position.xyz), min(b.nearest, position.w), b.kept && mu.a > 0.0);
+}
+
+bool shadows_may_reach(Block b) {
+    return shadow_may_reach_sphere(0.5 * (b.low + b.high), 0.5 * distance(b.low, b.high), shadow_bias(b.nearest));
 }
 
 void main() {
@@ -63,10 +76,13 @@ void main() {
             ivec2 pixel = pixel_in_block(texel, j, scale);
             if (all(lessThan(pixel, size))) known = reproject(pixel) && known;
         }
+        Block b = Block(vec3(1e30), vec3(-1e30), 1e30, true);
         for (int j = 0; j < (keeps_unblocked ? scale * scale : 0); ++j) {
             ivec2 pixel = pixel_in_block(texel, j, scale);
-            if (all(lessThan(pixel, size))) keep_unblocked(pixel);
+            if (all(lessThan(pixel, size))) keep_unblocked(pixel, b);
         }
-        if (!has_history || !known) needed[atomicAdd(needed_count, 1u)] = texels[i];
+        bool is_spared = keeps_unblocked && b.kept && b.nearest < 1e30 && !shadows_may_reach(b);
+        if (is_spared) spared[atomicAdd(spared_count, 1u)] = texels[i];
+        else if (!has_history || !known) needed[atomicAdd(needed_count, 1u)] = texels[i];
     }
 }

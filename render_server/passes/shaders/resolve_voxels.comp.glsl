@@ -44,14 +44,14 @@ void main() {
 #ifdef RHO_VIRTUAL
         if (other_grid[voxel] != 0u) continue;
 #endif
-        ivec3 v = voxel_of_index(voxel, volume_size);
+        ivec3 v = enter_volume_of(voxel, volume_size);
         for (int k = 0; k < 6; ++k) {
             vec4 c = own_texel(int(i), k);
 #ifdef RHO_REAL
             uint other = other_grid[voxel];
             if (other != 0u) c = at_most_covered(c + virtual_texel(int(other - 1u), k));
 #endif
-            imageStore(mipmap, v + ivec3(0, 0, k * volume_size), c);
+            imageStore(mipmap, level_base(0, k) + v, c);
         }
     }
 }

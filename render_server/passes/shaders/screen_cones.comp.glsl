@@ -6,7 +6,8 @@
 #include "common/ray_mesh.glsl"
 #include "common/shown_maps.glsl"
 #include "common/lobe.glsl"
-#include "common/work_list.glsl"
+#include "common/shown_pixels.glsl"
+#include "common/walk.glsl"
 #include "common/surface_change.glsl"
 
 layout(local_size_x = 64) in;
@@ -62,7 +63,8 @@ vec4 reflection(ivec2 pixel) {
     bool objects_apart = roughness < OBJECTS_BY_RAYS, is_open;
     vec4 sum = vec4(0.0);
     float count = 0.0;
-    for (int j = 0; j < CONE_COUNT; ++j) {
+    int j = 0;
+    do {
         vec3 even = fract(float(j) * vec3(0.6180339887, 0.7548776662, 0.5698402910) + vec3(0.0, 0.5, 0.5));
         vec2 within = even.yz - 0.5;
         vec3 n = normalize(normal.xyz + within.x * x.normal + within.y * y.normal);
@@ -76,7 +78,7 @@ vec4 reflection(ivec2 pixel) {
         if (objects_apart && !is_open) continue;
         sum += seen;
         count += 1.0;
-    }
+    } while (++j < CONE_COUNT);
     vec4 seen = sum / max(count, 1.0);
 #ifdef OBJECT_RAYS
     vec4 objects = imageLoad(object_rays, pixel);
@@ -85,29 +87,8 @@ vec4 reflection(ivec2 pixel) {
     return seen;
 }
 
-#ifdef QUADS
-#include "common/quads.glsl"
-
-// One pixel of each quad in the texels that show an object.
+// Of the listed pixels: all that show an object, or one for each quad of them (list_quads).
 void main() {
-    int grid_width = textureSize(sample_pixels, 0).x, edge = (scale + 1) / 2;
-    uint quads = uint(edge * edge);
-    for (uint i = first_item(); i < listed_count() * quads; i += items_apart()) {
-        ivec2 first = pixel_in_block(texel_of_index(texels[i / quads], grid_width), 0, scale);
-        ivec2 quad = first / 2 + ivec2(int(i % quads) % edge, int(i % quads) / edge), pixel = first_of_quad(quad);
-        if (pixel.x >= 0) imageStore(reflected, pixel, reflection(pixel));
-    }
+    uint i = first_item();
+    if (i < pixels_shown()) do imageStore(reflected, shown_pixel(i), reflection(shown_pixel(i))); while ((i += items_apart()) < pixels_shown());
 }
-#else
-// The pixels of the texels that show an object.
-void main() {
-    ivec2 size = textureSize(object_coverage, 0);
-    int grid_width = textureSize(sample_pixels, 0).x;
-    uint block = uint(scale * scale);
-    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
-        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
-        if (any(greaterThanEqual(pixel, size)) || texelFetch(object_coverage, pixel, 0).r <= 0.0) continue;
-        imageStore(reflected, pixel, reflection(pixel));
-    }
-}
-#endif

@@ -63,6 +63,7 @@ void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
     SurfacePoint s = surface_point(texel);
+    enter_volume(s.position);
     bool reached = s.present && (is_in_lit_area(real_pixel(texel)) || volume_fade(volume_coordinate(s.position)) > 0.0
         || object_may_shadow(s.position, 0.0, true));
     if (!reached) leave(texel, s);

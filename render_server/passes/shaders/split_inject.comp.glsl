@@ -11,8 +11,9 @@
 #include "common/packing.glsl"
 #include "common/volume.glsl"
 #include "common/split_sums.glsl"
+#include "common/map_texels.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 64) in;
 layout(std430) buffer RealLight { int real_light[]; };         // per slot, below
 layout(std430) readonly buffer VirtualGrid { uint virtual_grid[]; };
 layout(std430) buffer VirtualLight { int virtual_light[]; };
@@ -65,11 +66,11 @@ vec3 virtual_albedo(ivec2 texel) {
     return mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
 }
 
+bool is_wanted(LightView view, ivec2 texel) { return first_depth(virtual_light_depth, view, texel) != NOTHING; }
+
 void split(Light light, LightView view, ivec2 texel) {
-    float depth = first_depth(virtual_light_depth, view, texel);
-    if (depth == NOTHING) return;
     vec2 s = texel_lateral(view, texel);
-    vec3 p = ray_point(view, s, depth);
+    vec3 p = ray_point(view, s, first_depth(virtual_light_depth, view, texel));
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;
     int slot = slot_near(VIRTUAL_SET, volume_coordinate(p));
@@ -81,12 +82,14 @@ void split(Light light, LightView view, ivec2 texel) {
     add_area(VIRTUAL_SET, slot, lit_area(light, view, s, p, n));
 }
 #else
-void split(Light light, LightView view, ivec2 texel) {
+bool is_wanted(LightView view, ivec2 texel) {
     float depth = first_depth(real_light_depth, view, texel);
-    if (depth == NOTHING) return;
+    return depth != NOTHING && inside_volume(volume_coordinate(ray_point(view, texel_lateral(view, texel), depth)));
+}
+
+void split(Light light, LightView view, ivec2 texel) {
     vec2 s = texel_lateral(view, texel);
-    vec3 p = ray_point(view, s, depth);
-    if (!inside_volume(volume_coordinate(p))) return;
+    vec3 p = ray_point(view, s, first_depth(real_light_depth, view, texel));
     int slot = slot_near(REAL_SET, volume_coordinate(p));
     if (slot < 0) return;
     Hit object = first_hit(virtual_light_depth, light.views.z, light.views.w, p);
@@ -100,6 +103,10 @@ void split(Light light, LightView view, ivec2 texel) {
 
 void main() {
     LightView view = light_views[view_index];
-    if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
-    split(lights[light_of_view(view_index)], view, ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy));
+    Light light = lights[light_of_view(view_index)];
+    uint i = next_wanted(view, first_item());
+    if (i < texels_of(view)) do {
+        split(light, view, map_texel(view, i));
+        i = next_wanted(view, i + items_apart());
+    } while (i < texels_of(view));
 }

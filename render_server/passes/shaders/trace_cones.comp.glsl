@@ -59,6 +59,7 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
 
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
+    enter_volume(s.position);
     vec3 q = volume_coordinate(s.position);
     vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
 #ifdef REAL
@@ -94,6 +95,7 @@ void trace(ivec2 texel) {
 
 // The texels that select_cone_texels or low_res_grid listed.
 void main() {
-    for (uint i = first_item(); i < listed_count(); i += items_apart())
-        trace(texel_of_index(texels[i], low_resolution_size.x));
+    uint i = first_item();
+    if (i < listed_count()) do trace(texel_of_index(texels[i], low_resolution_size.x));
+    while ((i += items_apart()) < listed_count());
 }

@@ -8,14 +8,14 @@
 #include "common/ray_mesh.glsl"
 #include "common/refraction.glsl"
 #include "common/lobe.glsl"
-#include "common/work_list.glsl"
+#include "common/shown_pixels.glsl"
+#include "common/walk.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) readonly uniform image2D reflected_radiance;   // of the objects
 layout(rgba16f) writeonly uniform image2D radiance_out;
 // An image, because OpenGL guarantees no more than eight storage blocks, and sixteen samplers.
 layout(rgba32f) readonly uniform image2D light_records;   // a row a light
-uniform sampler2D object_coverage;
 uniform float pixel_size;      // m at 1 m depth
 #include "common/camera.glsl"
 
@@ -156,17 +156,14 @@ vec3 transmitted(ivec2 pixel) {
     return sum / max(count, 1.0);
 }
 
-// The pixels of the texels that show an object.
+void shade(ivec2 pixel) {
+    vec4 own = imageLoad(reflected_radiance, pixel);
+    int shown = int(texelFetch(virtual_raster_normal, raster_texel(pixel), 0).w);
+    if (is_transparent(shown)) own.rgb += transmitted(pixel);
+    imageStore(radiance_out, pixel, own);
+}
+
 void main() {
-    ivec2 size = imageSize(radiance_out);
-    int grid_width = textureSize(sample_pixels, 0).x;
-    uint block = uint(scale * scale);
-    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
-        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
-        if (any(greaterThanEqual(pixel, size)) || texelFetch(object_coverage, pixel, 0).r <= 0.0) continue;
-        vec4 own = imageLoad(reflected_radiance, pixel);
-        int shown = int(texelFetch(virtual_raster_normal, raster_texel(pixel), 0).w);
-        if (is_transparent(shown)) own.rgb += transmitted(pixel);
-        imageStore(radiance_out, pixel, own);
-    }
+    uint i = first_item();
+    if (i < pixels_shown()) do shade(shown_pixel(i)); while ((i += items_apart()) < pixels_shown());
 }

@@ -6,7 +6,8 @@
 #include "common/geometry.glsl"
 #include "common/object_light.glsl"
 #include "common/shown_maps.glsl"
-#include "common/work_list.glsl"
+#include "common/shown_pixels.glsl"
+#include "common/walk.glsl"
 #include "common/caustics.glsl"
 
 layout(local_size_x = 64) in;
@@ -62,13 +63,7 @@ void shade(ivec2 pixel) {
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
 }
 
-// The pixels of the texels that show an object.
 void main() {
-    ivec2 size = textureSize(object_coverage, 0);
-    int grid_width = textureSize(sample_pixels, 0).x;
-    uint block = uint(scale * scale);
-    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
-        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
-        if (all(lessThan(pixel, size)) && texelFetch(object_coverage, pixel, 0).r > 0.0) shade(pixel);
-    }
+    uint i = first_item();
+    if (i < pixels_shown()) do shade(shown_pixel(i)); while ((i += items_apart()) < pixels_shown());
 }

@@ -22,30 +22,41 @@ vec4 facing_texel(ivec3 cell, vec3 d) {
     return sum;
 }
 
+// Shows the first voxel that the ray meets in this volume if it is nearer than `nearest` (m).
+void show_volume(ivec2 pixel, vec3 d, inout float nearest) {
+    vec3 q = volume_coordinate(camera_position);
+    vec2 within = box_interval(q, d, vec3(0.0), vec3(float(volume_size)));
+    if (within.x >= within.y || within.x * voxel_edge >= nearest) return;
+    vec3 inverse = 1.0 / (d + vec3(equal(d, vec3(0.0))) * 1e-9);
+    vec3 at = q + (within.x + 1e-3) * d;
+    ivec3 cell = ivec3(floor(at)), stride = ivec3(sign(d));
+    vec3 next = (vec3(cell) + max(vec3(stride), 0.0) - q) * inverse;
+    int axis = 2;
+    float t = within.x;
+    for (int i = 0; i < 3 * volume_size; ++i) {
+        if (any(lessThan(cell, ivec3(0))) || any(greaterThanEqual(cell, ivec3(volume_size)))) return;
+        vec4 c = facing_texel(cell, d);
+        if (c.a > VISIBLE_COVERAGE) {
+            if (t * voxel_edge < nearest)
+                imageStore(code_out, pixel, srgb(c.rgb / c.a * (1.0 - 0.12 * float(axis))));
+            nearest = min(nearest, t * voxel_edge);
+            return;
+        }
+        axis = next.x < next.y ? (next.x < next.z ? 0 : 2) : (next.y < next.z ? 1 : 2);
+        t = next[axis];
+        cell[axis] += stride[axis];
+        next[axis] += abs(inverse[axis]);
+    }
+}
+
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(pixel, textureSize(picture, 0)))) return;
     imageStore(code_out, pixel, uvec4(texelFetch(picture, pixel, 0).rgb / 4u, 255u));
     vec3 d = normalize(mat3(world_from_camera) * vec3(texelFetch(picture_rays, pixel, 0).xy, 1.0));
-    vec3 q = volume_coordinate(camera_position);
-    vec3 inverse = 1.0 / (d + vec3(equal(d, vec3(0.0))) * 1e-9);
-    vec3 t0 = -q * inverse, t1 = (float(volume_size) - q) * inverse;
-    float enter = max(max(min(t0.x, t1.x), min(t0.y, t1.y)), max(min(t0.z, t1.z), 0.0));
-    float leave = min(max(t0.x, t1.x), min(max(t0.y, t1.y), max(t0.z, t1.z)));
-    if (enter >= leave) return;
-    vec3 at = q + (enter + 1e-3) * d;
-    ivec3 cell = ivec3(floor(at)), stride = ivec3(sign(d));
-    vec3 next = (vec3(cell) + max(vec3(stride), 0.0) - q) * inverse;
-    int axis = 2;
-    for (int i = 0; i < 3 * volume_size; ++i) {
-        if (any(lessThan(cell, ivec3(0))) || any(greaterThanEqual(cell, ivec3(volume_size)))) return;
-        vec4 c = facing_texel(cell, d);
-        if (c.a > VISIBLE_COVERAGE) {
-            imageStore(code_out, pixel, srgb(c.rgb / c.a * (1.0 - 0.12 * float(axis))));
-            return;
-        }
-        axis = next.x < next.y ? (next.x < next.z ? 0 : 2) : (next.y < next.z ? 1 : 2);
-        cell[axis] += stride[axis];
-        next[axis] += abs(inverse[axis]);
+    float nearest = 1e30;
+    for (int shown = 0; shown < volume_count; ++shown) {
+        work_in_volume(shown);
+        show_volume(pixel, d, nearest);
     }
 }

@@ -6,6 +6,7 @@
 
 layout(local_size_x = 64) in;
 uniform int triangle_count;
+uniform int filled_volume;
 
 const float SLACK = 1e-3;   // relative, and in voxels: more than rounding
 
@@ -17,6 +18,7 @@ void append(uint triangle, ivec3 voxel) {
 void main() {
     uint i = gl_GlobalInvocationID.x;
     if (i >= uint(triangle_count)) return;
+    work_in_volume(filled_volume);
     Triangle t = triangles[i];
     vec3 a = volume_coordinate(corner_position(t.corners[0]));
     vec3 b = volume_coordinate(corner_position(t.corners[1]));

@@ -11,6 +11,7 @@
 #include "common/voxel_pairs.glsl"
 
 layout(local_size_x = 64) in;
+uniform int filled_volume;
 
 // A half plane of the piece's plane, seen along the axis nearest to its normal: dot(xy, p) + z >= 0, xy of length 1.
 const int LINES = 9;                           // three edges, and six faces of the voxel
@@ -104,7 +105,7 @@ void emit(Triangle t, vec4 piece, ivec3 voxel, vec3 a, vec3 b, vec3 c, vec3 n) {
     if (piece.w < 1e-9) return;
     uint index = atomicAdd(surfel_count, 1u);
     if (index >= uint(surfels.length())) return;
-    uint v = voxel_index(voxel, volume_size);
+    uint v = voxel_index(voxel + ivec3(0, 0, volume * volume_size), volume_size);
     touch(v);
     surfels[index].position_area =
         vec4(volume_origin + piece.xyz * voxel_edge, piece.w * voxel_edge * voxel_edge);
@@ -132,6 +133,7 @@ void clip_to_voxel(uvec2 pair) {
 }
 
 void main() {
+    work_in_volume(filled_volume);
     uint count = min(pair_count, uint(pairs.length()));
     for (uint i = first_item(); i < count; i += items_apart()) clip_to_voxel(pairs[i]);
 }

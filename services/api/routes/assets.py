@@ -54,7 +54,7 @@ async def upload_asset(
     response: Response,
     name: Annotated[str, Query(max_length=1000, description="Name of the file.", examples=["chair.glb"])],
 ) -> AssetAnswer:
-    """Upload a mesh or an environment map as the body of the request; 200 where the same content is there already.
+    """Upload a mesh, map or precomputed material as the body of the request; 200 where the content is there already.
 
     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
     A .zip of one glTF and its files is kept as one .glb.
@@ -96,7 +96,7 @@ def download_asset(shared: Shared, digest: Digest) -> StoredFileResponse:
 @router.get("/{digest}/thumbnail.png", response_class=StoredFileResponse, responses=responses(404, 422) | PNG)
 @in_pool("thumbnails")
 def thumbnail(shared: Shared, digest: Digest) -> StoredFileResponse:
-    """Return a picture of a mesh or map, 256 x 256 pixels on a transparent ground."""
+    """Return a picture of a mesh, map or material, 256 x 256 pixels on a transparent ground."""
     path = shared.store.assets.thumbnail(digest.removeprefix(DIGEST_PREFIX))
     return StoredFileResponse(path, media_type="image/png", headers=UNCHANGING)
 

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, Query, Request, Response, WebSocket, WebSocketDisconnect
@@ -26,10 +27,11 @@ from deltalight.services.storage.faults import NotFoundError
 PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
 VIEW_TIMEOUT_S = 10.0  # the same, and its shaders' compilation
 POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
+CLOSE_REASON_BYTES = 123  # (5.5)
 ORDERS_PER_S, ORDERS_AT_ONCE = 10.0, 40  # changes of view and codec by one viewer, which are work for all
 BOUNDARY = "frame"
 CODECS: dict[str, LiveCodec] = {"jpeg": "jpeg", "h264": "h264"}
-_TOO_MANY_ORDERS = "change view and codec less often"
+_TOO_MANY_ORDERS = "change view, camera and codec less often"
 UNKNOWN_CODEC = f"there is no such codec; ask for one of {', '.join(CODECS)}"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 NO_ANSWER = "The render server does not answer, or (with Retry-After) too many requests wait for it."
@@ -37,6 +39,10 @@ JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": 
 
 WantedView = Annotated[
     ShownView | None, Query(description="What to look at; without, the scene's own `output.view`.")
+]
+WantedCamera = Annotated[
+    str | None,
+    Query(max_length=64, description="Whose picture, by its node's name; without, the first camera's."),
 ]
 _VIEW: TypeAdapter[ShownView | None] = TypeAdapter(ShownView | None)
 
@@ -75,6 +81,9 @@ class Pixel(BaseModel):
         max_length=200,
         description="Id of an object to look through, at the real scene behind it: one that is being dragged.",
     )
+    camera: str | None = Field(
+        None, max_length=64, description="Whose picture, by its node's name; null = the first camera's."
+    )
 
 
 class FisheyeAnswer(BaseModel):
@@ -95,35 +104,53 @@ def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
 
 
 @live_router.websocket("/live")
-async def live(socket: WebSocket, shared: Shared, view: WantedView = None, codec: str = "jpeg") -> None:
+async def live(
+    socket: WebSocket,
+    shared: Shared,
+    view: WantedView = None,
+    codec: str = "jpeg",
+    camera: WantedCamera = None,
+) -> None:
     """Send the newest frame whenever this viewer acknowledged enough; others are not affected."""
     await socket.accept()
-    if codec not in CODECS:
-        await socket.close(POLICY_VIOLATION, UNKNOWN_CODEC)
+    refusal = "" if codec in CODECS else UNKNOWN_CODEC
+    refusal = refusal or _why_not(shared.live, camera)
+    if refusal:
+        await socket.close(POLICY_VIOLATION, refusal)
         return
     under_way = _UnderWay()
-    with shared.live.viewer(view, CODECS[codec]) as viewer:
+    with shared.live.viewer(view, CODECS[codec], camera) as viewer:
         await _first_of(_send_frames(socket, viewer, under_way), _take_messages(socket, viewer, under_way))
 
 
 @live_router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description cannot express
-async def live_mjpeg(shared: Shared, view: WantedView = None) -> StreamingResponse:
+async def live_mjpeg(
+    shared: Shared, view: WantedView = None, camera: WantedCamera = None
+) -> StreamingResponse:
     """The newest frames as one endless multipart answer, for pictures in pages."""
+    shared.live.require(camera)
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
-    return StreamingResponse(_mjpeg(shared.live, view), media_type=media_type, headers=PICTURE_HEADERS)
+    return StreamingResponse(
+        _mjpeg(shared.live, view, camera), media_type=media_type, headers=PICTURE_HEADERS
+    )
 
 
 @live_router.get(
     "/live.jpg",
     response_class=Response,
-    responses={**unavailable("No picture has come from the render server yet."), **JPEG_ANSWER},
+    responses={
+        **responses(404),
+        **unavailable("No picture has come from the render server yet."),
+        **JPEG_ANSWER,
+    },
 )
-async def live_picture(shared: Shared, view: WantedView = None) -> Response:
+async def live_picture(shared: Shared, view: WantedView = None, camera: WantedCamera = None) -> Response:
     """Return the newest composite; with `view`, the next one, in that view."""
-    frame = shared.live.newest
+    shared.live.require(camera)
+    frame = shared.live.newest_of(camera)
     if frame is None:
         raise ProblemError(503, "no-picture", "No picture has come from the render server yet; see /state.")
-    jpeg = frame.picture(None).jpeg if view is None else await _next_in(shared.live, view)
+    jpeg = frame.picture(None).jpeg if view is None else await _next_in(shared.live, view, camera)
     return Response(jpeg, media_type="image/jpeg", headers=PICTURE_HEADERS)
 
 
@@ -132,16 +159,28 @@ async def live_picture(shared: Shared, view: WantedView = None) -> Response:
 )
 def poster(shared: Shared) -> StoredFileResponse:
     """Return the still that stands for the live picture until it comes; `/settings` says whether there is one."""
-    path = shared.store.poster
+    return _still(shared.store.poster)
+
+
+@live_router.get(
+    "/poster-before.jpg", response_class=StoredFileResponse, responses={**responses(404), **JPEG_ANSWER}
+)
+def poster_before(shared: Shared) -> StoredFileResponse:
+    """Return the camera's own picture of the poster's frame; `/settings` says whether there is one."""
+    return _still(shared.store.poster_before)
+
+
+def _still(path: Path) -> StoredFileResponse:
     if not path.is_file():
         raise NotFoundError("there is no poster; wait for the live picture.")
     return StoredFileResponse(path, media_type="image/jpeg", headers=PICTURE_HEADERS)
 
 
-@live_router.post("/live/pick", responses={**responses(400), **unavailable(NO_ANSWER)})
+@live_router.post("/live/pick", responses={**responses(400, 404), **unavailable(NO_ANSWER)})
 @in_pool("render server")
 def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 200}])]) -> Pick:
     """Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on."""
+    shared.live.require(pixel.camera)
     payload = pixel.model_dump(exclude_none=True)
     return Pick.model_validate(shared.link.command("pick", payload, PICK_TIMEOUT_S))
 
@@ -230,12 +269,15 @@ async def _send_frames(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) 
 
 
 async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) -> None:
-    """Take acknowledgements, `view NAME` for another view (`view` alone: the scene's own), and `codec NAME`."""
+    """Take acknowledgements, and what the viewer orders: `view NAME`, `camera NAME`, `codec NAME`.
+
+    `view` alone is the scene's own, `camera` alone the first one.
+    """
     orders = RateLimit(ORDERS_PER_S, ORDERS_AT_ONCE)
     try:
         while True:
             text = await socket.receive_text()
-            if not text.startswith(("view", "codec")):
+            if not text.startswith(("view", "camera", "codec")):
                 under_way.acknowledge()
                 continue
             refusal = _TOO_MANY_ORDERS if orders.wait_s("") > 0 else _obey(viewer, text)
@@ -250,7 +292,7 @@ async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay
 
 
 def _obey(viewer: Viewer, order: str) -> str:
-    """Show a viewer another view, or in another codec; return why not, else nothing.
+    """Show a viewer another view or camera, or in another codec; return why not, else nothing.
 
     Raises:
         ValueError: there is no such view.
@@ -258,6 +300,12 @@ def _obey(viewer: Viewer, order: str) -> str:
     if order.startswith("view"):
         viewer.look_at(_VIEW.validate_python(order.removeprefix("view").strip() or None))
         return ""
+    if order.startswith("camera"):
+        camera = order.removeprefix("camera").strip() or None
+        refusal = _why_not(viewer.hub, camera)
+        if not refusal:
+            viewer.turn_to(camera)
+        return refusal
     codec = CODECS.get(order.removeprefix("codec").strip())
     if codec is None:
         return UNKNOWN_CODEC
@@ -265,13 +313,22 @@ def _obey(viewer: Viewer, order: str) -> str:
     return ""
 
 
-async def _next_in(hub: LiveHub, view: ShownView) -> bytes:
-    """Return the next picture in a view.
+def _why_not(hub: LiveHub, camera: str | None) -> str:
+    """Return why a camera cannot be watched, in as many bytes as fit the close of a WebSocket; else nothing."""
+    try:
+        hub.require(camera)
+    except NotFoundError as fault:
+        return str(fault).encode()[:CLOSE_REASON_BYTES].decode(errors="ignore")
+    return ""
+
+
+async def _next_in(hub: LiveHub, view: ShownView, camera: str | None) -> bytes:
+    """Return a camera's next picture in a view.
 
     Raises:
         ProblemError: none came in time.
     """
-    with hub.viewer(view) as viewer:
+    with hub.viewer(view, camera=camera) as viewer:
         try:
             async with asyncio.timeout(VIEW_TIMEOUT_S):
                 while (frame := await viewer.next()) is not None:
@@ -282,8 +339,8 @@ async def _next_in(hub: LiveHub, view: ShownView) -> bytes:
     raise ProblemError(503, "no-picture", f"No picture in the view {view} has come; see /state.")
 
 
-async def _mjpeg(hub: LiveHub, view: ShownView | None) -> AsyncIterator[bytes]:
-    with hub.viewer(view) as viewer:
+async def _mjpeg(hub: LiveHub, view: ShownView | None, camera: str | None) -> AsyncIterator[bytes]:
+    with hub.viewer(view, camera=camera) as viewer:
         while (frame := await viewer.next()) is not None:
             yield _part(frame.picture(view).jpeg)
 

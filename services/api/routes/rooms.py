@@ -21,7 +21,7 @@ from deltalight.services.rooms.directory import (
     DirectoryClient,
     SilentDirectoryError,
 )
-from deltalight.services.rooms.status import RoomList, RoomState, RoomStatus, SlotStatus
+from deltalight.services.rooms.status import HOST_PATTERN, RoomList, RoomState, RoomStatus, SlotStatus
 from deltalight.services.storage.faults import ConflictError, NotFoundError
 
 router = APIRouter(tags=["rooms"])
@@ -93,7 +93,7 @@ async def _rooms(connection: HTTPConnection) -> Rooms:
 AllRooms = Annotated[Rooms, Depends(_rooms)]
 HostName = Annotated[
     str,
-    Path(description="The host's `name`.", pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,252}$", examples=["local"]),
+    Path(description="The host's `name`.", pattern=HOST_PATTERN, examples=["local"]),
 ]
 RoomName = Annotated[str, Path(description="The room's `name`.", pattern=NAME_PATTERN, examples=["room"])]
 

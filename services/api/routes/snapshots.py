@@ -69,6 +69,9 @@ class NewSnapshot(StrictModel):
         fail_fast=True,
         description="All of one and the same frame.",
     )
+    camera: Name | None = Field(
+        default=None, description="Whose frame, by its node's name; null = the first camera's."
+    )
     exr: StrictBool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
 
     @model_validator(mode="after")
@@ -85,7 +88,7 @@ def list_snapshots(shared: Shared) -> list[SnapshotFacts]:
     return shared.snapshots.all()
 
 
-@router.post("", status_code=201, responses={**responses(409, 422, 502), **unavailable(NO_ANSWER)})
+@router.post("", status_code=201, responses={**responses(404, 409, 422, 502), **unavailable(NO_ANSWER)})
 @in_pool("render server")
 def take_snapshot(
     shared: Shared,
@@ -98,6 +101,7 @@ def take_snapshot(
 ) -> SnapshotFacts:
     """Render the newest frame as each picture says, and keep the files."""
     order = checked(NewSnapshot, wanted, "the snapshot")
+    shared.live.require(order.camera)
     taken = shared.snapshots.add(lambda name, folder: _taken(shared, name, folder, order))
     response.headers["Location"] = f"/api/v1/snapshots/{taken.id}"
     shared.events.publish("snapshot", taken.model_dump())
@@ -162,6 +166,8 @@ def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) ->
     active = shared.store.scenes.active()
     pictures = [picture.model_dump(mode="json") for picture in wanted.pictures]
     order: dict[str, object] = {"folder": str(folder), "pictures": pictures, "exr": wanted.exr}
+    if wanted.camera is not None:
+        order["camera"] = wanted.camera
     answer: dict[str, Any] = shared.link.command("snapshot", order, TIMEOUT_S)
     files, faults = files_of(answer, folder)
     if not files:

@@ -7,9 +7,11 @@ from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
 from deltalight import __version__
+from deltalight.protocol.messages import CameraEntry, CameraStatus
 from deltalight.services.api.camera_finder import CamerasAnswer
 from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.live_frame import LiveFrame
+from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.live_video import LiveCodec
 from deltalight.services.api.metrics import MEDIA_TYPE
 from deltalight.services.api.models import PictureState, ProcessAnswer
@@ -44,11 +46,27 @@ class Health(BaseModel):
     version: str
 
 
+class CameraState(BaseModel):
+    """A camera whose pictures the render server makes, and its newest picture here."""
+
+    name: str = Field(description="Its node's.")
+    status: CameraStatus = Field(
+        description="`live`, or why it is left out: it is `silent`, sees `other_board` than the first one, or its "
+        "frames are of `other_time`."
+    )
+    frame_id: int | None = Field(description="Of its newest picture.")
+    last_frame_s: float | None = Field(description="Seconds since that came.")
+    frames_per_s: float | None
+
+
 class State(BaseModel):
     """How the render server and the nodes are doing."""
 
     render_server: Literal["answers", "silent"]
     picture: PictureState | None = Field(description="What became of the active scene's newest revision.")
+    cameras: list[CameraState] = Field(
+        description="The room's, in the order of their first frames: names for `camera` of other routes."
+    )
     has_fisheye: bool = Field(description="Whether light of a fish-eye camera has come.")
     processes: list[ProcessAnswer] = Field(description="Nodes and render server, as they report each second.")
     refused: dict[str, int] = Field(description="Requests refused since the start, by kind of problem.")
@@ -62,6 +80,7 @@ class Settings(BaseModel):
     upload_limit_bytes: int
     requests_per_s: float
     has_poster: bool = Field(description="Whether `/poster.jpg` stands for the live picture until it comes.")
+    has_poster_before: bool = Field(description="Whether `/poster-before.jpg` is the camera's picture of it.")
     live_codecs: list[LiveCodec] = Field(description="What `WS /live` sends pictures as, for the asking.")
     no_h264: str | None = Field(description="Why `h264` is not among them; null where it is.")
     no_whep: str | None = Field(description="Why `POST /whep` gives no pictures; null where it does.")
@@ -117,6 +136,7 @@ def state(shared: Shared) -> State:
     return State(
         render_server=_server(shared),
         picture=None if delivery is None else PictureState.of(delivery),
+        cameras=[_camera(shared.live, each) for each in shared.live.cameras],
         has_fisheye=shared.fisheye.newest is not None,
         processes=[ProcessAnswer.of(report) for report in shared.watch.reports()],
         refused=dict(shared.problems.counts),
@@ -138,6 +158,7 @@ def settings(shared: Shared) -> Settings:
         upload_limit_bytes=shared.settings.upload_limit_mb << 20,
         requests_per_s=shared.settings.requests_per_s,
         has_poster=shared.store.poster.is_file(),
+        has_poster_before=shared.store.poster_before.is_file(),
         live_codecs=["jpeg", "h264"] if shared.live.video.why_not is None else ["jpeg"],
         no_h264=shared.live.video.why_not,
         no_whep=shared.whep.why_not,
@@ -148,7 +169,7 @@ def settings(shared: Shared) -> Settings:
 def list_nodes(shared: Shared) -> list[NodeAnswer]:
     """List the nodes and render servers that are heard: state, rates, losses, clock, delays."""
     frame = shared.live.newest
-    server = shared.server_name if frame is None else frame.message.node
+    server = shared.server_name if frame is None else shared.live.server_of(frame.message)
     return [_node(report, frame, server) for report in shared.watch.reports()]
 
 
@@ -157,6 +178,18 @@ def list_nodes(shared: Shared) -> list[NodeAnswer]:
 def list_cameras(shared: Shared) -> CamerasAnswer:
     """List the cameras that are attached to this host, and what keeps others from being found."""
     return shared.cameras.find()
+
+
+def _camera(hub: LiveHub, camera: CameraEntry) -> CameraState:
+    frame = hub.newest_of(camera.node)
+    _, since_s = hub.state(camera.node)
+    return CameraState(
+        name=camera.node,
+        status=camera.status,
+        frame_id=None if frame is None else frame.message.frame_id,
+        last_frame_s=None if since_s is None else round(since_s, 3),
+        frames_per_s=hub.frames_per_s(camera.node),
+    )
 
 
 def _stream(shared: Shared) -> StreamState:

@@ -8,8 +8,8 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.services.api.context import Shared
 from deltalight.services.api.credentials import principal_of
 from deltalight.services.api.problems import ProblemError, responses, unavailable
-from deltalight.services.api.routes.live import WantedView
-from deltalight.services.api.whep import Watcher
+from deltalight.services.api.routes.live import WantedCamera, WantedView
+from deltalight.services.api.whep import Look, Watcher
 
 router = APIRouter(tags=["live"])
 ROUTERS = (router,)
@@ -34,17 +34,21 @@ SessionId = Annotated[str, Path(pattern="^[A-Za-z0-9_-]{1,64}$", description="Fr
     status_code=201,
     response_class=Response,
     openapi_extra=SDP_BODY,
-    responses={**responses(415), **unavailable("There is no WHEP here (extra `whep`)."), **SDP_ANSWER},
+    responses={**responses(404, 415), **unavailable("There is no WHEP here (extra `whep`)."), **SDP_ANSWER},
 )
-async def open_whep(shared: Shared, request: Request, view: WantedView = None) -> Response:
+async def open_whep(
+    shared: Shared, request: Request, view: WantedView = None, camera: WantedCamera = None
+) -> Response:
     """Watch the live picture by WebRTC (WHEP): the body is an SDP offer, the response its answer.
 
     Pictures come as H.264, without sound. A ticket lets in here too.
     """
+    shared.live.require(camera)
     client = request.client.host if request.client else ""
     watcher = Watcher(client, principal_of(request.scope).token_id)
     try:
-        session_id, answer = await shared.whep.open(shared.live, view, await _offer(request), watcher)
+        look = Look(view, camera)
+        session_id, answer = await shared.whep.open(shared.live, look, await _offer(request), watcher)
     except DeltalightError as fault:
         raise ProblemError(400, "sdp", str(fault)) from fault
     headers = {"Location": f"{request.app.url_path_for('open_whep')}/{session_id}"}

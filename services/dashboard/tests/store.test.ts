@@ -53,6 +53,17 @@ describe("changes", () => {
     expect(merged(target, { pose: null })).toEqual({ pose: null, name: "a" });
   });
 
+  it("to another kind of material replace it, as in the service", () => {
+    const { document } = answer("a", 1);
+    const target = objectTarget("knot");
+    const rough = { roughness: 0.5 };
+    const painted = target.apply(target.apply(document, { material: rough }), {
+      material: { precomputed: "sha256:1" },
+    });
+    expect(painted.objects[0]?.material).toEqual({ precomputed: "sha256:1" });
+    expect(target.apply(painted, { material: rough }).objects[0]?.material).toEqual(rough);
+  });
+
   it("reach only what they name", () => {
     const { document } = answer("a", 1);
     const moved = objectTarget("knot").apply(document, { pose: { scale: 2 } });

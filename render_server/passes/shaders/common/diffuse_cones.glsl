@@ -27,8 +27,23 @@ bool may_differ(vec3 q, vec3 d, float ratio, vec4 ball) {
 }
 
 vec4 ball_around_support() {
-    vec3 low = vec3(support[0], support[1], support[2]), high = vec3(-support[3], -support[4], -support[5]) + 1.0;
+    int held = 6 * volume;
+    vec3 low = vec3(support[held], support[held + 1], support[held + 2]);
+    vec3 high = vec3(-support[held + 3], -support[held + 4], -support[held + 5]) + 1.0;
     return vec4(0.5 * (low + high), 0.5 * length(high - low) + 3.0);   // the first samples lie a cell off the axis
+}
+
+// Whether a cone from q may meet a change in any volume. `ball`: of this one.
+bool may_meet_change(vec3 q, vec3 d, float ratio, vec4 ball) {
+    bool meets = may_differ(q, d, ratio, ball);
+#ifdef SEVERAL_VOLUMES
+    int home = volume;
+    vec3 from = volume_origin + q * voxel_edge;
+    for (volume = 0; volume < volume_count; ++volume)
+        meets = meets || may_differ(volume_coordinate(from), d, ratio, ball_around_support());
+    volume = home;
+#endif
+    return meets;
 }
 
 // Change of the irradiance by the objects. Lanes of a processor walk through their own lists of cones that meet any.
@@ -40,14 +55,14 @@ vec3 diffuse_change(vec3 q, vec3 n, ConeSet set) {
     for (int first = 0; first < cone_count; first += 32) {
         uint met = 0u;
         for (int k = first; k < min(first + 32, cone_count); ++k)
-            if (may_differ(q, basis * cone_direction(k, set), ratio, ball)) met |= 1u << (k - first);
-        while (met != 0u) {
+            if (may_meet_change(q, basis * cone_direction(k, set), ratio, ball)) met |= 1u << (k - first);
+        if (met != 0u) do {
             int k = findLSB(met);
             met &= met - 1u;
             vec3 d = basis * cone_direction(first + k, set);
             March m = march(q, d, ratio, false);
             change += m.c_rho - m.c_mu + (m.t_rho - m.t_mu) * environment(d, half_angle);
-        }
+        } while (met != 0u);
     }
     return change * PI / float(cone_count);
 }
@@ -60,13 +75,14 @@ void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3
     mat3 basis = basis_around(n);
     e_mu = vec3(0.0);
     e_rho = vec3(0.0);
-    for (int k = 0; k < cone_count; ++k) {
+    int k = 0;
+    do {   // a loop that tests at its end: march.glsl
         vec3 d = basis * cone_direction(k, set);
         March m = march(q, d, set.width * ratio, only_rho);
         vec3 r = environment(d, half_angle);
         e_mu += m.c_mu + m.t_mu * r;
         e_rho += m.c_rho + m.t_rho * r;
-    }
+    } while (++k < cone_count);
     e_mu *= PI / float(cone_count);
     e_rho *= PI / float(cone_count);
 }

@@ -15,7 +15,8 @@ void main() {
     uint count = surfels_held();
     for (uint i = first_item(); i < count; i += items_apart()) {
         Surfel s = surfels[i];
-        inject_side(s, s.normal_material.xyz);
-        if (s.uv_voxel.w > 0.5) inject_side(s, -s.normal_material.xyz);
+        int sides = s.uv_voxel.w > 0.5 ? 2 : 1;   // a loop: software renderers would run a branch for all
+        for (int side = 0; side < sides; ++side)
+            inject_side(s, side == 0 ? s.normal_material.xyz : -s.normal_material.xyz);
     }
 }

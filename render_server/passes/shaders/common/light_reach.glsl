@@ -12,8 +12,8 @@ uniform float noise_sigma;   // m at 1 m
 // Of a point, and of any point in a sphere around it; `bias`: m, the least of all points.
 #ifdef SHADOW_CONES
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
-bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return true; }
-#elif defined(REAL_SHADOWS)
+bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return object_meets_cone_of_sphere(p, radius); }
+#elif defined(REAL_SHADOWS) || defined(SPARED)
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return false; }
 bool shadow_may_reach_sphere(vec3 p, float radius, float bias) { return false; }
 #else
@@ -27,8 +27,7 @@ float shadow_bias(float depth) { return 3.0 * noise_sigma * depth * depth; }
 bool cones_may_reach(vec4 position, vec3 normal) {
     vec3 away = normalize(camera_position - position.xyz);
     float margin_m = 2.0 * sample_distance * position.w / max(dot(normal, away), 0.1);
-    vec3 place = position.xyz - volume_origin + margin_m;
-    return inside_cube(place, float(volume_size) * voxel_edge + 2.0 * margin_m);
+    return near_volume(position.xyz, margin_m);
 }
 
 // Whether cones or shadows of the objects reach the real surface of a pixel.

@@ -161,7 +161,8 @@ int view_containing(int first, int count, vec3 p) {
 }
 
 // Every loop over a light's samples appears twice, once for discs and once for squares, with no iterations for the
-// other kind: llvmpipe leaves a loop early, but executes both sides of a branch.
+// other kind: llvmpipe leaves a loop early, but executes both sides of a branch. Loops test at their end, because it runs
+// the body of those that test at their beginning once more, for no lane.
 
 struct Blocking { float sum; float hits; float deepest; };   // depths
 
@@ -169,7 +170,8 @@ void add_blockers(bool square, sampler2D map, Spread k, LightView view, Receiver
     k.square = square;
     float gap = drift(view, r.depth, view.range.x);
     float margin = view.tile.w / view.tile.z;   // half a texel
-    for (int j = 0; j < count; ++j) {
+    int j = 0;
+    if (count > 0) do {
         vec2 unit = light_sample(k, j, count);
         vec2 offset = count == 1 ? vec2(0.0) : shift_to(k, gap, norm_of(k, unit) * unit);
         vec2 t = tile_texel(view, r.s + offset);
@@ -177,7 +179,7 @@ void add_blockers(bool square, sampler2D map, Spread k, LightView view, Receiver
         float d = first_depth(map, view, ivec2(t));
         if (d >= r.depth - r.bias || !within(k, drift(view, r.depth, d), offset, margin)) continue;
         found = Blocking(found.sum + d, found.hits + 1.0, max(found.deepest, d));
-    }
+    } while (++j < count);
 }
 
 // Mean and greatest depth of the blockers of the light's area in one map; NOTHING if there are none. Only blockers
@@ -248,7 +250,8 @@ float texels_to_caster(LightView view, vec2 s) {
 // Whether a virtual object can stand between p and any part of a light; `in_box`: or anything that fills their map.
 bool object_may_block(Light light, vec3 p, float bias, bool in_box) {
     bool found = false;
-    for (int j = light.views.z; j < light.views.z + light.views.w && !found; ++j) {
+    int j = light.views.z, end = light.views.z + light.views.w;
+    if (j < end) do {
         LightView view = light_views[j];
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
         if (v.z - bias <= view.range.x) continue;
@@ -257,7 +260,7 @@ bool object_may_block(Light light, vec3 p, float bias, bool in_box) {
         float texel = 2.0 * view.tile.w / view.tile.z, reach = k.widest * drift(view, v.z, view.range.x);
         found = in_box ? all(lessThanEqual(abs(s), vec2(view.tile.w + reach)))
                        : texels_to_caster(view, s) <= reach * (k.square ? sqrt(2.0) : 1.0) / texel + COMPARED_TEXELS;
-    }
+    } while (++j < end && !found);
     return found;
 }
 
@@ -274,7 +277,8 @@ bool object_may_shadow(vec3 p, float bias, bool in_box) {
 // may differ by two of their diagonals more than its points are apart.
 bool object_may_block_sphere(Light light, vec3 p, float radius, float bias) {
     bool found = false;
-    for (int j = light.views.z; j < light.views.z + light.views.w && !found; ++j) {
+    int j = light.views.z, end = light.views.z + light.views.w;
+    if (j < end) do {
         LightView view = light_views[j];
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
         float deepest = v.z + radius, nearest = v.z - radius;
@@ -285,7 +289,7 @@ bool object_may_block_sphere(Light light, vec3 p, float radius, float bias) {
         float texel = 2.0 * view.tile.w / view.tile.z, reach = light.shape.x * drift(view, deepest, view.range.x);
         found = (!straight && nearest <= 0.0)
             || texels_to_caster(view, s) <= (reach + apart) / texel + COMPARED_TEXELS + 2.0 * sqrt(2.0) * CASTER_CELL;
-    }
+    } while (++j < end && !found);
     return found;
 }
 
@@ -316,14 +320,15 @@ void add_samples(
     bool square, Light light, Spread k, Occluder real, Occluder object, vec3 p, vec3 n, int count, inout vec3 sum
 ) {
     k.square = real.spread.square = object.spread.square = square;
-    for (int j = 0; j < count; ++j) {
+    int j = 0;
+    if (count > 0) do {
         vec2 offset = light_sample(k, j, count);
         float w = sample_weight(light, k, p, n, offset);
         float v = real.present ? passes(real_light_depth, real, offset) : 1.0;
         sum.xz += w * vec2(v, 1.0);
         if (object.present && v > 0.0) v *= passes(virtual_light_depth, object, offset);
         sum.y += w * v;
-    }
+    } while (++j < count);
 }
 
 vec2 visible_fraction(Light light, Occluder real, Occluder object, vec3 p, vec3 n) {

@@ -43,6 +43,7 @@ vec4 shown_at(ScreenHit hit, float spread) {
 // Radiance of all that a cone may meet, objects too, at the resolution of the voxels; `open`: the fraction that meets nothing.
 vec3 look_in_voxels(vec3 from, vec3 d, float spread, out float open) {
     bool differs;
+    enter_volume(from);
     Crossed met = march_one(mipmap_rho, volume_coordinate(from), d, spread, differs);
     open = 1.0 - blocked_fraction(met.coverage);
     return met.c + open * environment(d, atan(0.5 * spread));

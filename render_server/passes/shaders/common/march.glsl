@@ -18,7 +18,7 @@ layout(std140) uniform FarVolume {
     int far_levels;
 };
 layout(std430) readonly buffer OccupiedFar { uint occupied_far[]; };   // as Occupied, of mipmap_far
-layout(std430) readonly buffer Support { int support[6]; };   // voxels where mu and rho differ: min, -max
+layout(std430) readonly buffer Support { int support[]; };   // of each volume, voxels where mu and rho differ: min, -max
 
 // A wall's summed coverage scatters about 1 with its slant and position on the grid (2/3..4/3 at 45 degrees) and with
 // changes of level and other walls (down to 1/2). Below, the sum is the covered fraction of the cone.
@@ -92,11 +92,11 @@ void advance(inout Walk w, float ratio, float before, int levels) {
 
 #ifdef ISOTROPIC_VOXELS
 // One radiance and one opacity for all directions: the sum of all six, with the opacity of the densest direction.
-vec4 directional_sample(sampler3D mipmap, int n, vec3 q, Walk w) {
+vec4 directional_sample(sampler3D mipmap, int first, int n, vec3 q, Walk w) {
     vec4 sum = vec4(0.0);
     float most = 0.0;
     for (int k = 0; k < 6; ++k) {
-        vec4 cell = volume_sample(mipmap, n, q, w.level, k);
+        vec4 cell = volume_sample(mipmap, first, n, q, w.level, k);
         sum += cell;
         most = max(most, cell.a);
     }
@@ -107,18 +107,18 @@ vec4 directional_sample(sampler3D mipmap, int n, vec3 q, Walk w) {
 // and away from the ray along each axis. The net area n.d is exact; a closed lump adds, on the side that the ray
 // sees, at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a plane: no surface
 // occludes itself).
-vec4 directional_sample(sampler3D mipmap, int n, vec3 q, Walk w) {
-    vec4 x = volume_sample(mipmap, n, q, w.level, w.facing.x);
-    vec4 y = volume_sample(mipmap, n, q, w.level, w.facing.y);
-    vec4 z = volume_sample(mipmap, n, q, w.level, w.facing.z);
+vec4 directional_sample(sampler3D mipmap, int first, int n, vec3 q, Walk w) {
+    vec4 x = volume_sample(mipmap, first, n, q, w.level, w.facing.x);
+    vec4 y = volume_sample(mipmap, first, n, q, w.level, w.facing.y);
+    vec4 z = volume_sample(mipmap, first, n, q, w.level, w.facing.z);
     vec3 weights = abs(w.slope);
     vec4 most = weights.x * x + weights.y * y + weights.z * z;
     if (most.a <= 0.0) return vec4(0.0);
     vec3 f = vec3(x.a, y.a, z.a);
     vec3 b = vec3(
-        volume_sample(mipmap, n, q, w.level, w.facing.x ^ 1).a,
-        volume_sample(mipmap, n, q, w.level, w.facing.y ^ 1).a,
-        volume_sample(mipmap, n, q, w.level, w.facing.z ^ 1).a);
+        volume_sample(mipmap, first, n, q, w.level, w.facing.x ^ 1).a,
+        volume_sample(mipmap, first, n, q, w.level, w.facing.y ^ 1).a,
+        volume_sample(mipmap, first, n, q, w.level, w.facing.z ^ 1).a);
     float net = dot(weights, f - b);
     float round = 0.5 * (net + max(abs(net), length(weights * (f + b))));
     float paired = max(net, 0.0) + length(weights * min(f, b));
@@ -126,75 +126,145 @@ vec4 directional_sample(sampler3D mipmap, int n, vec3 q, Walk w) {
 }
 #endif
 
+vec4 sample_near(sampler3D mipmap, vec3 q, Walk w) {
+    return directional_sample(mipmap, volume * volume_size, volume_size, q, w);
+}
+
 // Whether a trilinear sample at q (voxels) may meet anything, of the volume around the objects and of the one beyond.
 bool may_be_near(vec3 q, int level) {
     ivec3 corner = corner_of(q, level);
-    return (occupied[corner_word(volume_size, level, corner)] >> (corner.x & 31) & 1u) != 0u;
+    int word = volume * mipmap_words(volume_size) + corner_word(volume_size, level, corner);
+    return (occupied[word] >> (corner.x & 31) & 1u) != 0u;
 }
 bool may_be_far(vec3 q, int level) {
     ivec3 corner = corner_of(q, level);
     return (occupied_far[corner_word(far_size, level, corner)] >> (corner.x & 31) & 1u) != 0u;
 }
 
-// Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
-// `differs`: the path crossed cells where mu and rho differ.
-Crossed march_near(sampler3D mipmap, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
-    Crossed sum = Crossed(vec3(0.0), 0.0);
-    Walk w = walk_from(q, d);
-    vec3 low = vec3(support[0], support[1], support[2]);
-    vec3 high = vec3(-support[3], -support[4], -support[5]) + 1.0;
-    differs = false;
-    vec3 at = sample_point(w);
-    for (int i = 0; i < 1024 && inside_volume(at) && sum.coverage < WALL; ++i) {
-        // Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together.
-        bool met = false;
-        for (int j = 0; j < 1024 && inside_volume(at) && !met; ++j) {
-            vec3 reach = vec3(1.5 * float(1 << w.level));
-            differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
-            met = may_be_near(at, w.level);
-            if (!met) advance(w, ratio, 0.0, volume_levels);
-            at = sample_point(w);
-        }
-        if (!met) break;
-        cross_cell(slice_fraction(w) * directional_sample(mipmap, volume_size, at, w), sum);
-        advance(w, ratio, 0.0, volume_levels);
+// Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together. Loops test at
+// their end, because software renderers run the body of those that test at their beginning once more, for no lane.
+
+// Goes on to the next cell, from that at `at` on, that may hold anything; whether there is one.
+bool find_near(inout Walk w, inout vec3 at, float before, float ratio, vec3 low, vec3 high, inout bool differs) {
+    bool met = false;
+    if (inside_volume(at)) do {
+        vec3 reach = vec3(1.5 * float(1 << w.level));
+        differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
+        met = may_be_near(at, w.level);
+        if (!met) advance(w, ratio, before, volume_levels);
         at = sample_point(w);
-    }
-    t = travelled(w);
-    return sum;
+    } while (inside_volume(at) && !met);
+    return met;
 }
 
-// Continues through the coarse real scene, from q after a distance `before` (both in its voxels).
-void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
+// Through the volume around the objects, from q after a distance `before` (both in voxels), until a wall or the volume's end.
+// Returns the distance crossed (voxels). `differs`: the path crossed cells where mu and rho differ.
+float march_near(
+    sampler3D mipmap, vec3 q, vec3 d, float before, float ratio, inout Crossed sum, inout bool differs
+) {
+    Walk w = walk_from(q, d);
+    if (before > 0.0) {
+        for (int i = 1; i < volume_levels; ++i) choose_level(w, ratio, before, volume_levels);
+        w.ahead *= float(1 << w.level);
+    }
+    int held = 6 * volume;
+    vec3 low = vec3(support[held], support[held + 1], support[held + 2]);
+    vec3 high = vec3(-support[held + 3], -support[held + 4], -support[held + 5]) + 1.0;
+    vec3 at = sample_point(w);
+    if (find_near(w, at, before, ratio, low, high, differs)) do {
+        cross_cell(slice_fraction(w) * sample_near(mipmap, at, w), sum);
+        advance(w, ratio, before, volume_levels);
+        at = sample_point(w);
+    } while (sum.coverage < WALL && find_near(w, at, before, ratio, low, high, differs));
+    return travelled(w);
+}
+
+#ifdef SEVERAL_VOLUMES
+bool in_far(vec3 at, Walk w, float end) { return inside_cube(at, float(far_size)) && travelled(w) < end; }
+#else
+bool in_far(vec3 at, Walk w, float end) { return inside_cube(at, float(far_size)); }
+#endif
+
+// The same in the coarse real scene, until a distance `end` (its voxels).
+bool find_far(inout Walk w, inout vec3 at, float before, float end, float ratio) {
+    bool met = false;
+    if (in_far(at, w, end)) do {
+        met = may_be_far(at, w.level);
+        if (!met) advance(w, ratio, before, far_levels);
+        at = sample_point(w);
+    } while (in_far(at, w, end) && !met);
+    return met;
+}
+
+// Continues through the coarse real scene, from q after a distance `before`, for a distance `end` (all in its voxels) where
+// another volume is ahead.
+void march_far(vec3 q, vec3 d, float before, float end, float ratio, inout Crossed sum) {
     Walk w = walk_from(q, d);
     for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
     w.ahead *= float(1 << w.level);
-    float edge = float(far_size);
     vec3 at = sample_point(w);
-    for (int i = 0; i < 256 && inside_cube(at, edge) && sum.coverage < WALL; ++i) {
-        for (int j = 0; j < 256 && inside_cube(at, edge) && !may_be_far(at, w.level); ++j) {
-            advance(w, ratio, before, far_levels);
-            at = sample_point(w);
-        }
-        if (!inside_cube(at, edge)) break;
-        cross_cell(slice_fraction(w) * directional_sample(mipmap_far, far_size, at, w), sum);
+    if (sum.coverage < WALL && find_far(w, at, before, end, ratio)) do {
+        cross_cell(slice_fraction(w) * directional_sample(mipmap_far, 0, far_size, at, w), sum);
         advance(w, ratio, before, far_levels);
         at = sample_point(w);
-    }
+    } while (sum.coverage < WALL && find_far(w, at, before, end, ratio));
 }
 
+const float ENDLESS = 1e30;
+
+#ifdef SEVERAL_VOLUMES
+// Of the volumes that a ray (world, m) has not `crossed`, goes to the one that it meets first after a distance t; returns where,
+// or ENDLESS.
+float enter_next(vec3 from, vec3 d, float t, uint crossed) {
+    float nearest = ENDLESS;
+    int found = 0;
+    for (volume = 0; volume < volume_count; ++volume) {
+        if ((crossed >> volume & 1u) != 0u) continue;
+        vec2 within = box_interval(from - volume_origin, d, vec3(0.0), vec3(float(volume_size) * voxel_edge));
+        float at = max(within.x, t);
+        if (at < within.y && at < nearest) { nearest = at; found = volume; }
+    }
+    volume = found;
+    return nearest;
+}
+
+// One march from q (voxels) along d, continued through other volumes and, between and behind them, the coarse scene.
+Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
+    Crossed sum = Crossed(vec3(0.0), 0.0);
+    differs = false;
+    int home = volume;
+    vec3 from = volume_origin + q * voxel_edge;
+    float t = 0.0;   // m
+    uint crossed = 0u;
+    while (sum.coverage < WALL) {
+        float start = crossed == 0u ? 0.0 : t / voxel_edge + 1.0;   // whose first sample lies inside
+        crossed |= 1u << volume;
+        t = voxel_edge * (start + march_near(mipmap, volume_coordinate(from) + start * d, d, start, ratio, sum, differs));
+        float skip = t > 0.0 ? 0.0 : 1.5;   // as below
+        float next = t > 0.0 ? enter_next(from, d, t, crossed) : ENDLESS;
+        vec3 leave = (from + t * d - far_origin) / far_edge + skip * d;
+        if (far_size > 0 && sum.coverage < WALL) march_far(leave, d, t / far_edge + skip, (next - t) / far_edge, ratio, sum);
+        if (next == ENDLESS) break;
+        t = next;
+    }
+    volume = home;
+    return sum;
+}
+#else
 // One march from q (voxels) along d, continued into the coarse scene.
 Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
-    float t;
-    Crossed sum = march_near(mipmap, q, d, ratio, t, differs);
+    Crossed sum = Crossed(vec3(0.0), 0.0);
+    differs = false;
+    float t = march_near(mipmap, q, d, 0.0, ratio, sum, differs);
     if (far_size > 0 && sum.coverage < WALL) {
         vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
         // A surface that starts the march outside of the volume must not hit its own coarse voxels.
         float skip = t > 0.0 ? 0.0 : 1.5;
-        march_far(leave + skip * d, d, t * voxel_edge / far_edge + skip, ratio, sum);
+        march_far(leave + skip * d, d, t * voxel_edge / far_edge + skip, ENDLESS, ratio, sum);
     }
     return sum;
 }
+#endif
 
 // Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is that of rho.
 March march(vec3 q, vec3 d, float ratio, bool only_rho) {

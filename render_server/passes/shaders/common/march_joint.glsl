@@ -9,20 +9,12 @@ const float OPAQUE = 0.99;   // opacity that ends a march
 // inside an object is blocked by its far wall.
 vec4 cone_sample(sampler3D mipmap, vec3 q, int level, vec3 d) {
 #if DIRECTIONS == 1
-    return volume_sample(mipmap, volume_size, q, level, 0);
+    return volume_sample(mipmap, 0, volume_size, q, level, 0);
 #else
     vec4 sum = vec4(0.0);
-    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(mipmap, volume_size, q, level, k);
+    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(mipmap, 0, volume_size, q, level, k);
     return sum;
 #endif
-}
-
-// Where the ray q + t d, t >= 0, is inside a box: (first t, last t); none where first >= last.
-vec2 box_interval(vec3 q, vec3 d, vec3 low, vec3 high) {
-    vec3 inverse = 1.0 / (d + vec3(equal(d, vec3(0.0))) * 1e-9);
-    vec3 t0 = (low - q) * inverse, t1 = (high - q) * inverse;
-    vec3 near = min(t0, t1), far = max(t0, t1);
-    return vec2(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
 }
 
 // Takes one step. Directional cells hold the covered fraction of their face, which adds up to 1 across a surface
@@ -40,12 +32,12 @@ vec4 accumulated(vec4 sum, vec4 v) {
 vec4 march(sampler3D mipmap, vec3 q, vec3 d, float ratio, vec2 interval) {
     vec4 sum = vec4(0.0);
     float t = interval.x;
-    for (int i = 0; i < 1024 && t < interval.y && sum.a < OPAQUE; ++i) {
+    if (t < interval.y) do {   // at least a cell a step; a loop that tests at its end: walk.glsl
         float diameter = max(1.0, ratio * t);
         int level = min(int(floor(log2(diameter) + 0.5)), volume_levels - 1);
         float edge = exp2(float(level));
         sum = accumulated(sum, cone_sample(mipmap, q + (t + 0.5 * edge) * d, level, d));
         t += edge;
-    }
+    } while (t < interval.y && sum.a < OPAQUE);
     return sum;
 }

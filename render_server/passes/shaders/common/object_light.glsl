@@ -25,7 +25,8 @@ vec3 response_times_cosine(vec3 n, vec3 v, vec3 l, float cosine, Material m, flo
 
 vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
     vec3 sum = vec3(0.0);
-    for (int i = 0; i < light_count; ++i) {
+    int i = 0;
+    if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
         vec3 l; float radius;
         vec3 across = light_at(lights[i], p, n, l, radius);
         float cosine = dot(n, l);
@@ -34,7 +35,7 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
         vec2 fraction = visibility(lights[i], lifted, n, 3.0 * noise_sigma * depth * depth, 0.0);
         vec3 seen = arriving(lights[i], lifted, fraction, beam_alpha);
         sum += across * seen * response_times_cosine(n, v, l, cosine, m, radius);
-    }
+    } while (++i < light_count);
     return sum;
 }
 

@@ -18,5 +18,8 @@ int corner_word(int n, int level, ivec3 corner) {
     return first + (corner.z * (cells + 1) + corner.y) * row_words(cells) + (corner.x >> 5);
 }
 
+// Words of a whole mipmap: those of volumes follow one another.
+int mipmap_words(int n) { return level_words(n) + (findMSB(n) + 1) * level_words(n >> 1); }
+
 // The corner around which a trilinear sample at q (voxels of level 0) reads.
 ivec3 corner_of(vec3 q, int level) { return ivec3(floor(q * exp2(-float(level)) + 0.5)); }

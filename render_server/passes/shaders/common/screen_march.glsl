@@ -38,31 +38,40 @@ ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
     if (!in_picture(first)) return hit;
     float last = fraction_in_picture(first, path);
     int steps = min(int(ceil(max(abs(path.x), abs(path.y)) * last)), MOST_STEPS);
-    float before = 0.0;
-    for (int i = 0, fine_until = 0; i < steps;) {
-        int next = i < fine_until ? i + 1 : min(i + STRIDE, steps);
-        float s = last * float(next) / float(steps);
-        float t = reach * s * near_b / mix(near_a, near_b, s);   // uniform in the picture is not uniform in the world
-        vec3 c = a + t * v;
-        vec2 pixel = seen_pixel(c);
-        bool inside = in_picture(pixel);
-        vec4 seen = inside ? texelFetch(real_surface_position, ivec2(pixel), 0) : vec4(0.0);
-        bool behind = seen.w > 0.0 && c.z > seen.w;
-        if ((behind || !inside) && next > i + 1) { fine_until = next; continue; }
-        if (!inside) break;
-        if (behind) {
-            vec3 n = texelFetch(real_surface_normal, ivec2(pixel), 0).xyz;
-            float tolerance = 3.0 * noise_sigma * seen.w * seen.w, towards = -dot(n, d);
-            float at = dot(n, from - seen.xyz) / max(towards, 1e-6);
-            if (towards > 0.0 && at > before - (t - before) - tolerance / max(towards, FLATTEST)) {
-                hit = ScreenHit(max(at, 0.0), pixel, c.z, smoothstep(0.0, FLATTEST, towards));
-                break;
-            }
-            if (c.z > seen.w + tolerance) break;
+    float before = 0.0, t, depth;
+    int i = 0, next, fine_until = 0;
+    vec2 pixel;
+    vec4 seen;
+    bool inside;
+    if (steps > 0) do {
+        // Most steps are in front of all surfaces: the lanes of a processor take them in a loop of their own.
+        bool searches;
+        do {
+            next = i < fine_until ? i + 1 : min(i + STRIDE, steps);
+            float s = last * float(next) / float(steps);
+            t = reach * s * near_b / mix(near_a, near_b, s);   // uniform in the picture is not uniform in the world
+            vec3 c = a + t * v;
+            pixel = seen_pixel(c);
+            depth = c.z;
+            inside = in_picture(pixel);
+            seen = inside ? texelFetch(real_surface_position, ivec2(pixel), 0) : vec4(0.0);
+            bool stops = !inside || (seen.w > 0.0 && depth > seen.w), strides = next > i + 1;
+            searches = !stops || strides;
+            if (!stops) { before = t; i = next; }
+            else if (strides) fine_until = next;
+        } while (searches && i < steps);
+        if (i == steps || !inside) break;
+        vec3 n = texelFetch(real_surface_normal, ivec2(pixel), 0).xyz;
+        float tolerance = 3.0 * noise_sigma * seen.w * seen.w, towards = -dot(n, d);
+        float at = dot(n, from - seen.xyz) / max(towards, 1e-6);
+        if (towards > 0.0 && at > before - (t - before) - tolerance / max(towards, FLATTEST)) {
+            hit = ScreenHit(max(at, 0.0), pixel, depth, smoothstep(0.0, FLATTEST, towards));
+            break;
         }
+        if (depth > seen.w + tolerance) break;
         before = t;
         i = next;
-    }
+    } while (i < steps);
     if (hit.fraction > 0.0) {   // refines the hit on the surface: at most a pixel off
         vec3 c = a + hit.distance * v;
         if (c.z > NEAREST) { hit.pixel = seen_pixel(c); hit.depth = c.z; }

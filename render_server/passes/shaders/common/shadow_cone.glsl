@@ -36,6 +36,29 @@ bool object_meets_cone(vec3 p, vec3 n) {
     return false;
 }
 
+const float OFF_CONE = 0.5;       // voxels, for rounding
+
+// Whether object_meets_cone may hold of a point within `radius` (m) of p, whatever its normal; of images and rectangles,
+// only the points tell. Cones of positions start and end SHADOW_START beside the segment from a point to the light.
+bool object_meets_cone_of_sphere(vec3 p, float radius) {
+    if (has_rectangles || has_mirror_images) return true;
+    vec3 q = volume_coordinate(p);
+    for (int i = 0; i < light_count; ++i) {
+        Light light = lights[i];
+        bool distant = light.place.w == DIRECTIONAL;
+        vec3 way = distant ? -light.place.xyz : volume_coordinate(light.place.xyz) - q;
+        float far = length(way), slack = radius / voxel_edge + 2.0 * SHADOW_START + OFF_CONE;
+        float sine = distant ? sin(atan(light.shape.x)) : light.shape.x / (voxel_edge * max(far - slack, 1e-6));
+        if (sine >= 0.5) return true;
+        float away = distance(q, 0.5 * (object_low + object_high)) + slack;
+        vec3 margin = vec3(0.5 + 0.5 * max(1.0, 2.0 * tan(asin(sine)) * away) + slack);
+        vec2 interval = box_interval(q, way / far, object_low - margin, object_high + margin);
+        if (!distant) interval.y = min(interval.y, far);
+        if (interval.x < interval.y) return true;
+    }
+    return false;
+}
+
 // (V_mu, V_rho)
 vec2 cone_visibility(Light light, vec3 p, vec3 n, float bias) {
     float v_mu = real_visibility(light, p, n, bias);

@@ -21,8 +21,8 @@ uint group_entry(uint voxel, vec3 n) {
     return voxel_index(block, volume_size / 2) * 6u + uint(main_axis(n));
 }
 
-// Low corner (voxels) of the block of an entry of the grid.
-vec3 block_corner(uint entry) { return vec3(2 * voxel_of_index(entry / 6u, volume_size / 2)); }
+// Low corner (voxels) of the block of an entry of the grid, in the volume that it enters.
+vec3 block_corner(uint entry) { return vec3(2 * enter_volume_of(entry / 6u, volume_size / 2)); }
 
 #ifdef GROUP_ENTRIES_ACCESS
 layout(std430) GROUP_ENTRIES_ACCESS buffer GroupEntries { uint group_count; uint group_entries[]; };

@@ -31,6 +31,18 @@ const float FIXED_POINT = 1048576.0;   // 2^20 steps: 1e-6 resolution, sums up t
 
 int fixed_point(float x) { return int(round(x * FIXED_POINT)); }
 
+// Voxels of further volumes follow in z.
 uint voxel_index(ivec3 v, int n) { return uint((v.z * n + v.y) * n + v.x); }
 
 ivec3 voxel_of_index(uint i, int n) { return ivec3(int(i) % n, (int(i) / n) % n, int(i) / (n * n)); }
+
+#ifdef SEVERAL_VOLUMES
+// Goes to the volume of a voxel, or of a block of the coarser grid of `n` an edge, and returns its place there.
+ivec3 enter_volume_of(uint i, int n) {
+    ivec3 v = voxel_of_index(i, n);
+    volume = v.z / n;
+    return v - ivec3(0, 0, volume * n);
+}
+#else
+ivec3 enter_volume_of(uint i, int n) { return voxel_of_index(i, n); }
+#endif

@@ -6,6 +6,8 @@
 #define CORES 1u
 #endif
 
+// Where a step is costly the loop tests at its end, do .. while: software renderers run the step of a loop that tests at
+// its beginning once more, for no lane.
 uint first_item() {
     uint run = gl_NumWorkGroups.x / CORES, group = gl_WorkGroupID.x;
     if (run > 0u && group < run * CORES) group = group % run * CORES + group / run;

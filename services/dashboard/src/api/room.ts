@@ -7,5 +7,6 @@ export const room: string | null = new URLSearchParams(location.search).get(NAME
 export function pageOf(name: string): string {
   const address = new URL(location.href);
   address.searchParams.set(NAME, name);
+  address.searchParams.delete("camera"); // it is another room's
   return address.href;
 }

@@ -39,7 +39,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Upload Asset
-         * @description Upload a mesh or an environment map as the body of the request; 200 where the same content is there already.
+         * @description Upload a mesh, an environment map or a precomputed material as the body of the request; 200 where the same content is there already.
          *
          *     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
          *     A .zip of one glTF and its files is kept as one .glb.
@@ -104,7 +104,7 @@ export interface paths {
         };
         /**
          * Thumbnail
-         * @description Return a picture of a mesh or map, 256 x 256 pixels on a transparent ground.
+         * @description Return a picture of a mesh, map or material, 256 x 256 pixels on a transparent ground.
          */
         readonly get: operations["thumbnail"];
         readonly put?: never;
@@ -335,6 +335,26 @@ export interface paths {
          * @description List the nodes and render servers that are heard: state, rates, losses, clock, delays.
          */
         readonly get: operations["list_nodes"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/poster-before.jpg": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * Poster Before
+         * @description Return the camera's own picture of the poster's frame; `/settings` says whether there is one.
+         */
+        readonly get: operations["poster_before"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -1553,7 +1573,7 @@ export interface components {
             readonly asset: string;
             /**
              * Facts
-             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels.
+             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, polynomial_texture), base_color, and lobes and roughness, or width and height in texels.
              * @example {
              *       "maximum": [
              *         0.1,
@@ -1579,10 +1599,10 @@ export interface components {
             readonly format: string;
             /**
              * Kind
-             * @description `mesh` for objects and models, `map` for environment lights.
+             * @description `mesh` for objects and models, `map` for environment lights, `material` for what `material: {precomputed: ...}` names.
              * @enum {string}
              */
-            readonly kind: "mesh" | "map";
+            readonly kind: "mesh" | "map" | "material";
             /**
              * Names
              * @description Names under which it was uploaded.
@@ -1655,6 +1675,35 @@ export interface components {
              * @example uvc:0
              */
             readonly source: string;
+        };
+        /**
+         * CameraState
+         * @description A camera whose pictures the render server makes, and its newest picture here.
+         */
+        readonly CameraState: {
+            /**
+             * Frame Id
+             * @description Of its newest picture.
+             */
+            readonly frame_id: number | null;
+            /** Frames Per S */
+            readonly frames_per_s: number | null;
+            /**
+             * Last Frame S
+             * @description Seconds since that came.
+             */
+            readonly last_frame_s: number | null;
+            /**
+             * Name
+             * @description Its node's.
+             */
+            readonly name: string;
+            /**
+             * Status
+             * @description `live`, or why it is left out: it is `silent`, sees `other_board` than the first one, or its frames are of `other_time`.
+             * @enum {string}
+             */
+            readonly status: "live" | "silent" | "other_board" | "other_time";
         };
         /**
          * CamerasAnswer
@@ -2441,6 +2490,12 @@ export interface components {
                 readonly [key: string]: unknown;
             }[];
             /**
+             * Node
+             * @description The node whose camera it is of, where the room has several; else null.
+             * @default null
+             */
+            readonly node: string | null;
+            /**
              * Number
              * @description Counts the pictures that came.
              */
@@ -2721,6 +2776,11 @@ export interface components {
          */
         readonly NewSnapshot: {
             /**
+             * Camera
+             * @description Whose frame, by its node's name; null = the first camera's.
+             */
+            readonly camera?: string | null;
+            /**
              * Exr
              * @description Add composite.exr: the composite's linear radiance.
              * @default false
@@ -2971,6 +3031,11 @@ export interface components {
          * @description A place in the composite.
          */
         readonly Pixel: {
+            /**
+             * Camera
+             * @description Whose picture, by its node's name; null = the first camera's.
+             */
+            readonly camera?: string | null;
             /**
              * Ignore
              * @description Id of an object to look through, at the real scene behind it: one that is being dragged.
@@ -3674,6 +3739,11 @@ export interface components {
              */
             readonly has_poster: boolean;
             /**
+             * Has Poster Before
+             * @description Whether `/poster-before.jpg` is the camera's picture of it.
+             */
+            readonly has_poster_before: boolean;
+            /**
              * Live Codecs
              * @description What `WS /live` sends pictures as, for the asking.
              */
@@ -4006,6 +4076,11 @@ export interface components {
          */
         readonly State: {
             /**
+             * Cameras
+             * @description The room's, in the order of their first frames: names for `camera` of other routes.
+             */
+            readonly cameras: readonly components["schemas"]["CameraState"][];
+            /**
              * Has Fisheye
              * @description Whether light of a fish-eye camera has come.
              */
@@ -4226,6 +4301,7 @@ export type AroofMethod = components['schemas']['AroofMethod'];
 export type AssetAnswer = components['schemas']['AssetAnswer'];
 export type BoxRegion = components['schemas']['BoxRegion'];
 export type CameraAnswer = components['schemas']['CameraAnswer'];
+export type CameraState = components['schemas']['CameraState'];
 export type CamerasAnswer = components['schemas']['CamerasAnswer'];
 export type Check = components['schemas']['Check'];
 export type DifferentialMethod = components['schemas']['DifferentialMethod'];
@@ -4477,7 +4553,7 @@ export interface operations {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** @description The file itself: GLB, PLY, STL, HDR, EXR, OBJ, or a ZIP of one glTF and its files. */
+        /** @description The file itself: GLB, PLY, STL, HDR, EXR, DLMAT, OBJ, or a ZIP of one glTF and its files. */
         readonly requestBody: {
             readonly content: {
                 readonly "application/octet-stream": string;
@@ -5616,6 +5692,8 @@ export interface operations {
             readonly query?: {
                 /** @description What to look at; without, the scene's own `output.view`. */
                 readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
+                /** @description Whose picture, by its node's name; without, the first camera's. */
+                readonly camera?: string | null;
             };
             readonly header?: never;
             readonly path?: never;
@@ -5652,6 +5730,15 @@ export interface operations {
             };
             /** @description Forbidden */
             readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
@@ -5739,6 +5826,15 @@ export interface operations {
             };
             /** @description Forbidden */
             readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
@@ -5997,6 +6093,98 @@ export interface operations {
             };
             /** @description Forbidden */
             readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Service Unavailable */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly poster_before: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "image/jpeg": unknown;
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
@@ -13050,6 +13238,15 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description Not Found */
+            readonly 404: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Conflict */
             readonly 409: {
                 headers: {
@@ -13753,6 +13950,8 @@ export interface operations {
             readonly query?: {
                 /** @description What to look at; without, the scene's own `output.view`. */
                 readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
+                /** @description Whose picture, by its node's name; without, the first camera's. */
+                readonly camera?: string | null;
             };
             readonly header?: never;
             readonly path?: never;
@@ -13794,6 +13993,15 @@ export interface operations {
             };
             /** @description Forbidden */
             readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Not Found */
+            readonly 404: {
                 headers: {
                     readonly [name: string]: unknown;
                 };

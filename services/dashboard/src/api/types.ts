@@ -4,6 +4,7 @@ import type * as Generated from "./schema";
 export type {
   Animation,
   AssetAnswer,
+  CameraState,
   EnvironmentLights,
   FisheyeLights,
   LiveCamera,

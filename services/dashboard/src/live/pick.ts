@@ -2,13 +2,15 @@
 import { API, ProblemError, request } from "../api/http";
 import type { PickAnswer } from "../api/types";
 import type { Pixel } from "../math/camera";
+import { frame } from "./picture";
 
 // Ten a second: more would take the render server's time from the pictures.
 export const PICK_INTERVAL_MS = 100;
 
 /** What is at a pixel, seen through an object where one is named; throws the service's refusal. */
 export function lookAt([x, y]: Pixel, ignore?: string): Promise<PickAnswer> {
-  const body = { x: Math.max(0, x), y: Math.max(0, y), ...(ignore === undefined ? {} : { ignore }) };
+  const camera = frame.value?.node ?? null; // whose picture is under the pointer
+  const body = { x: Math.max(0, x), y: Math.max(0, y), camera, ...(ignore === undefined ? {} : { ignore }) };
   return request<PickAnswer>("POST", `${API}/live/pick`, { body });
 }
 

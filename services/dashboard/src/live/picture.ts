@@ -3,6 +3,7 @@ import { computed, effect, signal, type ReadonlySignal } from "@preact/signals";
 import { API } from "../api/http";
 import type { LiveHeader } from "../api/types";
 import { lensOf, type Pixel, type View } from "../math/camera";
+import { chosenCamera } from "../state/cameras";
 import { lookedAt } from "../state/scene";
 import { noteDrawn } from "./delay";
 import { BitMeter, RateMeter } from "./rate";
@@ -50,6 +51,16 @@ export const connection = socket.state as ReadonlySignal<Connection>;
 effect(() => {
   const view = lookedAt.value ?? "";
   if (connection.value === "open") socket.send(`view ${view}`);
+});
+
+/** Whether the service was told of a camera by this connection. */
+let isTurned = false;
+
+effect(() => {
+  const camera = chosenCamera.value;
+  const isOpen = connection.value === "open";
+  if (isOpen && (camera !== null || isTurned)) socket.send(`camera ${camera ?? ""}`);
+  isTurned = isOpen && camera !== null;
 });
 
 effect(() => {

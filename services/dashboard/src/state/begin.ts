@@ -13,6 +13,8 @@ export const needsToken = signal(false);
 export const uploadLimitBytes = signal(Infinity);
 /** Whether a still stands for the live picture until it comes. */
 export const hasPoster = signal(false);
+/** Whether the camera's picture of that frame is there too. */
+export const hasPosterBefore = signal(false);
 
 /** Ask the service what it needs; the sign-in page comes up where that is a token. */
 export async function begin(): Promise<void> {
@@ -21,6 +23,7 @@ export async function begin(): Promise<void> {
     needsToken.value = settings.needs_token;
     uploadLimitBytes.value = settings.upload_limit_bytes;
     hasPoster.value = settings.has_poster;
+    hasPosterBefore.value = settings.has_poster_before;
     await readSchemas();
     phase.value = "ready";
     await chooseCodec(settings.no_h264);

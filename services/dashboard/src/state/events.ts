@@ -5,6 +5,7 @@ import { role, version } from "../api/session";
 import type { PictureState, ProcessAnswer, Recording, Replay } from "../api/types";
 import { ReconnectingSocket } from "../live/socket";
 import { readAssets, readShelf } from "./assets";
+import { cameras } from "./cameras";
 import { readRevisions } from "./history";
 import { readState, takeReport } from "./processes";
 import { readRooms } from "./rooms";
@@ -76,6 +77,10 @@ async function take(event: Event): Promise<void> {
     }
     case "rooms":
       return readRooms();
+    case "cameras": {
+      cameras.value = event.cameras as typeof cameras.value;
+      return;
+    }
     case "notice": {
       toast(String(event.text));
       return;

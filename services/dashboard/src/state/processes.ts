@@ -2,6 +2,7 @@
 import { signal } from "@preact/signals";
 import { API, request } from "../api/http";
 import type { Fisheye, ProcessAnswer, State } from "../api/types";
+import { cameras } from "./cameras";
 
 export interface Seen {
   readonly report: ProcessAnswer;
@@ -40,6 +41,7 @@ export async function readState(): Promise<void> {
     const state = await request<State>("GET", `${API}/state`);
     renderServer.value = state.render_server;
     hasFisheye.value = state.has_fisheye;
+    cameras.value = state.cameras;
     for (const report of state.processes) takeReport(report);
   } catch {
     renderServer.value = null;

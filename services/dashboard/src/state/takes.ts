@@ -3,6 +3,7 @@ import { computed, signal } from "@preact/signals";
 import { API, request } from "../api/http";
 import type { Recording, Replay, ReplayChange, Snapshot, Video, WantedPicture } from "../api/types";
 import { uploadRecording } from "../api/upload";
+import { frame } from "../live/picture";
 import { sendShown } from "./assets";
 import { openDrawer, recordsRelit } from "./preferences";
 import { announce, attempt, toast } from "./toasts";
@@ -141,7 +142,7 @@ export async function takeSnapshot(
   exr: boolean,
 ): Promise<Snapshot | undefined> {
   isTakingSnapshot.value = true;
-  const body = { ...(pictures ? { pictures } : {}), exr };
+  const body = { ...(pictures ? { pictures } : {}), exr, camera: frame.value?.node ?? null };
   const taken = await attempt(() => request<Snapshot>("POST", `${API}/snapshots`, { body }));
   isTakingSnapshot.value = false;
   if (taken) await readSnapshots();

@@ -1,5 +1,5 @@
 // What a change may be made to: an address below the scene, and the same change on the document in this browser.
-import type { ManualLight, SceneDocument } from "../api/types";
+import type { ManualLight, SceneDocument, SceneObject } from "../api/types";
 
 export type Patch = Readonly<Record<string, unknown>>;
 
@@ -15,7 +15,7 @@ export function objectTarget(id: string): Target {
     path: `/objects/${encodeURIComponent(id)}`,
     apply: (document, patch) => ({
       ...document,
-      objects: document.objects.map((item) => (item.id === id ? merged(item, patch) : item)),
+      objects: document.objects.map((item) => (item.id === id ? mergedObject(item, patch) : item)),
     }),
   };
 }
@@ -49,6 +49,13 @@ export function merged<T extends object>(target: T, patch: Patch): T {
     else result[key] = value;
   }
   return result as T;
+}
+
+/** As the service does it: a material in numbers and a precomputed one share no key, so one replaces the other. */
+function mergedObject(item: SceneObject, patch: Patch): SceneObject {
+  const { material } = patch;
+  const isOther = item.material && isPlain(material) && "precomputed" in item.material !== "precomputed" in material;
+  return merged(isOther ? { ...item, material: null } : item, patch);
 }
 
 function isPlain(value: unknown): value is Record<string, unknown> {

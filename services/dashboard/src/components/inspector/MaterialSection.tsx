@@ -1,11 +1,13 @@
 import type { Material, SceneObject } from "../../api/types";
 import { MATERIALS } from "../../forms/materials";
 import { schemas } from "../../forms/schemas";
-import { assets, materialOfFile } from "../../state/assets";
+import { assetName, assets, materialOfFile } from "../../state/assets";
 import { edit } from "../../state/gesture";
 import { objectTarget } from "../../state/targets";
 import { Button } from "../ui/Button";
 import { ColorField } from "../ui/ColorField";
+import { Field } from "../ui/Field";
+import { Select } from "../ui/Select";
 import { SliderField } from "../ui/SliderField";
 import { Switch } from "../ui/Switch";
 import { useGesture } from "../ui/useGesture";
@@ -16,13 +18,29 @@ interface MaterialSectionProps {
   readonly disabled: boolean;
 }
 
-/** The material of the scene, in place of the file's. */
+/** The material of the scene, in place of the file's: in numbers, or an asset. */
 export function MaterialSection({ item, disabled }: MaterialSectionProps) {
   const material = item.material ?? null;
   const target = objectTarget(item.id);
   const isOwn = material !== null && !("precomputed" in material);
+  const precomputed = material !== null && "precomputed" in material ? material.precomputed : "";
+  const measured = assets.value.filter((each) => each.kind === "material");
   return (
     <Section title="Material">
+      {measured.length > 0 && (
+        <Field label="Measured" help="Paints and texture maps of deltalight precompute, uploaded under Assets." inline>
+          <Select
+            label="Measured material"
+            value={precomputed}
+            choices={[
+              { value: "", label: "None" },
+              ...measured.map((each) => ({ value: each.asset, label: assetName(each) })),
+            ]}
+            onChange={(chosen) => edit(target, { material: chosen ? { precomputed: chosen } : null })}
+            disabled={disabled}
+          />
+        </Field>
+      )}
       <Switch
         label="Override material"
         checked={isOwn}

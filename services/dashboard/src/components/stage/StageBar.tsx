@@ -10,6 +10,7 @@ import { IconButton } from "../ui/IconButton";
 import { Segments, type Segment } from "../ui/Segments";
 import { Select } from "../ui/Select";
 import { AddObjectButton } from "./AddObjectButton";
+import { CameraSwitch } from "./CameraSwitch";
 
 const TOOLS: readonly Segment<Tool>[] = [
   { value: "select", label: "Select", icon: "cursor", hint: "Q" },
@@ -68,6 +69,7 @@ export function StageBar() {
       />
       <AddObjectButton />
       <span class="grow" />
+      <CameraSwitch />
       <Select<MethodName>
         label="Method"
         value={document?.method.name ?? NOTHING.value}

@@ -6,12 +6,26 @@ import { addObject } from "../../state/actions";
 import { assetName, removeAsset } from "../../state/assets";
 import { ASSET_DRAG } from "../../state/drag";
 import { edit } from "../../state/gesture";
-import { inspectorTab } from "../../state/selection";
-import { partTarget } from "../../state/targets";
+import { inspectorTab, selectedObjectId } from "../../state/selection";
+import { objectTarget, partTarget } from "../../state/targets";
+import { toast } from "../../state/toasts";
 import { download } from "../ui/download";
 import { Icon } from "../ui/Icon";
 import { Menu, type MenuEntry } from "../ui/Menu";
 import { SecureImage } from "../ui/SecureImage";
+
+interface Use {
+  readonly label: string;
+  /** Said before the asset's name. */
+  readonly verb: string;
+  readonly run: (asset: AssetAnswer) => unknown;
+}
+
+const USES: Readonly<Record<AssetAnswer["kind"], Use>> = {
+  mesh: { label: "Add to the scene", verb: "Add", run: (asset) => addObject(asset) },
+  map: { label: "Light the scene with it", verb: "Light the scene with", run: lightWith },
+  material: { label: "Paint the selected object with it", verb: "Paint the selected object with", run: paintWith },
+};
 
 interface AssetCardProps {
   readonly asset: AssetAnswer;
@@ -21,14 +35,10 @@ interface AssetCardProps {
 export function AssetCard({ asset, mayChange }: AssetCardProps) {
   const name = assetName(asset);
   const path = `${API}/assets/${asset.asset}`;
-  const use = asset.kind === "mesh" ? () => addObject(asset) : () => lightWith(asset);
+  const { label, verb, run } = USES[asset.kind];
+  const use = (): unknown => run(asset);
   const entries: MenuEntry[] = [
-    {
-      label: asset.kind === "mesh" ? "Add to the scene" : "Light the scene with it",
-      icon: "add",
-      disabled: !mayChange,
-      onClick: use,
-    },
+    { label, icon: "add", disabled: !mayChange, onClick: use },
     { label: "Download", icon: "download", onClick: () => download(`${path}/content`, name) },
     { label: "Delete", icon: "trash", disabled: !mayChange, onClick: () => removeAsset(asset) },
   ];
@@ -42,7 +52,7 @@ export function AssetCard({ asset, mayChange }: AssetCardProps) {
         type="button"
         class="asset-use"
         disabled={!mayChange}
-        aria-label={`${asset.kind === "mesh" ? "Add" : "Light the scene with"} ${name}`}
+        aria-label={`${verb} ${name}`}
         title={factsText(asset)}
         onClick={use}
       >
@@ -59,6 +69,15 @@ export function AssetCard({ asset, mayChange }: AssetCardProps) {
 async function lightWith(asset: AssetAnswer): Promise<void> {
   inspectorTab.value = "lights";
   await edit(partTarget("lights"), { mode: "environment", environment: { map: asset.asset } });
+}
+
+async function paintWith(asset: AssetAnswer): Promise<void> {
+  const id = selectedObjectId.value;
+  if (id === null) {
+    toast("Select the object first that is to have this material.");
+    return;
+  }
+  await edit(objectTarget(id), { material: { precomputed: asset.asset } });
 }
 
 function factsText(asset: AssetAnswer): string {

@@ -8,7 +8,7 @@ import { IconButton } from "../ui/IconButton";
 import { MESH_TYPES } from "../stage/AddObjectButton";
 import { AssetCard } from "./AssetCard";
 
-const TYPES = `${MESH_TYPES},.hdr,.exr`;
+const TYPES = `${MESH_TYPES},.hdr,.exr,.dlmat`;
 
 /** Uploaded files; dropping one here only uploads it. */
 export function AssetList() {
@@ -57,7 +57,7 @@ export function AssetList() {
       </ul>
       {!isRead.value && <Skeleton />}
       {isRead.value && assets.value.length === 0 && (
-        <p class="tree-empty">{mayChange ? "Drop GLB, OBJ, PLY, STL, HDR or EXR files here." : "None yet."}</p>
+        <p class="tree-empty">{mayChange ? "Drop GLB, OBJ, PLY, STL, HDR, EXR or DLMAT files here." : "None yet."}</p>
       )}
     </section>
   );

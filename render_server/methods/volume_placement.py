@@ -1,0 +1,131 @@
+"""Where the volumes around the objects lie (docs/method.md 4): one, or several where objects are far apart."""
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from operator import eq
+
+import numpy as np
+from jaxtyping import Float64
+
+from deltalight.protocol.quality import BEST, QualityTier
+from deltalight.render_server.frame import FrameResources
+from deltalight.render_server.gpu_scene import ObjectExtent
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.methods.light_maps import object_extent
+from deltalight.render_server.passes.volumes import (
+    MOST_VOLUMES,
+    VolumePlacement,
+    keep_placement,
+    place_volume,
+)
+
+Placements = tuple[VolumePlacement, ...]
+SizeOf = Callable[[int], int]
+"""Voxels an edge of each of so many volumes, 0 where there is no room for them."""
+
+
+def only_one(size: int) -> SizeOf:
+    """There is room for one volume."""
+    return lambda count: size if count == 1 else 0
+
+
+def volume_placement(
+    g: Graph, s: FrameResources, size: int, edge_m: float | None, tier: QualityTier = BEST
+) -> Resource[VolumePlacement]:
+    """Declares the cube of voxels or cells around the objects; a quick tier moves it only when it must."""
+    return g.value("volume cube", _only, volume_placements(g, s, only_one(size), edge_m, tier))
+
+
+def volume_placements(
+    g: Graph, s: FrameResources, size_of: SizeOf, edge_m: float | None, tier: QualityTier = BEST
+) -> Resource[Placements]:
+    """Declares the cubes of voxels around the objects; a quick tier moves them only when it must."""
+    placed: Placements = ()
+
+    def place(extent: ObjectExtent) -> Placements:
+        """Places cubes around the objects, snapped to their cells; they stand still while objects turn."""
+        nonlocal placed
+        groups, wanted = place_volumes(extent, size_of, edge_m)
+        if not tier.refresh_tiles or not _may_stay(placed, groups, wanted):
+            placed = wanted
+        return placed
+
+    placing = g.shared("volume placement", lambda: place)
+    return g.value("volume placement", placing, object_extent(g, s), same=eq)
+
+
+def _only(placements: Placements) -> VolumePlacement:
+    """The one volume."""
+    return placements[0]
+
+
+def _may_stay(placed: Placements, groups: Sequence[ObjectExtent], wanted: Placements) -> bool:
+    pairs = zip(placed, groups, wanted, strict=False)
+    return len(placed) == len(wanted) and all(
+        keep_placement(old, *group.bounds, new) for old, group, new in pairs
+    )
+
+
+def place_volumes(
+    extent: ObjectExtent, size_of: SizeOf, edge_m: float | None = None
+) -> tuple[Sequence[ObjectExtent], Placements]:
+    """Returns groups of near objects, and the volume of each.
+
+    It is one around all of them where `edge_m` is given, and where several would have larger voxels.
+    """
+    whole = extent.volume_edge if edge_m is None else edge_m
+    single = [extent], (_placed(extent, size_of(1), whole),)
+    parts = [each for each in extent.parts if each.volume_edge > 0]
+    if edge_m is not None or len(parts) < 2 or not size_of(2):
+        return single
+    gaps = relative_gaps(parts)
+    members = group_near(gaps)
+    size = size_of(len(members))
+    groups = [ObjectExtent.around([parts[each] for each in group]) for group in members]
+    edges = _volume_edges(groups, [[gaps[np.ix_(one, other)].min() for other in members] for one in members])
+    if len(groups) == 1 or not size or max(edges) * size_of(1) > whole * size:
+        return single
+    placed = zip(groups, edges, strict=True)
+    return groups, tuple(_placed(group, size, edge) for group, edge in placed)
+
+
+def _placed(group: ObjectExtent, size: int, edge: float) -> VolumePlacement:
+    low, high = group.upright
+    return place_volume(low, high, size, edge)
+
+
+def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
+    """Returns the gaps between objects' own volumes, by half the sum of two edges; negative: they overlap."""
+    middles = np.stack([each.upright.mean(axis=0) for each in parts])
+    halves = np.array([each.volume_edge / 2 for each in parts])
+    reach = halves[:, None] + halves
+    return np.asarray(np.abs(middles[:, None] - middles).max(axis=-1) / reach - 1)
+
+
+def group_near(gaps: Float64[np.ndarray, "n n"]) -> list[list[int]]:
+    """Joins objects whose gap is negative, then the nearest until MOST_VOLUMES groups are left (single linkage)."""
+    groups = {index: [index] for index in range(len(gaps))}
+    for one, other in sorted(combinations(groups, 2), key=lambda pair: gaps[pair]):
+        if gaps[one, other] >= 0 and len({id(group) for group in groups.values()}) <= MOST_VOLUMES:
+            break
+        if groups[one] is not groups[other]:
+            joined = sorted(groups[one] + groups[other])
+            groups |= dict.fromkeys(joined, joined)
+    return [group for index, group in groups.items() if group[0] == index]
+
+
+def _volume_edges(groups: Sequence[ObjectExtent], gaps: Sequence[Sequence[float]]) -> list[float]:
+    """Returns the edge of each group's volume, m.
+
+    As large as one around two groups where they are nearly joined, its own where the gap is as wide as their volumes:
+    so voxels do not change at once when objects are moved apart.
+    """
+    edges = [each.volume_edge for each in groups]
+    for one, other in combinations(range(len(groups)), 2):
+        share = max(0.0, 1 - gaps[one][other])
+        if share > 0:
+            joint = ObjectExtent.around([groups[one], groups[other]]).volume_edge
+            for index in (one, other):
+                own = groups[index].volume_edge
+                edges[index] = max(edges[index], float(own + share * (joint - own)))
+    return edges

@@ -1,0 +1,238 @@
+"""The cameras of a room: each node's streams are paired for themselves, their newest frames are rendered together.
+
+A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: it is
+silent, sees another board than the first one, or its frames are of another time.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import structlog
+
+from deltalight.protocol.messages import MAX_CAMERAS, CameraEntry, CameraStatus, Message
+from deltalight.protocol.subscriber import ReceivedMultipart
+from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, PairingSettings
+from deltalight.render_server.started_frame import CameraFrame
+
+SILENT_NS = 2 * 10**9  # without a frame; or this many of the camera's periods, if they are longer
+SILENT_PERIODS = 5
+KEPT_ARRIVALS = 5
+MAX_NODES = 2 * MAX_CAMERAS  # those that send light without frames included
+
+log = structlog.get_logger()
+
+
+class Taken(NamedTuple):
+    """A camera's newest frame; `is_new`: it was not rendered yet."""
+
+    camera: str
+    frame: AssembledFrame
+    is_new: bool
+
+    def shown(self, *, is_shown: bool) -> CameraFrame:
+        """Returns it for the renderer, with or without a picture of it."""
+        return CameraFrame(self.camera, self.frame.view, is_shown=is_shown)
+
+
+@dataclass(eq=False)
+class _Place:
+    """A camera and its newest frame, which is `new` since `ready_ns` or has been rendered."""
+
+    name: str
+    newest: AssembledFrame
+    ready_ns: int
+    is_new: bool = True
+    status: CameraStatus = "live"
+    remark: str = ""
+    arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT_ARRIVALS))
+
+    def note(self, frame: AssembledFrame, now_ns: int) -> None:
+        """Takes a newer frame."""
+        self.ready_ns = self.ready_ns if self.is_new else now_ns
+        self.newest, self.is_new = frame, True
+        self.arrivals_ns.append(frame.received_ns)
+
+    @property
+    def period_ns(self) -> int:
+        """Mean time between its frames; 0 before the second."""
+        count = len(self.arrivals_ns) - 1
+        return (self.arrivals_ns[-1] - self.arrivals_ns[0]) // count if count > 0 else 0
+
+    @property
+    def patience_ns(self) -> int:
+        """How long its newest frame counts."""
+        return max(SILENT_NS, SILENT_PERIODS * self.period_ns)
+
+    def entry(self) -> CameraEntry:
+        """Returns what receivers of pictures are told of it."""
+        header = self.newest.color
+        return CameraEntry(
+            node=self.name,
+            status=self.status,
+            frame_id=header.frame_id,
+            capture_ns=header.capture_ns,
+            received_ns=self.newest.received_ns,
+        )
+
+
+class RoomCameras:
+    """Takes the messages of all nodes, and returns the frames to be rendered together.
+
+    `on_fault` is called with the fault of a frame whose data is broken, which is dropped. `counts` are those of
+    `FrameAssembler`, and `unplaced`: messages of nodes beyond `MAX_NODES` and frames of cameras beyond `MAX_CAMERAS`,
+    while none of those that have a place is silent.
+    """
+
+    def __init__(
+        self, settings: PairingSettings | None, on_fault: Callable[[Exception], None], *, needs_depth: bool
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.is_waiting = False  # for a camera's frame, to render others with it
+        self._settings = settings or PairingSettings()
+        self._on_fault = on_fault
+        self._needs_depth = needs_depth
+        self._assemblers: dict[str, FrameAssembler] = {}
+        self._places: dict[str, _Place] = {}
+
+    def need_depth(self, needs_depth: bool) -> None:
+        """Says whether frames are complete only with depth."""
+        self._needs_depth = needs_depth
+        for assembler in self._assemblers.values():
+            assembler.needs_depth = needs_depth
+
+    def restart(self) -> None:
+        """Forgets all nodes, for another source; counts continue."""
+        self._assemblers, self._places, self.is_waiting = {}, {}, False
+
+    def add(self, message: Message, parts: Sequence[memoryview], multipart: ReceivedMultipart) -> None:
+        """Stores a message until its partners arrive."""
+        assembler = self._assemblers.get(message.node)
+        if assembler is None:
+            if len(self._assemblers) >= MAX_NODES and not self._make_room():
+                self.counts["unplaced"] += 1
+                return
+            assembler = self._assemblers[message.node] = FrameAssembler(
+                self._settings, needs_depth=self._needs_depth, counts=self.counts
+            )
+        assembler.add(message, parts, multipart.received_ns)
+
+    @property
+    def are_several(self) -> bool:
+        """Whether more than one camera has a place."""
+        return len(self._places) > 1
+
+    @property
+    def statuses(self) -> dict[str, CameraStatus]:
+        """The status of each camera, in the order of their first frames."""
+        return {place.name: place.status for place in self._places.values()}
+
+    @property
+    def entries(self) -> tuple[CameraEntry, ...]:
+        """Returns all cameras, those left out included, in the order of their first frames."""
+        return tuple(place.entry() for place in self._places.values())
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Why cameras are left out, a sentence for each."""
+        return tuple(place.remark for place in self._places.values() if place.remark)
+
+    def take(self, now_ns: int) -> tuple[Taken, ...]:
+        """Returns the newest frame of each camera that counts, if any of them is new, else none.
+
+        A new frame waits for those of other cameras that are due, for `together_ms` at most.
+        """
+        for name, assembler in list(self._assemblers.items()):
+            try:
+                frame = assembler.take(now_ns)
+            except Exception as fault:  # a node's data is no reason to end, nor to hold up the others
+                self._on_fault(fault)
+                continue
+            if frame is not None:
+                self._note(name, frame, now_ns)
+        members = self._members()
+        self.is_waiting = self._must_wait(members, now_ns)
+        if self.is_waiting or not any(place.is_new for place in members):
+            return ()
+        taken = tuple(Taken(place.name, place.newest, place.is_new) for place in members)
+        for place in self._places.values():
+            place.is_new = False
+        return taken
+
+    def _note(self, name: str, frame: AssembledFrame, now_ns: int) -> None:
+        place = self._places.get(name)
+        if place is None:
+            if len(self._places) >= MAX_CAMERAS and not self._make_room():
+                self.counts["unplaced"] += 1
+                return
+            place = self._places[name] = _Place(name, frame, now_ns)
+        place.note(frame, now_ns)
+
+    def _make_room(self) -> bool:
+        """Forgets the camera that has been silent longest; returns whether there was one."""
+        silent = [place for place in self._places.values() if place.status == "silent"]
+        if not silent:
+            return False
+        longest = min(silent, key=lambda place: place.newest.received_ns).name
+        del self._places[longest], self._assemblers[longest]
+        return True
+
+    def _must_wait(self, members: Sequence[_Place], now_ns: int) -> bool:
+        new_since_ns = min((place.ready_ns for place in members if place.is_new), default=None)
+        together_ns = int(1e6 * self._settings.together_ms)
+        if new_since_ns is None or now_ns - new_since_ns >= together_ns:
+            return False
+        return any(
+            not place.is_new and now_ns - place.newest.received_ns >= place.period_ns - together_ns
+            for place in members
+        )
+
+    def _members(self) -> list[_Place]:
+        """Returns the cameras whose frames count, and notes why the others' do not."""
+        places = list(self._places.values())
+        if not places:
+            return []
+        newest_ns = max(place.newest.received_ns for place in places)
+        live = [place for place in places if newest_ns - place.newest.received_ns <= place.patience_ns]
+        first = live[0]
+        for place in places:
+            self._judge(place, first, is_silent=place not in live)
+        return [place for place in live if place.status == "live"]
+
+    def _judge(self, place: _Place, first: _Place, *, is_silent: bool) -> None:
+        status, remark = _status(place, first, is_silent=is_silent)
+        if status == place.status:
+            return
+        if status == "live":
+            log.info("a camera is back", camera=place.name)
+        else:
+            log.warning("a camera is left out", camera=place.name, reason=remark)
+        place.status, place.remark = status, remark
+
+
+def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraStatus, str]:
+    """Returns whether a camera is rendered with the first one, and the sentence that says why not."""
+    if is_silent:
+        return "silent", f"The camera {place.name} sends no frames; the others go on without it."
+    board, wanted = place.newest.view.board, first.newest.view.board
+    if board is not None and wanted is not None and board != wanted:
+        return (
+            "other_board",
+            f"The camera {place.name} is left out: give its node the board that {first.name} sees.",
+        )
+    if _apart_ns(place, first) > max(place.patience_ns, first.patience_ns):
+        return (
+            "other_time",
+            f"The camera {place.name} is left out: its frames are of another time than those of {first.name}.",
+        )
+    return "live", ""
+
+
+def _apart_ns(some: _Place, other: _Place) -> int:
+    """Returns how far apart two cameras' frames were taken at least; 0 where clocks were never compared."""
+    one, two = some.newest.color, other.newest.color
+    if one.clock_bound_ns is None or two.clock_bound_ns is None:
+        return 0
+    apart_ns = abs(one.capture_ns + one.clock_offset_ns - two.capture_ns - two.clock_offset_ns)
+    return apart_ns - one.clock_bound_ns - two.clock_bound_ns

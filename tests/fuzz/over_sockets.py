@@ -1,0 +1,129 @@
+"""Mutated messages of all streams to a running station: `python -m tests.fuzz.over_sockets --messages 100000`.
+
+What is published goes to the render server and the web process as from a node, requests and replies to the render
+server's control endpoint, each of which is answered.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from random import Random
+
+import httpx
+import psutil
+import zmq
+
+from deltalight.benchmarks.soak.link import LoopThread
+from deltalight.benchmarks.soak.nonsense import mutated
+from deltalight.benchmarks.soak.profiles import PROFILES
+from deltalight.benchmarks.soak.station import Station, running_station
+from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.vectors import FOLDER, unframe_pieces
+from deltalight.services import ports
+
+COMMANDS = (b"request", b"reply")
+LOOK_EVERY = 200  # messages
+START_S, ANSWER_MS = 300.0, 10_000
+SMALLEST_PAUSE_S = 0.05  # after each look: the receivers have their turn too
+
+
+def main() -> None:
+    """Send them, and print the figures as a JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz.over_sockets", description=__doc__)
+    parser.add_argument("--messages", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    with ExitStack() as stack:
+        thread = stack.enter_context(LoopThread("links"))
+        station = stack.enter_context(running_station(PROFILES["small"], thread, options.seed))
+        _until_shown(station)
+        print(json.dumps(attacked(station, options.messages, Random(options.seed))), flush=True)
+
+
+def attacked(station: Station, messages: int, dice: Random) -> dict[str, object]:
+    """Send so many, and tell what became of the processes, their memory (MB), and the pictures meanwhile."""
+    vectors = [unframe_pieces(path.read_bytes()) for path in sorted(FOLDER.glob("*.bin"))]
+    before, peaks, gaps = memory_mb(station), memory_mb(station), Gaps(station)
+    began_s = time.monotonic()
+    with ExitStack() as stack:
+        publisher = stack.enter_context(closing(Publisher(ports.endpoint(station.places.stranger))))
+        ask = _asking(stack, ports.endpoint(station.places.control))
+        unanswered = 0
+        for number in range(messages):
+            pieces = mutated(dice, dice.choice(vectors))
+            if pieces[0].startswith(COMMANDS):
+                unanswered += not ask(pieces)
+            else:
+                publisher.send(pieces)
+            if number % LOOK_EVERY == 0:
+                peaks = {name: max(peaks[name], now) for name, now in memory_mb(station).items()}
+                gaps.look()
+                time.sleep(SMALLEST_PAUSE_S)
+    return {
+        "messages": messages,
+        "seconds": round(time.monotonic() - began_s),
+        "streams": len({pieces[0].partition(b".")[0] for pieces in vectors}),
+        "deaths": sum(station.deaths().values()),
+        "unanswered": unanswered,
+        "memory_mb": {name: (before[name], peaks[name]) for name in before},
+        "longest_gap_s": round(gaps.longest_s, 2),
+    }
+
+
+def memory_mb(station: Station) -> dict[str, float]:
+    """Resident memory of each process."""
+    return {
+        name: round(psutil.Process(station.process_id(name)).memory_info().rss / 1e6, 1)
+        for name in station.names
+    }
+
+
+class Gaps:
+    """The longest time in which no other picture was shown."""
+
+    def __init__(self, station: Station) -> None:
+        self.longest_s = 0.0
+        self._client, self._shown, self._since_s = station.client, b"", time.monotonic()
+
+    def look(self) -> None:
+        """Compare the picture with that of the last look."""
+        shown, now_s = self._client.get("/live.jpg").content, time.monotonic()
+        if shown != self._shown:
+            self.longest_s = max(self.longest_s, now_s - self._since_s)
+            self._shown, self._since_s = shown, now_s
+
+
+def _until_shown(station: Station) -> None:
+    deadline_s = time.monotonic() + START_S
+    while time.monotonic() < deadline_s:
+        station.check()
+        try:
+            if station.client.get("/live.jpg").status_code == httpx.codes.OK:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.2)
+    raise SystemExit("no picture came; see whether `deltalight bench soak --profile small` runs here")
+
+
+def _asking(stack: ExitStack, endpoint: str) -> Callable[[Sequence[bytes]], bool]:
+    """Return what sends a request and tells whether an answer came."""
+    context = zmq.Context()
+    stack.callback(context.destroy, 0)
+    socket = context.socket(zmq.DEALER)
+    socket.connect(endpoint)
+
+    def ask(pieces: Sequence[bytes]) -> bool:
+        socket.send_multipart([b"", *pieces])
+        answered = bool(socket.poll(ANSWER_MS))
+        if answered:
+            socket.recv_multipart()
+        return answered
+
+    return ask
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""Peers that speak ZeroMQ's protocol (ZMTP 3.0, mechanism NULL) by hand, to do what no library does."""
+
+import socket
+import struct
+from collections.abc import Sequence
+
+MORE, LONG, COMMAND = 1, 2, 4
+LINGER_NONE = struct.pack("ii", 1, 0)  # hang up at once, with a reset
+
+
+def frame(body: bytes, *, kind: int = 0) -> bytes:
+    """A frame: flags, length, body (ZMTP 3.0, RFC 23)."""
+    if len(body) < 256:
+        return bytes([kind, len(body)]) + body
+    return bytes([kind | LONG]) + struct.pack(">Q", len(body)) + body
+
+
+def multipart(pieces: Sequence[bytes]) -> bytes:
+    """The frames of a multipart."""
+    *first, last = pieces
+    return b"".join(frame(piece, kind=MORE) for piece in first) + frame(last)
+
+
+class RawPeer:
+    """Connects to a loopback port as a socket of this kind."""
+
+    def __init__(self, port: int, kind: str) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=10)
+        greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
+        ready = b"\x05READY" + _property(b"Socket-Type", kind.encode()) + _property(b"Identity", b"")
+        self.socket.sendall(greeting + frame(ready, kind=COMMAND))
+
+    def send_what_fits(self, data: bytes) -> None:
+        """Send until the other end takes no more for a moment."""
+        self.socket.settimeout(0.05)
+        try:
+            self.socket.sendall(data)
+        except OSError:
+            return
+
+    def hang_up(self) -> None:
+        """Reset the connection."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER_NONE)
+        self.socket.close()
+
+
+def _property(name: bytes, value: bytes) -> bytes:
+    return bytes([len(name)]) + name + struct.pack(">I", len(value)) + value

@@ -1,0 +1,233 @@
+"""Objects far apart have volumes of their own: as good as alone, lit by each other, moved apart without a jump."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import moderngl
+import numpy as np
+import pytest
+import trimesh
+
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_method import DvctMethod
+from deltalight.protocol.scene_objects import Pose
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
+from deltalight.render_server.gpu_scene import ObjectExtent
+from deltalight.render_server.methods.volume_placement import (
+    group_near,
+    only_one,
+    place_volumes,
+    relative_gaps,
+)
+from deltalight.render_server.methods.voxel_volumes import DeltaVoxels, affordable_size, sets_memory_mb
+from deltalight.render_server.passes.volumes import VolumePlacement
+from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server.scenes import (
+    Fields,
+    Stage,
+    Vector,
+    ambient,
+    ball,
+    fields_of,
+    frame,
+    shifted,
+    solve,
+    sphere_light,
+)
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+SIZE = 32
+RADIUS = 0.06  # of the balls, whose own volumes have twice their diameter as edge
+TOUCHING = 4 * RADIUS  # distance at which these touch
+APART = 2.0
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    return Stage(tmp_path)
+
+
+def box(*middle: float, edge: float = 1.0) -> ObjectExtent:
+    corners = np.array(middle) + edge / 2 * np.array([[-1, -1, -1], [1, 1, 1]])
+    return ObjectExtent(corners, corners)
+
+
+def placed(parts: Sequence[ObjectExtent], **more: float) -> tuple[VolumePlacement, ...]:
+    return place_volumes(ObjectExtent.around(parts), lambda _: 64, **more)[1]
+
+
+def edges_of(placements: Sequence[VolumePlacement]) -> list[float]:
+    return [each.size * each.voxel_edge for each in placements]
+
+
+def test_objects_far_apart_have_volumes_of_their_own_size() -> None:
+    found = placed([box(0, 0, 0), box(20, 0, 0, edge=2.0)])
+    assert edges_of(found) == pytest.approx(
+        [2.0, 4.0], rel=0.2
+    )  # more by what keeps turned objects off the border
+    for each, middle in zip(found, (0.0, 20.0), strict=True):
+        assert abs(each.origin[0] + each.size * each.voxel_edge / 2 - middle) < each.voxel_edge
+
+
+def test_near_objects_share_the_one_volume_around_them() -> None:
+    parts = [box(0, 0, 0), box(1.5, 0, 0)]
+    assert placed(parts) == place_volumes(ObjectExtent.around(parts), only_one(64))[1]
+    assert len(placed([box(0, 0, 0), box(9, 0, 0)], edge_m=3.0)) == 1
+
+
+def test_volumes_shrink_smoothly_from_the_one_around_both_objects() -> None:
+    steps = [max(edges_of(placed([box(0, 0, 0), box(x, 0, 0)]))) for x in np.arange(1.5, 6.0, 0.02)]
+    assert steps[-1] == pytest.approx(steps[0] * 2 / 5, rel=0.2)
+    assert max(abs(b - a) for a, b in pairwise(steps)) < 0.12 * min(steps)
+
+
+def test_at_most_four_volumes_with_the_nearest_objects_together() -> None:
+    row = [box(x, 0, 0) for x in (0, 100, 107, 300, 400, 480)]
+    assert group_near(relative_gaps(row)) == [[0], [1, 2], [3], [4, 5]]
+    assert len(placed(row)) == 4
+
+
+def test_one_volume_where_several_would_have_larger_voxels() -> None:
+    near, far = ([box(0, 0, 0), box(x, 0, 0)] for x in (2.6, 20.0))
+    for parts, count in ((near, 1), (far, 2)):
+        assert len(place_volumes(ObjectExtent.around(parts), lambda count: 64 // count)[1]) == count
+
+
+def test_memory_bounds_the_size_of_several_volumes() -> None:
+    whole = sets_memory_mb(64, 4)
+    assert affordable_size(64, 4, whole) == 64
+    assert affordable_size(64, 4, whole - 1) == 56
+    assert affordable_size(64, 1, 1) == 64, "one volume is refused elsewhere"
+    assert affordable_size(64, 4, 0) == 0
+
+
+def test_several_volumes_take_the_memory_that_is_stated_and_give_it_back(gpu: GpuContext) -> None:
+    voxels = DeltaVoxels(gpu, DvctMethod(), 32)
+
+    def large_bytes() -> int:
+        large = [item for item in set(gpu_objects(voxels)) if isinstance(item, moderngl.Texture3D)]
+        sets = voxels.real, voxels.objects, voxels.far._set
+        grids = [grid for each in sets for grid in (each.store.grid, each.groups._grid)]
+        occupied = [each.occupied for each in (voxels.mu, voxels.rho, voxels.far.mipmap)]
+        return sum(sizes_bytes([*large, *grids, *occupied]))
+
+    cube = VolumePlacement((0.0, 0.0, 0.0), 1.0, 32)
+    before = large_bytes()
+    assert math.ceil(before / 1e6) == sets_memory_mb(32, 1)
+    voxels._make_room((cube, cube, cube))
+    assert math.ceil(large_bytes() / 1e6) == sets_memory_mb(32, 3)
+    voxels._make_room((cube,))
+    assert large_bytes() == before
+    voxels.release()
+
+
+def plane(half: float, step: float) -> trimesh.Trimesh:
+    """The plane z = 0 in squares."""
+    n = round(2 * half / step)
+    along = np.linspace(-half, half, n + 1)
+    first = np.arange(n * (n + 1)).reshape(n, n + 1)[:, :n].ravel()
+    triangles = [
+        np.stack([first, first + 1, first + n + 2], 1),
+        np.stack([first, first + n + 2, first + n + 1], 1),
+    ]
+    return trimesh.Trimesh(
+        [(x, y, 0) for y in along for x in along], np.concatenate(triangles), process=False
+    )
+
+
+def room(
+    stage: Stage,
+    *balls: Vector,
+    lamp: bool = True,
+    wall: bool = False,
+    **method: Any,  # noqa: ANN401
+) -> SceneDocument:
+    """Balls that stand on a floor, under even light and a lamp; a wall halfway to those that are 0.6 m away."""
+    lamps = [sphere_light((0.5, -0.4, 1.0), 2.0, 0.05)] if lamp else []
+    objects = [
+        stage.virtual(ball(RADIUS, (0, 0, RADIUS)), (0.8, 0.2, 0.1), pose={"translation_m": list(place)})
+        for place in balls
+    ]
+    real = plane(2.5, 0.1)
+    if wall:
+        real = trimesh.util.concatenate([real, shifted(trimesh.creation.box((0.02, 2, 1)), 0.3, 0, 0.5)])
+    settings = {"volume_size": SIZE, "volume_edge_m": None, "cone_count": 8, **method}
+    return stage.document(objects, [*lamps, ambient(0.3)], real, **settings)
+
+
+def floor_around(fields: Fields) -> np.ndarray:
+    """Pixels of the floor near the first ball."""
+    near = np.abs(fields.position[..., :2]).max(axis=-1) < 0.1
+    return np.asarray(
+        near & (fields.normal[..., 2] > 0.9) & (fields.matte == 0) & (fields.position[..., 3] > 0)
+    )
+
+
+def test_a_second_object_far_away_leaves_the_light_around_the_first_as_good(
+    gpu: GpuContext, stage: Stage
+) -> None:
+    """Against voxels of half the size; in one volume around both the error is over ten times as large."""
+    truth = solve(gpu, room(stage, (0, 0, 0), volume_size=2 * SIZE))
+    seen = floor_around(truth)
+
+    def error(document: SceneDocument) -> float:
+        found = solve(gpu, document)
+        return float(np.sqrt(np.mean((found.cones_rho - truth.cones_rho)[seen] ** 2)))
+
+    alone, beside = (error(room(stage, *balls)) for balls in ([(0, 0, 0)], [(0, 0, 0), (APART, 0, 0)]))
+    assert beside < 1.1 * alone + 0.001
+    one_volume = room(stage, (0, 0, 0), (APART, 0, 0), volume_edge_m=2 * (APART + 2 * RADIUS))
+    assert error(one_volume) > 5 * beside
+
+
+def test_light_does_not_jump_where_volumes_part_and_comes_back_to_the_bit(
+    gpu: GpuContext, stage: Stage
+) -> None:
+    """While the second ball is moved away, no step changes more than those within the one volume do."""
+    document = room(stage, (0, 0, 0), (0.0, 0, 0))
+    renderer = SceneRenderer(gpu, document)
+    first, second = document.objects
+
+    def moved_to(x: float) -> tuple[np.ndarray, Fields, int]:
+        away = second.model_copy(update={"pose": Pose(translation_m=(x, 0.0, 0.0))})
+        renderer.set_scene(document.replaced(objects=(first, away)))
+        color = renderer.render(frame()).color
+        assert renderer.graph is not None
+        return color, fields_of(renderer), len(renderer.graph["volume placement"])
+
+    places = TOUCHING + 0.02 * np.arange(-3.5, 3)
+    steps = [moved_to(float(x)) for x in places]
+    assert [count for _, _, count in steps] == [1, 1, 1, 1, 2, 2, 2]
+    changes = []
+    for (_, before, _), (_, after, _) in pairwise(steps):
+        seen = floor_around(before) & floor_around(after) & (before.position[..., 0] < 0.03)
+        changes.append(np.percentile(np.abs(after.cones_rho - before.cones_rho)[seen], 99))
+    assert max(changes[3:]) <= max(changes[:3])
+    back, _, _ = moved_to(float(places[0]))
+    renderer.release()
+    assert np.array_equal(back, steps[0][0])
+
+
+def test_objects_in_different_volumes_light_each_other_unless_something_stands_between(
+    gpu: GpuContext, stage: Stage
+) -> None:
+    """A ball that glows 0.6 m away lights the first as through one volume; a wall between keeps its light off."""
+
+    def gained(*, wall: bool, **method: Any) -> float:  # noqa: ANN401
+        dark = room(stage, (0, 0, 0), (0.6, 0, 0), lamp=False, wall=wall, cone_count=32, **method)
+        first, second = dark.objects
+        assert second.material is not None
+        glowing = second.material.model_copy(update={"emission": (20.0, 20.0, 20.0)})
+        bright = second.model_copy(update={"material": glowing})
+        fields = [solve(gpu, each) for each in (dark, dark.replaced(objects=(first, bright)))]
+        on_first = (fields[0].matte > 0.9) & (np.arange(fields[0].matte.shape[1]) < 90)
+        assert on_first.sum() > 100
+        return float((fields[1].on_object - fields[0].on_object)[on_first].mean())
+
+    apart, together = gained(wall=False), gained(wall=False, shadow="cone", volume_size=2 * SIZE)
+    assert apart == pytest.approx(together, rel=0.25)
+    assert gained(wall=True) < 0.3 * apart

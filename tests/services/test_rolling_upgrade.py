@@ -1,0 +1,111 @@
+"""Hosts are upgraded one after another: processes that speak the oldest schema version run beside those of today."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from deltalight.benchmarks.soak.profiles import choose_profile
+from deltalight.benchmarks.soak.station import soaked_scene, write_take
+from deltalight.protocol.messages import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
+from deltalight.services import ports
+from tests.services.conftest import ROOT
+from tests.services.rooms_installation import wait_for
+
+# The command of the version before: it sends and reads the oldest schema version alone.
+OLDER = f"""
+import sys
+from importlib.util import find_spec, module_from_spec
+from pathlib import Path
+name = "deltalight.protocol.messages"
+spec = find_spec(name)
+source = Path(spec.origin).read_text()
+now = "SCHEMA_VERSION: Final = {SCHEMA_VERSION}\\n"
+assert now in source
+sys.modules[name] = module_from_spec(spec)
+exec(compile(source.replace(now, "SCHEMA_VERSION: Final = {OLDEST_SCHEMA_VERSION}\\n", 1), spec.origin, "exec"),
+     sys.modules[name].__dict__)
+from deltalight.services.cli import main
+main()
+"""
+
+
+@contextmanager
+def running(*arguments: object, is_older: bool = False) -> Iterator[None]:
+    program = ["-c", OLDER] if is_older else ["-m", "deltalight.services.cli"]
+    process = subprocess.Popen([sys.executable, *program, *map(str, arguments)], cwd=ROOT)
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+class Station:
+    """A node, a render server and a web process, each in the version that a test says."""
+
+    def __init__(self, folder: Path) -> None:
+        write_take(folder / "take.mcap", (96, 72), 5.0, frames=(0,) * 5)
+        scene = folder / "scene.json"
+        scene.write_text(soaked_scene(choose_profile("small")).model_dump_json())
+        page, *others = ports.private_ports(4)
+        node, control, publish = map(ports.endpoint, others)
+        self.node = (
+            "node",
+            "--source",
+            folder / "take.mcap",
+            "--loop",
+            "--publish",
+            node,
+            "--clock",
+            control,
+        )
+        self.server = ("server", "--control", control, "--publish", publish, "--subscribe", node)
+        self.server += ("--allow-software",)
+        self.web = ("api", "--port", page, "--data", folder / "data", "--scene", scene, "--control", control)
+        self.web += ("--subscribe", publish, "--subscribe", node)
+        self.client = httpx.Client(base_url=f"http://{ports.LOOPBACK}:{page}/api/v1", timeout=60)
+
+    def is_shown(self) -> bool:
+        """Whether live pictures of the scene come."""
+        state = self.client.get("/state").json()
+        return bool(
+            (state["picture"] or {}).get("state") == "shown"
+            and self.client.get("/live.jpg").status_code == 200
+        )
+
+    def move(self, x_m: float) -> object:
+        """Move the object; return the state of its change in the picture."""
+        scene = self.client.get("/active-scene").json()
+        item = scene["document"]["objects"][0]["id"]
+        answer = self.client.patch(
+            f"/scenes/{scene['id']}/objects/{item}", json={"pose": {"translation_m": [x_m, 0, 0.1]}}
+        )
+        return answer.json()["picture"]["state"]
+
+    def node_is_compared(self) -> bool:
+        """Whether the node has compared its clock with the render server's."""
+        nodes = self.client.get("/nodes").json()
+        return any(each["name"] == "camera" and each["age_s"] < 2 for each in nodes)
+
+
+@pytest.mark.slow
+def test_web_process_then_render_server_then_node_are_upgraded_while_pictures_go_on(tmp_path: Path) -> None:
+    station = Station(tmp_path)
+    with running(*station.web), ExitStack() as node:
+        node.enter_context(running(*station.node, is_older=True))
+        with running(*station.server, is_older=True):
+            wait_for(station.is_shown)
+            assert station.move(0.02) == "shown"
+        with running(*station.server):
+            wait_for(lambda: station.move(0.04) == "shown")
+            wait_for(station.is_shown)
+            node.close()
+            with running(*station.node):
+                wait_for(station.node_is_compared)
+                assert station.move(0.06) == "shown"
+    station.client.close()
