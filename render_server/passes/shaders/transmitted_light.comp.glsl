@@ -7,7 +7,6 @@
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
 #include "common/refraction.glsl"
-#include "common/lobe.glsl"
 #include "common/shown_pixels.glsl"
 #include "common/walk.glsl"
 
@@ -23,6 +22,7 @@ const float NOWHERE = 1e30;        // distance of what a ray does not meet
 const int MOST_SURFACES = 24;      // that the paths of one ray may meet
 const int HELD = 4;                // paths that wait
 const float LEAST_WEIGHT = 0.004;  // of a path that goes on: a step of 8-bit codes
+const float NARROWEST = 1e-3;      // rad: half-angle of the smallest lamp
 
 struct Path { vec3 from; vec3 direction; vec3 weight; int medium; };
 
@@ -49,16 +49,26 @@ Light lamp(int i) {
     return light;
 }
 
+// Fraction of a cone around d that a disc of half-angle `radius` around l fills. Both are even discs, which overlap by a smooth step from
+// where one covers the other to where they part, of the same sum. Chords measure: on a sphere, a disc's area is PI times its chord's square.
+float covered_by_disc(vec3 d, vec3 l, float radius, float spread) {
+    float lamp = 2.0 * sin(0.5 * radius), cone = 0.5 * spread;
+    float wide = max(lamp, cone), narrow = min(lamp, cone);
+    float most = min(lamp * lamp / (cone * cone), 1.0) / (1.0 + 0.2 * narrow * narrow / (wide * wide));
+    return most * (1.0 - smoothstep(wide - narrow, wide + narrow, distance(d, l)));
+}
+
 // Mean radiance of the lamps over a cone around d.
 vec3 lamps_along(vec3 from, vec3 d, float spread) {
     vec3 sum = vec3(0.0);
-    float alpha = max(spread / (2.0 * MEDIAN_DISC), LEAST_ALPHA);
     for (int i = 0; i < light_count; ++i) {
         Light light = lamp(i);
         if (is_image(light)) continue;   // the picture shows the real one
         vec3 l; float radius;
         vec3 across = unmirrored_light_at(light, from, vec3(0.0), l, radius);
-        sum += across * image_of_disc(d, l, alpha, radius);
+        radius = max(radius, NARROWEST);
+        float sine = sin(radius);
+        sum += across * (covered_by_disc(d, l, radius, spread) / (PI * sine * sine));
     }
     return sum;
 }
