@@ -200,7 +200,7 @@ def test_clear_objects_neither_make_nor_lose_light(gpu: GpuContext, stage: Stage
 
 
 def test_a_pane_shows_the_lamp_behind_it(gpu: GpuContext, stage: Stage) -> None:
-    """As large as it is seen, and as bright but for what both faces reflect."""
+    """As large as it is seen, as bright but for what both faces reflect, and without a halo."""
     eye, at, radius, intensity = np.array([0.0, -0.9, 0.3]), np.array([0.0, 1.1, 0.8]), 0.12, 0.05
     pane = shifted(trimesh.creation.box((0.4, 0.002, 0.4)), 0, 0, 0.55)
     lamp = sphere_light((at[0], at[1], at[2]), intensity, radius)
@@ -215,6 +215,7 @@ def test_a_pane_shows_the_lamp_behind_it(gpu: GpuContext, stage: Stage) -> None:
     assert np.quantile(shown[shown > 0.5 * radiance], 0.5) == pytest.approx(passing * radiance, rel=0.03)
     disc_px = FOCAL * radius / np.linalg.norm(at - eye)
     assert (shown / (passing * radiance)).sum() == pytest.approx(np.pi * disc_px**2, rel=0.1)
+    assert np.count_nonzero(shown > 1e-4 * radiance) < np.pi * (disc_px + 1.5) ** 2
 
 
 def beams_of(gpu: GpuContext, document: SceneDocument) -> np.ndarray:
