@@ -20,6 +20,7 @@ from deltalight.benchmarks.soak.nonsense import mutated
 from deltalight.benchmarks.soak.profiles import PROFILES
 from deltalight.benchmarks.soak.station import Station, running_station
 from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.sockets import open_context
 from deltalight.protocol.vectors import FOLDER, unframe_pieces
 from deltalight.services import ports
 
@@ -110,7 +111,7 @@ def _until_shown(station: Station) -> None:
 
 def _asking(stack: ExitStack, endpoint: str) -> Callable[[Sequence[bytes]], bool]:
     """Return what sends a request and tells whether an answer came."""
-    context = zmq.Context()
+    context = open_context()
     stack.callback(context.destroy, 0)
     socket = context.socket(zmq.DEALER)
     socket.connect(endpoint)
