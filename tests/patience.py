@@ -1,4 +1,4 @@
-"""How long tests may take: one that says it takes long gets more time, and a file that loses too much of it is given up."""
+"""How long tests may take: who says that it takes long gets more time, and who loses too much of it is given up."""
 
 from collections import Counter
 from collections.abc import Iterable
