@@ -6,7 +6,8 @@ from collections.abc import Iterable
 import pytest
 
 TIMES = 10  # a machine may be this much slower than the one whose seconds the marks tell
-LOST_S = 300.0  # that the failed tests of a file may take together
+LIMIT_S = 300.0  # of pytest-timeout, for those that do not say
+LOST_S = 120.0  # that the failed tests of a file may take together: two waits of a minute each
 
 
 def grant(items: Iterable[pytest.Item]) -> None:
@@ -14,7 +15,7 @@ def grant(items: Iterable[pytest.Item]) -> None:
     for item in items:
         mark = item.get_closest_marker("slow")
         if mark is not None and "seconds" in mark.kwargs:
-            item.add_marker(pytest.mark.timeout(max(LOST_S, TIMES * mark.kwargs["seconds"])))
+            item.add_marker(pytest.mark.timeout(max(LIMIT_S, TIMES * mark.kwargs["seconds"])))
 
 
 class LostTime:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.patience import LOST_S, TIMES, LostTime, grant
+from tests.patience import LIMIT_S, LOST_S, TIMES, LostTime, grant
 
 
 def report(nodeid: str, outcome: str, duration_s: float) -> pytest.TestReport:
@@ -40,7 +40,7 @@ def test_a_file_whose_tests_fail_for_long_is_given_up(item: pytest.Item) -> None
         lost.refuse(item)
 
 
-@pytest.mark.parametrize(("seconds", "limit_s"), [(10, LOST_S), (100, 100 * TIMES)])
+@pytest.mark.parametrize(("seconds", "limit_s"), [(10, LIMIT_S), (100, 100 * TIMES)])
 def test_who_says_that_it_takes_long_gets_more_time(
     item: pytest.Item, seconds: float, limit_s: float
 ) -> None:
