@@ -46,11 +46,9 @@ void look_around(ivec2 pixel, float z, out Side front, out Side back) {
     for (int j = REACH; j < SPAN - REACH; ++j) {
         uvec2 row = rows[j - 2] & rows[j - 1] & rows[j] & rows[j + 1] & rows[j + 2];
         for (int i = REACH; i < SPAN - REACH; ++i) {
-            uvec2 is = row >> uint(i) & 1u;
-            if ((is.x | is.y) == 0u) continue;
-            Sample one = sample_at(pixel, ivec2(i, j) - SIGHT - REACH, ray);
-            if (is.x != 0u) add(front, one);
-            if (is.y != 0u) add(back, one);
+            ivec2 offset = ivec2(i, j) - SIGHT - REACH;
+            if (((row.x >> uint(i)) & 1u) != 0u) add(front, pixel, offset, ray);
+            if (((row.y >> uint(i)) & 1u) != 0u) add(back, pixel, offset, ray);
         }
     }
     finish(front);

@@ -27,10 +27,9 @@ void look_along(ivec2 pixel, float z, vec3 ray, vec2 direction, inout Side front
         if (!in_picture(at)) return;
         float real = texelFetch(real_surface_position, at, 0).w;
         if (real <= 0.0) continue;
-        Sample one = sample_at(pixel, offset, ray);
         if (real >= hides_before(z)) {
-            if (backs < TAKEN && !near_front(at, z)) { add(back, one); ++backs; }
-        } else if (fronts < TAKEN && inside_front(at, z)) { add(front, one); ++fronts; }
+            if (backs < TAKEN && !near_front(at, z)) { add(back, pixel, offset, ray); ++backs; }
+        } else if (fronts < TAKEN && inside_front(at, z)) { add(front, pixel, offset, ray); ++fronts; }
     }
 }
 

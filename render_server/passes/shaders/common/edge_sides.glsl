@@ -28,22 +28,16 @@ float continued(ivec2 at, vec3 ray) {
     return abs(away) > 1e-3 * position.w ? dot(normal, ray) / away : 1.0 / position.w;
 }
 
-// Software renderers execute what both sides of a branch do: what is added to either side is found before.
-struct Sample { ivec2 offset; vec3 colour; float inverse_depth; float w; };
-
-Sample sample_at(ivec2 pixel, ivec2 offset, vec3 ray) {
+void add(inout Side side, ivec2 pixel, ivec2 offset, vec3 ray) {
+    vec3 colour = texelFetch(linear_picture, pixel + offset, 0).rgb;
     float w = 1.0 / float(offset.x * offset.x + offset.y * offset.y);
-    return Sample(offset, texelFetch(linear_picture, pixel + offset, 0).rgb, continued(pixel + offset, ray), w);
-}
-
-void add(inout Side side, Sample one) {
     ivec2 n = side.nearest;
-    if (side.count == 0 || one.w * float(n.x * n.x + n.y * n.y) > 1.0) side.nearest = one.offset;
-    side.colour += one.w * one.colour;
-    side.squares += one.w * outerProduct(one.colour, one.colour);
-    side.middle += one.w * vec2(one.offset);
-    side.inverse_depth += one.w * one.inverse_depth;
-    side.weight += one.w;
+    if (side.count == 0 || w * float(n.x * n.x + n.y * n.y) > 1.0) side.nearest = offset;
+    side.colour += w * colour;
+    side.squares += w * outerProduct(colour, colour);
+    side.middle += w * vec2(offset);
+    side.inverse_depth += w * continued(pixel + offset, ray);
+    side.weight += w;
     side.count += 1;
 }
 
