@@ -142,7 +142,7 @@ def configuration(known: dict[str, Sequence[str | int]]) -> str:
     return "\n".join(lines)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=75)
 def test_answers_keep_to_the_description(full_api: RunningApi, tmp_path: Path) -> None:
     description = copy.deepcopy(full_api.app.openapi())  # type: ignore[attr-defined]
     del description["paths"]["/api/v1/whep"]
