@@ -14,8 +14,9 @@ def grant(items: Iterable[pytest.Item]) -> None:
     """Give tests that say how long they take that time, TIMES over; the others have pytest-timeout's."""
     for item in items:
         mark = item.get_closest_marker("slow")
-        if mark is not None and "seconds" in mark.kwargs:
-            item.add_marker(pytest.mark.timeout(max(LIMIT_S, TIMES * mark.kwargs["seconds"])))
+        limit_s = TIMES * mark.kwargs.get("seconds", 0.0) if mark is not None else 0.0
+        if limit_s > LIMIT_S:
+            item.add_marker(pytest.mark.timeout(limit_s))
 
 
 class LostTime:

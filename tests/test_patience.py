@@ -40,14 +40,13 @@ def test_a_file_whose_tests_fail_for_long_is_given_up(item: pytest.Item) -> None
         lost.refuse(item)
 
 
-@pytest.mark.parametrize(("seconds", "limit_s"), [(10, LIMIT_S), (100, 100 * TIMES)])
-def test_who_says_that_it_takes_long_gets_more_time(
-    item: pytest.Item, seconds: float, limit_s: float
-) -> None:
+def test_who_says_that_it_takes_long_gets_more_time(item: pytest.Item) -> None:
     grant([item])
-    assert item.get_closest_marker("timeout") is None
-    item.add_marker(pytest.mark.slow(seconds=seconds))
+    item.add_marker(pytest.mark.slow(seconds=LIMIT_S / TIMES))
+    grant([item])
+    assert item.get_closest_marker("timeout") is None, "it has the limit of all"
+    item.add_marker(pytest.mark.slow(seconds=LIMIT_S), append=False)
     grant([item])
     mark = item.get_closest_marker("timeout")
     assert mark is not None
-    assert mark.args == (limit_s,)
+    assert mark.args == (LIMIT_S * TIMES,)
