@@ -24,7 +24,7 @@ from deltalight.services.rooms.status import RoomStatus
 from tests.services.conftest import ROOT
 
 PATIENCE_S = 150.0
-POLL_S = 0.1  # each look is a request, whose answer takes what it waits for from the processor
+POLL_S = 0.05  # each look is a request, whose answer takes what it waits for from the processor
 ROOMS = """
 slots: 2
 nodes: {desk: {source: take.mcap}}
