@@ -1,6 +1,6 @@
 """How long tests may take: who says that it takes long gets more time, and who loses too much of it is given up."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterable
 
 import pytest
@@ -26,7 +26,7 @@ class LostTime:
     """
 
     def __init__(self) -> None:
-        self._lost_s: Counter[str] = Counter()  # by file
+        self._lost_s = defaultdict[str, float](float)  # by file
 
     def note(self, report: pytest.TestReport) -> None:
         """Count the time of a test that failed."""
