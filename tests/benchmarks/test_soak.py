@@ -236,7 +236,7 @@ def test_wrong_options_are_sentences(
     assert parse_faults("none") == []
 
 
-@pytest.mark.slow(seconds=145)
+@pytest.mark.slow(seconds=170)
 @pytest.mark.skipif(
     not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
 )

@@ -19,7 +19,7 @@ from deltalight.render_server.gpu.kernel import Bindings, _Program
 from tests.render_server.protected_scenes import METHODS, Case, pictures_of
 from tests.render_server.test_golden import psnr_db
 
-pytestmark = [pytest.mark.slow(seconds=15), pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=8), pytest.mark.usefixtures("clean_gl")]
 CASES = [Case(method, "model", "mirror") for method in METHODS if method != "none"]
 POISON = b"\xff"  # NaN in floats, -1 or the greatest number in integers
 LEAST_PSNR_DB = 60.0  # light propagates in another order there

@@ -34,7 +34,7 @@ from tests.render_server.scenes import (
     with_neighbours,
 )
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=35), pytest.mark.usefixtures("clean_gl")]
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed", allow_module_level=True)
 WIDTH, HEIGHT, FOCAL = 320, 240, 420.0

@@ -31,7 +31,7 @@ from tests.services.rooms_installation import (
 )
 
 pytestmark = [
-    pytest.mark.slow(seconds=15),
+    pytest.mark.slow(seconds=25),
     pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
 ]
 # A host that is silent for a second and a half is dead (Ray's default is 15 s).
