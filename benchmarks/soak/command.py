@@ -23,7 +23,7 @@ from deltalight.protocol.files import write_bytes
 from deltalight.services import ports
 from deltalight.services.files import make_output_folder
 
-START_TIMEOUT_S = 180.0  # a cold shader cache on a slow machine takes a while
+START_TIMEOUT_S = 300.0  # a cold shader cache on a slow machine takes a while, and each camera needs a frame
 END_TIMEOUT_S = 5.0  # a process whose supervisor is gone ends itself
 PLOT = "soak.svg"
 
