@@ -43,6 +43,7 @@ RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
 MAXIMUM_FAULTS_IN_A_ROW = 30
 LOG_INTERVAL_NS = 10**9
+SAME_LOG_INTERVAL_NS = 60 * 10**9  # of one sentence, whose fault may come and go
 WATCHED_NS = 60 * 10**9
 
 log = structlog.get_logger()
@@ -161,7 +162,7 @@ class RenderSession:
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._logged_notices = 0
-        self._logged_ns = -LOG_INTERVAL_NS
+        self._logged = "", -SAME_LOG_INTERVAL_NS  # which fault, and when
 
     def receive(self, multipart: ReceivedMultipart) -> None:
         """Takes a message of the sensor node; a malformed one is counted and logged."""
@@ -454,10 +455,11 @@ class RenderSession:
         self.counts[kind] += 1
         named = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
         sentence = as_sentence(named)
-        now_ns = self._clock_ns()
+        now_ns, (logged, logged_ns) = self._clock_ns(), self._logged
+        interval_ns = SAME_LOG_INTERVAL_NS if sentence == logged else LOG_INTERVAL_NS
         # A fault of every frame is one line, not thirty a second, and a node that finds others fills no disk.
-        if sentence != self._last_fault and now_ns - self._logged_ns >= LOG_INTERVAL_NS:
-            self._logged_ns = now_ns
+        if sentence != self._last_fault and now_ns - logged_ns >= interval_ns:
+            self._logged = sentence, now_ns
             log.warning(kind, fault=sentence)
             log.debug("traceback", exc_info=fault)
         self._last_fault = sentence

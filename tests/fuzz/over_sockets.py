@@ -39,7 +39,7 @@ def main() -> None:
     with ExitStack() as stack:
         thread = stack.enter_context(LoopThread("links"))
         station = stack.enter_context(running_station(PROFILES["small"], thread, options.seed))
-        _until_shown(station)
+        until_shown(station)
         print(json.dumps(attacked(station, options.messages, Random(options.seed))), flush=True)
 
 
@@ -96,7 +96,8 @@ class Gaps:
             self._shown, self._since_s = shown, now_s
 
 
-def _until_shown(station: Station) -> None:
+def until_shown(station: Station) -> None:
+    """Wait for the first picture."""
     deadline_s = time.monotonic() + START_S
     while time.monotonic() < deadline_s:
         station.check()
