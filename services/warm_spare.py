@@ -13,6 +13,7 @@ SPARE_VARIABLE = "DELTALIGHT_SPARE_PREPARES"
 GO = b"1"
 PREPARED = {  # by spares of a command
     "node": ("deltalight.services.node_process", "pydantic_settings"),
+    "replay": ("deltalight.services.node_process", "pydantic_settings"),
     "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings"),
     "api": ("deltalight.services.api.serve", "pydantic_settings"),
 }

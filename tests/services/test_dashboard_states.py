@@ -3,16 +3,23 @@
 Node and renderer are stand-ins.
 """
 
+import gzip
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import cv2
 import pytest
-from playwright.sync_api import Browser, Route, WebSocketRoute, expect
+from playwright.sync_api import Browser, Response, Route, WebSocketRoute, expect
 
 from deltalight import __version__
+from deltalight.protocol.source import open_source
+from deltalight.sensor_node.cameras.playback import PlaybackCamera
+from deltalight.services import ports
 from deltalight.services.demo import POSTER, POSTER_BEFORE
+from deltalight.services.node_process import playback_control
 from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
     SCREENSHOTS,
@@ -22,6 +29,7 @@ from tests.services.dashboard_samples import (
     Stack,
 )
 from tests.services.live_samples import AGE_S, NOISE, LiveApi, live_api, shade
+from tests.services.record_samples import frames, write
 
 pytestmark = NEEDS_BROWSER
 LAMP = {"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}
@@ -29,6 +37,8 @@ SCENE = {"name": "Gallery", "lights": {"mode": "manual", "manual": [LAMP]}}
 PHONE = {"width": 390, "height": 844}
 TABS = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History")
 PANELS = ("Object", "Lights", "Real", "Method", "Output")
+
+FIRST_LOAD_BYTES = 400_000  # gzipped
 
 
 @pytest.fixture(scope="module")
@@ -253,6 +263,52 @@ def test_the_guide_ticks_off_what_was_tried_and_keeps_it(stack: Stack, page: Des
     assert stack.document()["lights"]["manual"][-1]["type"] == "spot"
 
 
+@contextmanager
+def node_that_plays(folder: Path) -> Iterator[tuple[PlaybackCamera, LiveApi]]:
+    """A node whose source is a recording, paused at its start, and an API that is told where it is controlled."""
+    (port,) = ports.private_ports(1)
+    recording = open_source(write(folder / "a.mcap", frames(9)))
+    camera = PlaybackCamera(recording, loop=True, playing=False, stays=True)
+    options = {"period_s": STAND_IN_PERIOD_S, "playback": ports.endpoint(port)}
+    with playback_control(camera, ports.endpoint(port), None), live_api(folder / "data", **options) as api:  # type: ignore[arg-type]
+        yield camera, api
+
+
+def test_the_camera_of_a_recording_that_the_node_plays_is_moved_by_a_slider(
+    browser: Browser, tmp_path: Path
+) -> None:
+    with ExitStack() as opened:
+        camera, api = opened.enter_context(node_that_plays(tmp_path))
+        store = api.api.store
+        scene = store.scenes.activate(store.scenes.create(SCENE).head.id).head.id
+        api.stream.scene = (scene, 1)
+        stack = Stack(api.address, api.client, f"/scenes/{scene}")
+        page = opened.enter_context(contextmanager(seat)(stack, browser, viewport=SIZE))
+        page.open()
+        bar = page.named("group", "Camera motion")
+        slider, end_s = bar.get_by_role("slider", name="Position"), camera.playback.duration_s
+        expect(slider).to_have_value("0")
+        expect(page.named("button", "Back to live")).to_have_count(0)
+        says(page, "Live")
+        step = page.named("region", "Try this").get_by_role("listitem").filter(has_text="Move the camera")
+        expect(step).not_to_have_class("done")
+        slider.press("End")
+        page.until(lambda: camera.playback.position_s == pytest.approx(end_s), "the end")
+        expect(step).to_have_class("done")
+        bar.get_by_role("button", name="Play", exact=True).click()
+        page.until(lambda: camera.playback.playing, "the motion")
+        bar.get_by_role("button", name="Pause").click()
+        page.until(lambda: not camera.playback.playing, "the pause")
+        camera.seek(end_s / 2)  # as by another page
+        place_s = camera.playback.position_s
+        page.until(
+            lambda: float(slider.input_value()) == pytest.approx(place_s), "where another page moved it"
+        )
+        page.page.set_viewport_size(PHONE)  # type: ignore[arg-type]
+        assert page.beyond_the_edge() == []
+        expect(slider).to_be_in_viewport(ratio=1)
+
+
 def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, page: Desk) -> None:
     page.open()
     page.named("button", "Scenes: Gallery").click()
@@ -265,6 +321,17 @@ def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, pag
     name.press("Enter")
     expect(page.named("button", "Scenes: mY room #2")).to_be_visible()
     page.until(lambda: stack.document()["name"] == "mY room #2", "the name in the document")
+
+
+def test_what_the_page_loads_at_first_is_small(page: Desk) -> None:
+    loaded: list[Response] = []
+    page.page.on("response", loaded.append)
+    page.open()
+    page.page.wait_for_load_state("networkidle")
+    files = {each.url: each for each in loaded if "/api/" not in each.url}
+    assert any(".js" in url for url in files)
+    sizes = {url: len(gzip.compress(each.body())) for url, each in files.items()}
+    assert sum(sizes.values()) < FIRST_LOAD_BYTES, sizes
 
 
 def test_everything_can_be_reached_on_a_phone(phone: Desk) -> None:
