@@ -3,7 +3,6 @@
 Node and renderer are stand-ins.
 """
 
-import gzip
 import re
 import shutil
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from playwright.sync_api import Browser, Response, Route, WebSocketRoute, expect
+from playwright.sync_api import Browser, Route, WebSocketRoute, expect
 
 from deltalight import __version__
 from deltalight.protocol.source import open_source
@@ -37,8 +36,6 @@ SCENE = {"name": "Gallery", "lights": {"mode": "manual", "manual": [LAMP]}}
 PHONE = {"width": 390, "height": 844}
 TABS = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History")
 PANELS = ("Object", "Lights", "Real", "Method", "Output")
-
-FIRST_LOAD_BYTES = 400_000  # gzipped
 
 
 @pytest.fixture(scope="module")
@@ -321,20 +318,6 @@ def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, pag
     name.press("Enter")
     expect(page.named("button", "Scenes: mY room #2")).to_be_visible()
     page.until(lambda: stack.document()["name"] == "mY room #2", "the name in the document")
-
-
-def test_what_the_page_loads_at_first_is_small(page: Desk) -> None:
-    files: dict[str, Response] = {}
-
-    def keep(response: Response) -> None:
-        if "/api/" not in response.url:
-            files[response.url] = response
-
-    page.page.on("response", keep)
-    page.open()
-    assert any(url.endswith(".js") for url in files)
-    sizes = {url: len(gzip.compress(each.body())) for url, each in files.items()}
-    assert sum(sizes.values()) < FIRST_LOAD_BYTES, sizes
 
 
 def test_everything_can_be_reached_on_a_phone(phone: Desk) -> None:
