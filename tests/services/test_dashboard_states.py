@@ -6,7 +6,7 @@ Node and renderer are stand-ins.
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
 import cv2
@@ -38,12 +38,15 @@ TABS = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History")
 PANELS = ("Object", "Lights", "Real", "Method", "Output")
 
 
+def stand_in(data: Path, **settings: object) -> AbstractContextManager[LiveApi]:
+    """An API whose pictures are noise, or the demo's still where pictures are wanted."""
+    picture = cv2.cvtColor(cv2.imread(str(POSTER)), cv2.COLOR_BGR2RGB) if SCREENSHOTS else NOISE
+    return live_api(data, period_s=STAND_IN_PERIOD_S, picture=picture, **settings)
+
+
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
-    """Shows noise, or the demo's still where pictures are wanted."""
-    picture = cv2.cvtColor(cv2.imread(str(POSTER)), cv2.COLOR_BGR2RGB) if SCREENSHOTS else NOISE
-    data = tmp_path_factory.mktemp("data")
-    with live_api(data, period_s=STAND_IN_PERIOD_S, picture=picture) as running:
+    with stand_in(tmp_path_factory.mktemp("data")) as running:
         yield running
 
 
@@ -266,8 +269,8 @@ def node_that_plays(folder: Path) -> Iterator[tuple[PlaybackCamera, LiveApi]]:
     (port,) = ports.private_ports(1)
     recording = open_source(write(folder / "a.mcap", frames(9)))
     camera = PlaybackCamera(recording, loop=True, playing=False, stays=True)
-    options = {"period_s": STAND_IN_PERIOD_S, "playback": ports.endpoint(port)}
-    with playback_control(camera, ports.endpoint(port), None), live_api(folder / "data", **options) as api:  # type: ignore[arg-type]
+    endpoint = ports.endpoint(port)
+    with playback_control(camera, endpoint, None), stand_in(folder / "data", playback=endpoint) as api:
         yield camera, api
 
 
@@ -296,6 +299,7 @@ def test_the_camera_of_a_recording_that_the_node_plays_is_moved_by_a_slider(
         page.until(lambda: camera.playback.playing, "the motion")
         bar.get_by_role("button", name="Pause").click()
         page.until(lambda: not camera.playback.playing, "the pause")
+        page.photograph("camera_motion")
         camera.seek(end_s / 2)  # as by another page
         place_s = camera.playback.position_s
         page.until(

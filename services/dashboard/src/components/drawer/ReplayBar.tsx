@@ -19,6 +19,8 @@ import { Select } from "../ui/Select";
 
 const RATES = ["0.25", "0.5", "1", "2", "4"].map((value) => ({ value, label: `${value}×` }));
 const POLL_MS = 1000;
+// Of such a recording tenths of seconds are told.
+const SHORT_S = 10;
 
 /** Timeline of the recording that is shown: in place of the camera, or where the node itself plays one. */
 export function ReplayBar() {
@@ -85,14 +87,15 @@ function Timeline({ shown, disabled }: { readonly shown: Replay; readonly disabl
   const position = shown.position_s ?? 0;
   const duration = shown.duration_s ?? 0;
   const share = duration > 0 ? position / duration : 0;
+  const text = duration < SHORT_S ? (seconds: number) => `${seconds.toFixed(1)} s` : clock;
   return (
     <>
-      <span class="quiet">{clock(position)}</span>
+      <span class="quiet">{text(position)}</span>
       <input
         type="range"
         class="grow"
         aria-label="Position"
-        aria-valuetext={`${clock(position)} of ${clock(duration)}`}
+        aria-valuetext={`${text(position)} of ${text(duration)}`}
         min={0}
         max={duration}
         step="any"
@@ -102,7 +105,7 @@ function Timeline({ shown, disabled }: { readonly shown: Replay; readonly disabl
         onInput={(event) => scrub(event.currentTarget.valueAsNumber)}
         ref={(element) => element?.style.setProperty("--filled", `${100 * share}%`)}
       />
-      <span class="quiet">{clock(duration)}</span>
+      <span class="quiet">{text(duration)}</span>
     </>
   );
 }
