@@ -14,8 +14,8 @@ from deltalight.sensor_node.cameras.base import Camera, EndOfStream
 from deltalight.sensor_node.cameras.replay import CLOCK_STEP_NS, DEFAULT_PERIOD_NS, LATE_NS
 
 MIN_RATE, MAX_RATE = 0.05, 20.0
-# Period of repeating a frame that stands still: a change of the scene shows, and nothing looks lost.
-REPEAT_NS = 500_000_000
+# Bounds of the period of repeating a frame that stands still: what moves in the scene goes on moving as it did.
+LEAST_REPEAT_NS, MOST_REPEAT_NS = 66_666_667, 500_000_000
 # Time between frames on both sides of a jump: longer than the memory of any filter.
 JUMP_NS = 1_000_000_000
 
@@ -36,7 +36,7 @@ class PlaybackCamera(Camera):
 
     Every frame is stamped with the moment at which it is due here, whatever its position in the recording: numbers,
     times and stamps keep rising after a pause, a seek or a new round, so that whoever pairs, smooths or records the
-    streams sees one camera. While paused, the frame is repeated twice a second.
+    streams sees one camera. While paused, the frame is repeated at the recording's rate, 2 to 15 times a second.
 
     Args:
         source: what to replay.
@@ -64,6 +64,7 @@ class PlaybackCamera(Camera):
         self._times = np.asarray(source.timestamps_ns, np.int64)
         steps = np.diff(self._times)
         self._period_ns = int(np.median(steps)) if len(steps) else DEFAULT_PERIOD_NS
+        self._repeat_ns = min(max(self._period_ns, LEAST_REPEAT_NS), MOST_REPEAT_NS)
         self._loop, self._stays, self._rate = loop, stays, _checked_rate(rate)
         self._playing = playing
         self._changed = threading.Condition()
@@ -189,7 +190,7 @@ class PlaybackCamera(Camera):
                 raise EndOfStream
             self._playing = False
         if not self._playing:
-            return self._index, self._due_ns + REPEAT_NS
+            return self._index, self._due_ns + self._repeat_ns
         return self._following()
 
     def _following(self) -> tuple[int, int]:

@@ -194,7 +194,13 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
             assert client.get("/poster.jpg").content == POSTER.read_bytes()
             assert client.get("/poster-before.jpg").content == POSTER_BEFORE.read_bytes()
             (recording,) = client.get("/recordings").json()
+            begins = client.get("/replay").json()
+            end_s = begins["duration_s"]
+            assert client.patch("/replay", json={"position_s": end_s}).json()["position_s"] == pytest.approx(
+                end_s
+            )
         assert (recording["id"], recording["frames"]) == ("demo", 30)
+        assert (begins["recording"], begins["position_s"], begins["playing"]) == (None, 0, False)
     with demo(page_port, "--method", "paper") as address:
         check_changes(address)
 

@@ -3,7 +3,7 @@
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,16 @@ from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.gpu.context import CompileWatcher
+from deltalight.render_server.server import process
 from deltalight.render_server.server.process import ServerSettings, serve
+from deltalight.render_server.started_frame import CameraFrame
 from deltalight.services import ports
 from deltalight.services.api.streams import ProcessWatch
 from tests.services.api_samples import UPLOAD, running_api
 from tests.services.conftest import camera, color, depth, pose
+from tests.services.render_server_samples import Started
 from tests.services.storage_samples import TETRAHEDRON
 from tests.services.test_session import InvertingRenderer
 
@@ -62,7 +67,13 @@ class Node:
 class Server:
     """A render server in a thread, its control client, and a receiver of what it publishes."""
 
-    def __init__(self, renderer: InvertingRenderer, node_port: int, **settings: object) -> None:
+    def __init__(
+        self,
+        renderer: InvertingRenderer,
+        node_port: int,
+        compile_watchers: list[CompileWatcher] | None = None,
+        **settings: object,
+    ) -> None:
         self.control, self.published = map(ports.endpoint, ports.private_ports(2))
         scene = SceneDocument(revision=7)
         self._settings = ServerSettings.model_validate(
@@ -76,7 +87,7 @@ class Server:
         self._thread = threading.Thread(
             target=serve,
             args=(self._settings, renderer, scene),
-            kwargs={"renderer_name": "abacus"},
+            kwargs={"renderer_name": "abacus", "compile_watchers": compile_watchers},
             daemon=True,
         )
         self._thread.start()
@@ -109,11 +120,17 @@ class Server:
 
 
 @contextmanager
-def serving(*, immediate: bool = True, **settings: object) -> Iterator[tuple[Server, InvertingRenderer, int]]:
-    renderer = InvertingRenderer()
+def serving(
+    renderer: InvertingRenderer | None = None,
+    compile_watchers: list[CompileWatcher] | None = None,
+    *,
+    immediate: bool = True,
+    **settings: object,
+) -> Iterator[tuple[Server, InvertingRenderer, int]]:
+    renderer = renderer or InvertingRenderer()
     renderer.immediate = immediate
     (node_port,) = ports.private_ports(1)
-    server = Server(renderer, node_port, **settings)
+    server = Server(renderer, node_port, compile_watchers, **settings)
     try:
         yield server, renderer, node_port
     finally:
@@ -255,6 +272,44 @@ def test_a_state_that_comes_and_goes_is_counted_each_time_and_logged_once() -> N
             report = watch.note(StatsMessage(node="cam", capture_ns=number, state=state, detail="board"))
     assert report.degraded == 10
     assert [each["event"] for each in lines] == ["a process is degraded", "a process is no longer degraded"]
+
+
+class CompilingRenderer(InvertingRenderer):
+    """Compiles two shaders for its first picture, the second once `released`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.watchers: list[CompileWatcher] = []
+        self.released = threading.Event()
+
+    def submit_cameras(
+        self,
+        taken: Sequence[CameraFrame],
+        *,
+        with_linear: bool = False,
+        whole: bool = False,
+        others: Sequence[ShownView] = (),
+    ) -> list[Started]:
+        for label in ("clear", "shade"):
+            for watch in self.watchers:
+                watch(label, {})
+            self.released.wait(PATIENCE_S)
+        return super().submit_cameras(taken, with_linear=with_linear, whole=whole, others=others)
+
+
+def test_how_far_a_first_picture_is_comes_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "PREPARING_INTERVAL_S", 0.0)
+    renderer = CompilingRenderer()
+    with serving(renderer, renderer.watchers) as (server, _, node_port):
+        receiver, node = Receiver([server.published], ["stats"]), Node(ports.endpoint(node_port))
+        states = []
+        while "starting" not in states:
+            messages = [decode(each)[0] for each in (receiver.latest(PATIENCE_S) or {}).values()]
+            states += [message.state for message in messages if isinstance(message, StatsMessage)]
+        renderer.released.set()
+        assert server.first(lambda message: message.status == "ok")
+        node.close()
+        receiver.close()
 
 
 def test_frames_go_on_after_a_snapshot_and_commands_wait_for_it(tmp_path: Path) -> None:
