@@ -42,24 +42,25 @@ def a_light(kind: str, rng: np.random.Generator) -> Light:
     return SphereLight(place.astype(np.float32), white, float(rng.uniform(0, 0.1)))
 
 
-def spheres_of(rng: np.random.Generator) -> Array:
-    """Middle and radius, m: from a point to as large as the volume is."""
+def samples_of(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Spheres (middle and radius, m), and places and normals of points in each.
+
+    A sphere may be a point, or as large as the volume. Most points are on its rim, where a bound that is too small
+    misses first.
+    """
     radii = 10 ** rng.uniform(-3, 0, (SPHERES, 1)) * EDGE_M
-    return np.hstack([rng.uniform(-2, 2, (SPHERES, 3)) * EDGE_M, radii])
-
-
-def points_of(spheres: Array, rng: np.random.Generator) -> Array:
-    """Places and normals: most on the rim, where a bound that is too small misses first."""
+    spheres = np.hstack([rng.uniform(-2, 2, (SPHERES, 3)) * EDGE_M, radii])
     shares = np.minimum(rng.uniform(0, 1.5, (SPHERES, POINTS, 1)), 1)
     away = unit(rng.normal(size=(SPHERES, POINTS, 3)))
     places = spheres[:, None, :3] + spheres[:, None, 3:] * shares * away
-    return np.stack([places, unit(rng.normal(size=places.shape))], axis=2)
+    return spheres, np.stack([places, unit(rng.normal(size=places.shape))], axis=2)
 
 
 def found_in(
-    gpu: GpuContext, kernel: Kernel, light: Light, box: Array, spheres: Array, points: Array
+    gpu: GpuContext, kernel: Kernel, light: Light, box: Array, samples: tuple[Array, Array]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Whether the bound says that cones may meet a box of voxels, and whether any of the points' does."""
+    spheres, points = samples
     with ExitStack() as stack:
         lights = LightBuffers(gpu, 8, 1)
         stack.callback(lights.release)
@@ -89,10 +90,10 @@ def test_no_cone_meets_the_objects_from_where_the_bound_says_so(
     for number in range(ROUNDS):
         low = rng.uniform(0, VOXELS - 2, 3)
         box = np.stack([low, rng.uniform(low + 1, VOXELS)])
-        spheres = spheres_of(rng)
-        points = points_of(spheres, rng)
-        maybe[number], does[number] = found_in(gpu, kernel, a_light(kind, rng), box, spheres, points)
-    print(f"{kind}: cones meet the objects from {does.mean():.1%} of the spheres, may from {maybe.mean():.1%}")
+        maybe[number], does[number] = found_in(gpu, kernel, a_light(kind, rng), box, samples_of(rng))
+    print(
+        f"{kind}: cones meet the objects from {does.mean():.1%} of the spheres, may from {maybe.mean():.1%}"
+    )
     assert does.any()
     assert not (does & ~maybe).any()
     assert (~maybe).mean() > 0.5 * (~does).mean(), "the bound tells most that are out of reach"
