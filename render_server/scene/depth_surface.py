@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage
+from deltalight.render_server.view import LENSES_KEPT
 
 ASSUMED_NOISE_SIGMA_M = 0.002
 MAX_SLOPE_DEG = 80.0
@@ -232,7 +233,7 @@ def by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float
     return np.stack([(by_pixel * inverse[:, ray]).sum(axis=0) for ray in (0, 1)])
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=LENSES_KEPT)
 def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 h w"]:
     """Returns the change of pixel coordinates (first axis) by ray coordinates (second) at every pixel."""
     rays = camera.rays().astype(np.float64)
@@ -261,7 +262,7 @@ def surface_normals(
     return np.asarray(cv2.merge([x * scale, y * scale, z * scale]))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=LENSES_KEPT)
 def _ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
     return np.ascontiguousarray(camera.rays().transpose(2, 0, 1))
 
