@@ -30,11 +30,8 @@ from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.brdf_fit import fit_brdf
 from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX, BrdfMeasurements, read_brdf
 from deltalight.render_server.scene.material_file import write_material
-from deltalight.render_server.scene.polynomial_texture import (
-    INFO_NAME,
-    polynomial_terms,
-    read_polynomial_texture,
-)
+from deltalight.render_server.scene.texture_folder import INFO_NAME
+from deltalight.render_server.scene.textures_by_light import read_texture_by_light
 
 SIDE, FOCAL = 200, 380.0  # pixels
 EYE, RADIUS = np.array([0.0, 0.0, 1.0]), 0.22  # m
@@ -177,7 +174,7 @@ def draw_paint(path: Path, folder: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 def draw_map(source: Path, folder: Path) -> list[UInt8[np.ndarray, "h w 3"]]:
     """Returns plates with a polynomial texture map under lamps, above as the polynomials have it, below as drawn."""
-    texture = read_polynomial_texture(source)
+    texture = read_texture_by_light(source)
     write_material(folder / "map.dlmat", texture)
     plate = trimesh.Trimesh(
         np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / FOCAL / 2, [[0, 1, 2], [0, 2, 3]]
@@ -186,13 +183,9 @@ def draw_map(source: Path, folder: Path) -> list[UInt8[np.ndarray, "h w 3"]]:
     plate.export(folder / "plate.obj")
     columns = []
     for way in MAP_LAMPS:
-        towards = -np.array([way]) / np.linalg.norm(way)
-        coded = np.clip(
-            np.tensordot(polynomial_terms(towards), texture.coefficients.astype(float), 1)[0], 0, 1
-        )
-        given = cv2.resize(coded.astype(np.float32), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        shown = texture.under(-np.array(way) / np.linalg.norm(way))
         codes = [
-            np.round(255 * given).astype(np.uint8),
+            _codes(cv2.resize(shown, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float64)),
             _codes(drawn_picture(folder / "plate.obj", folder / "map.dlmat", [(way, np.pi, 0.0)])),
         ]
         typer.echo(_agreement(f"{source.name}, light along {way}", *codes))
