@@ -29,7 +29,7 @@ class TextureStack:
     """A texture under lights at even steps of the cosine 0..1 between light and normal, and the coat over it.
 
     `layers` is the radiance relative to that of a white Lambertian which the light meets head-on: times the
-    irradiance across the light's beam / pi. Row 0 is the top. `f0` (0: no coat) and `roughness` are those of `Material`.
+    irradiance across the light's beam / pi. Row 0 is the top. `f0` (0: none) and `roughness` are a `Material`'s.
     """
 
     layers: Float16[np.ndarray, "k h w 3"]
@@ -48,7 +48,7 @@ class TextureStack:
 
     @cached_property
     def albedo(self) -> Float16[np.ndarray, "h w 3"]:
-        """What each texel reflects of light from everywhere, coat left out: twice the mean over the cosine, at most 1."""
+        """What texels reflect of light from everywhere, coat left out: twice the mean over the cosine, up to 1."""
         inner = self.layers[1:-1].sum(axis=0, dtype=np.float32)
         ends = self.layers[0].astype(np.float32) + self.layers[-1]
         return np.minimum(2 * (inner + 0.5 * ends) / (len(self.layers) - 1), 1).astype(np.float16)

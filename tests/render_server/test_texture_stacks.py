@@ -63,8 +63,9 @@ def seen(eye: tuple[float, float, float] = EYES[0]) -> ViewFrame:
 
 def plate(folder: Path, material: TextureByLight | dict[str, Any], **pose: object) -> dict[str, Any]:
     if not isinstance(material, dict):
-        write_material(folder / "stack.dlmat", material)
-        material = {"precomputed": str(folder / "stack.dlmat")}
+        path = folder / f"{type(material).__name__}.dlmat"
+        write_material(path, material)
+        material = {"precomputed": str(path)}
     asset = Plate(0.5, 0.4).write(folder / "plate.glb")
     return {"asset": str(asset), "up_axis": "z", "material": material, "pose": pose}
 
@@ -160,11 +161,10 @@ def test_a_map_of_light_is_integrated_with_the_texture(gpu: GpuContext, tmp_path
     )
     leant = np.where(codes > 0.04045, ((codes + 0.055) / 1.055) ** 2.4, codes / 12.92)
     steep = np.interp(z, STEPS, relief().layers[:, 0, 0, 0].astype(float))[:, None] * TINT
-    texture = {"left": stack_of_halves(*[relief().layers[:, 0, 0, 0].astype(float)] * 2), "leant": leaning()}
-    renderer = SceneRenderer(gpu, gradient_scene(tmp_path, texture["left"], name), with_linear=True)
+    stack = stack_of_halves(*[relief().layers[:, 0, 0, 0].astype(float)] * 2)
+    renderer = SceneRenderer(gpu, gradient_scene(tmp_path, stack, name), with_linear=True)
     try:
-        for made, response in ((texture["left"], steep), (texture["leant"], leant)):
-            renderer.set_scene(gradient_scene(tmp_path, texture["left"], name).replaced(objects=[]))
+        for made, response in ((stack, steep), (leaning(), leant)):
             renderer.set_scene(gradient_scene(tmp_path, made, name))
             linear = renderer.render(seen()).linear
             assert linear is not None
