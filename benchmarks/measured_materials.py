@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
@@ -117,16 +118,24 @@ def measured_picture(brdf: Interpolated) -> Float64[np.ndarray, "h w 3"]:
     return picture
 
 
-def drawn_picture(asset: Path, material: Path, lamps: Sequence[Lamp]) -> Float64[np.ndarray, "h w 3"]:
-    """Returns the object as Deltalight draws it."""
-    lights = [
+def lamps_of(lamps: Sequence[Lamp]) -> dict[str, Any]:
+    """Returns the `lights` of a scene document."""
+    manual = [
         {"type": "directional", "direction": way, "irradiance": strength, "angular_radius_deg": radius_deg}
         for way, strength, radius_deg in lamps
     ]
+    return {"manual": manual, "surroundings": "none"}
+
+
+def drawn_picture(
+    asset: Path, material: Path, lights: dict[str, Any], shading: str = "auto"
+) -> Float64[np.ndarray, "h w 3"]:
+    """Returns the object as Deltalight draws it."""
     document = {
         "objects": [{"asset": str(asset), "material": {"precomputed": str(material)}, "up_axis": "z"}],
-        "lights": {"manual": lights, "surroundings": "none"},
+        "lights": lights,
         "method": {"name": "none"},
+        "shading": {"name": shading},
     }
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = EYE
@@ -148,11 +157,13 @@ def drawn_picture(asset: Path, material: Path, lamps: Sequence[Lamp]) -> Float64
     return linear
 
 
-def _codes(linear: Float64[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def codes_of(linear: Float64[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns the sRGB codes of a radiance whose white is 1."""
     return np.asarray(np.searchsorted(decode_lut(None)[:, 0], np.clip(linear, 0, 1)), np.uint8)
 
 
-def _agreement(name: str, one: UInt8[np.ndarray, "..."], other: UInt8[np.ndarray, "..."]) -> str:
+def agreement(name: str, one: UInt8[np.ndarray, "..."], other: UInt8[np.ndarray, "..."]) -> str:
+    """Returns the PSNR of two pictures as a line."""
     error = np.mean((one.astype(float) - other) ** 2)
     return f"{name}: {10 * np.log10(255**2 / error):.1f} dB"
 
@@ -164,31 +175,37 @@ def draw_paint(path: Path, folder: Path) -> UInt8[np.ndarray, "h w 3"]:
     write_material(folder / "paint.dlmat", fit_brdf(samples))
     trimesh.creation.icosphere(5, RADIUS).export(folder / "ball.ply", vertex_normal=True)
     codes = [
-        _codes(measured_picture(Interpolated(samples))),
-        _codes(drawn_picture(folder / "ball.ply", folder / "paint.dlmat", PAINT_LAMPS)),
+        codes_of(measured_picture(Interpolated(samples))),
+        codes_of(drawn_picture(folder / "ball.ply", folder / "paint.dlmat", lamps_of(PAINT_LAMPS))),
     ]
     facing = (normals * views).sum(axis=1) > _GRAZING
-    typer.echo(_agreement(path.stem, codes[0][shown][facing], codes[1][shown][facing]))
+    typer.echo(agreement(path.stem, codes[0][shown][facing], codes[1][shown][facing]))
     return np.vstack(codes)
+
+
+def write_plate(path: Path) -> None:
+    """Writes a plate that fills the picture, with texture coordinates."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / FOCAL / 2
+    plate = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]])
+    plate.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
+    plate.export(path)
 
 
 def draw_map(source: Path, folder: Path) -> list[UInt8[np.ndarray, "h w 3"]]:
     """Returns plates with a polynomial texture map under lamps, above as the polynomials have it, below as drawn."""
     texture = read_texture_by_light(source)
     write_material(folder / "map.dlmat", texture)
-    plate = trimesh.Trimesh(
-        np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / FOCAL / 2, [[0, 1, 2], [0, 2, 3]]
-    )
-    plate.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
-    plate.export(folder / "plate.obj")
+    write_plate(folder / "plate.obj")
     columns = []
     for way in MAP_LAMPS:
         shown = texture.under(-np.array(way) / np.linalg.norm(way))
         codes = [
-            _codes(cv2.resize(shown, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float64)),
-            _codes(drawn_picture(folder / "plate.obj", folder / "map.dlmat", [(way, np.pi, 0.0)])),
+            codes_of(cv2.resize(shown, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float64)),
+            codes_of(
+                drawn_picture(folder / "plate.obj", folder / "map.dlmat", lamps_of([(way, np.pi, 0.0)]))
+            ),
         ]
-        typer.echo(_agreement(f"{source.name}, light along {way}", *codes))
+        typer.echo(agreement(f"{source.name}, light along {way}", *codes))
         columns.append(np.vstack(codes))
     return columns
 
