@@ -50,26 +50,31 @@ def direction(from_normal_deg: float, around_deg: float) -> Float64[np.ndarray, 
     return np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
 
 
-def write_relief(path: Path) -> None:
-    """Writes studs on a ground as a mesh with colours."""
-    place = np.linspace(0, 1, CELLS + 1)
-    x, y = np.meshgrid(place, place)
+def stud_heights(x: Float64[np.ndarray, "*n"], y: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    """Returns the studs' height over the ground at places 0..1, in edges of the plate; y may be flipped."""
     row = np.floor(y * STUDS)
     u, v = (x * STUDS + 0.5 * (row % 2)) % 1 - 0.5, y * STUDS % 1 - 0.5
-    height = np.sqrt(np.maximum(0.38**2 - u**2 - v**2, 0)) * 0.7
-    points = np.stack([x - 0.5, y - 0.5, height / STUDS], axis=-1).reshape(-1, 3) * EDGE
+    return np.asarray(0.7 / STUDS * np.sqrt(np.maximum(0.38**2 - u**2 - v**2, 0)))
+
+
+def write_relief(path: Path) -> None:
+    """Writes studs on a ground as a mesh with texture coordinates."""
+    place = np.linspace(0, 1, CELLS + 1)
+    x, y = np.meshgrid(place, place)
+    points = np.stack([x - 0.5, y - 0.5, stud_heights(x, y)], axis=-1).reshape(-1, 3) * EDGE
     corner = (np.arange(CELLS)[:, None] * (CELLS + 1) + np.arange(CELLS)).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + CELLS + 2], 1),
-            np.stack([corner, corner + CELLS + 2, corner + CELLS + 1], 1),
-        ]
-    )
-    mesh = trimesh.Trimesh(points, faces, process=False)
-    mesh.visual.vertex_colors = np.round(255 * COLORS[np.where(height > 0, 0, 1)].reshape(-1, 3)).astype(
-        np.uint8
-    )
+    lower = np.stack([corner, corner + 1, corner + CELLS + 2], axis=1)
+    upper = np.stack([corner, corner + CELLS + 2, corner + CELLS + 1], axis=1)
+    mesh = trimesh.Trimesh(points, np.concatenate([lower, upper]), process=False)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.stack([x, y], axis=-1).reshape(-1, 2))
     mesh.export(path)
+
+
+def stud_colors() -> Float32[np.ndarray, "h w 3"]:
+    """Returns the reflectance of studs and ground as a texture."""
+    place = (np.arange(4 * CELLS) + 0.5) / (4 * CELLS)
+    is_stud = stud_heights(*np.meshgrid(place, place)) > 0
+    return np.asarray(COLORS[np.where(is_stud, 0, 1)], np.float32)
 
 
 def sky(d: Float64[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
@@ -97,14 +102,14 @@ def path_traced(relief: Path, light: dict[str, Any]) -> Float32[np.ndarray, "h w
         "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}},
         "sampler": {"type": "independent", "sample_count": SAMPLES},
     }
-    color = {"type": "mesh_attribute", "name": "vertex_color"}
+    color = {"type": "bitmap", "bitmap": mi.Bitmap(stud_colors()), "raw": True}
     diffuse = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": color}}
     scene = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 8, "hide_emitters": True},
         "sensor": sensor,
     }
-    scene["relief"] = {"type": "ply", "filename": str(relief), "face_normals": True, "bsdf": diffuse}
+    scene["relief"] = {"type": "obj", "filename": str(relief), "face_normals": True, "bsdf": diffuse}
     return np.asarray(mi.render(mi.load_dict({**scene, "light": light})))[..., :3]
 
 
@@ -160,13 +165,13 @@ def main(out: Path) -> None:
     choose_variant()
     with TemporaryDirectory() as name:
         folder = Path(name)
-        write_relief(folder / "relief.ply")
+        write_relief(folder / "relief.obj")
         write_plate(folder / "plate.obj")
-        write_material(folder / "PTM.dlmat", polynomials_of_relief(folder / "relief.ply"))
-        write_material(folder / "ABTF.dlmat", stack_of_relief(folder / "relief.ply"))
+        write_material(folder / "PTM.dlmat", polynomials_of_relief(folder / "relief.obj"))
+        write_material(folder / "ABTF.dlmat", stack_of_relief(folder / "relief.obj"))
         columns = []
         for title, light, lights, shading in lightings(folder):
-            rows = [codes_of(path_traced(folder / "relief.ply", light).astype(np.float64))]
+            rows = [codes_of(path_traced(folder / "relief.obj", light).astype(np.float64))]
             for kind in ("PTM", "ABTF"):
                 rows.append(
                     codes_of(drawn_picture(folder / "plate.obj", folder / f"{kind}.dlmat", lights, shading))
