@@ -10,6 +10,7 @@ edition, 8.6.2): by Gaussian weights in (sin sin, azimuth / pi, cos cos).
 
 import sys
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +27,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_png
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.scene import parse_scene
-from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.brdf_fit import fit_brdf
 from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX, BrdfMeasurements, read_brdf
@@ -127,6 +128,11 @@ def lamps_of(lamps: Sequence[Lamp]) -> dict[str, Any]:
     return {"manual": manual, "surroundings": "none"}
 
 
+@cache
+def _gpu() -> GpuContext:
+    return create_context()
+
+
 def drawn_picture(
     asset: Path, material: Path, lights: dict[str, Any], shading: str = "auto"
 ) -> Float64[np.ndarray, "h w 3"]:
@@ -148,7 +154,7 @@ def drawn_picture(
         pose=BoardPose(pose),
         depth=DepthImage(depth, depth > 0, _camera(), 0.001),
     )
-    renderer = SceneRenderer(create_context(), parse_scene(document), with_linear=True)
+    renderer = SceneRenderer(_gpu(), parse_scene(document), with_linear=True)
     try:
         linear = renderer.render(view).linear
     finally:

@@ -145,7 +145,7 @@ def gradient_scene(folder: Path, texture: TextureByLight, name: str) -> SceneDoc
     turned = plate(folder, texture, rotation_wxyz=[np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
     document = unlit(Stage(folder).document([turned], []))
     lights = Lights(mode="environment", environment=given, registration=(1.0, 1.0, 1.0))
-    return document.replaced(lights=lights, shading=Shading(name=name, rays=64, bounces=0))  # type: ignore[arg-type]
+    return document.replaced(lights=lights, shading=Shading(name=name, rays=64, bounces=0))
 
 
 @pytest.mark.parametrize("name", ["image_based", "precomputed"])
