@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from deltalight.benchmarks.relief_materials import latitude_longitude
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
@@ -135,11 +136,7 @@ def leaning() -> PolynomialTexture:
 
 def gradient_scene(folder: Path, texture: TextureByLight, name: str) -> SceneDocument:
     """The plate turned by 90 degrees about its normal under a sky that changes evenly along three axes."""
-    v, u = (np.mgrid[:128, :256] + 0.5) / np.reshape((128, 256), (2, 1, 1))
-    azimuth, elevation = np.pi * (1 - 2 * u), np.pi * (0.5 - v)
-    level = np.cos(elevation)
-    directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
-    sky = np.repeat((0.5 + directions @ GRADIENT)[..., None], 3, axis=2).astype(np.float32)
+    sky = np.repeat((0.5 + latitude_longitude() @ GRADIENT)[..., None], 3, axis=2).astype(np.float32)
     cv2.imwrite(str(folder / "sky.hdr"), sky)
     given = EnvironmentLights(map=str(folder / "sky.hdr"))
     turned = plate(folder, texture, rotation_wxyz=[np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
