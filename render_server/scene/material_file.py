@@ -40,7 +40,7 @@ def write_material(path: Path, material: PrecomputedMaterial) -> None:
     write_bytes(path, head + content)
 
 
-def _arrays_of(material: PrecomputedMaterial) -> dict[str, np.ndarray]:
+def _arrays_of(material: PrecomputedMaterial) -> dict[str, Any]:
     match material:
         case PolynomialTexture():
             return {"coefficients": material.coefficients}

@@ -51,7 +51,7 @@ class TextureStack:
         """What texels reflect of light from everywhere, coat left out: twice the mean over the cosine, up to 1."""
         inner = self.layers[1:-1].sum(axis=0, dtype=np.float32)
         ends = self.layers[0].astype(np.float32) + self.layers[-1]
-        return np.minimum(2 * (inner + 0.5 * ends) / (len(self.layers) - 1), 1).astype(np.float16)
+        return np.asarray(np.minimum(2 * (inner + 0.5 * ends) / (len(self.layers) - 1), 1), np.float16)
 
 
 def stack_of(
