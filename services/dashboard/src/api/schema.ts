@@ -1573,7 +1573,7 @@ export interface components {
             readonly asset: string;
             /**
              * Facts
-             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, polynomial_texture), base_color, and lobes and roughness, or width and height in texels.
+             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, polynomial_texture, texture_stack), base_color, and lobes and roughness, or width and height in texels.
              * @example {
              *       "maximum": [
              *         0.1,
