@@ -5,7 +5,7 @@ the frame makes the CPU wait; and some paths are taken only there.
 """
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -107,14 +107,12 @@ def audit(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     faults: list[str] = []
     bind = _Program.bind
 
-    def audited(program: _Program, shared: Sequence[Bindings], own: Bindings) -> dict[str, object]:
-        written = bind(program, shared, own)
-        slots = [*program._samplers, *program._images, *program._storage]
-        bound = [(slot.name, program.find(slot.name, (own, *shared))) for slot in slots]
-        for name, item in written.items():
-            others = [other for other, value in bound if value is item and other != name]
+    def audited(program: _Program, own: Bindings, known: Bindings) -> None:
+        bind(program, own, known)
+        names = [slot.name for slot in (*program._samplers, *program._images, *program._storage)]
+        for name, item in program.written(known).items():
+            others = [other for other in names if known[other] is item and other != name]
             faults.extend(f"{program.label}: {name} and {other}" for other in others)
-        return written
 
     monkeypatch.setattr(_Program, "bind", audited)
     return faults
