@@ -35,13 +35,14 @@ from deltalight.render_server.scene.polynomial_texture import PolynomialTexture,
 from deltalight.render_server.scene.texture_stack import TextureStack, stack_of
 
 ANGLES_DEG = np.arange(0, 85, 6.0)  # 15 pictures, as [D] 4.3.3 has them, with the light from the right
-FITTED = 20  # directions of a PTM's lamps
+FITTED = 48  # directions of a PTM's lamps
 LOWEST = 0.2  # cosine of those
 LAMPS_DEG = ((39.0, 0.0), (69.0, 0.0), (45.0, 90.0))  # from the normal, and around it from the right
 EDGE = SIDE / FOCAL  # m
 CELLS, STUDS = 200, 5
 COLORS = np.array([[0.75, 0.55, 0.25], [0.2, 0.3, 0.45]])  # of studs and ground
-SAMPLES = 12
+SAMPLES = 64  # paths a pixel
+TRUTH_SEED = 0  # of what the materials are compared with, and of none that they are made of
 
 
 def direction(from_normal_deg: float, around_deg: float) -> Float64[np.ndarray, "3"]:
@@ -91,8 +92,8 @@ def latitude_longitude() -> Float64[np.ndarray, "128 256 3"]:
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
-def path_traced(relief: Path, light: dict[str, Any]) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the relief from straight above."""
+def path_traced(relief: Path, light: dict[str, Any], seed: int) -> Float32[np.ndarray, "h w 3"]:
+    """Returns the relief from straight above; pictures of different seeds have independent noise."""
     import mitsuba as mi
 
     above = mi.ScalarTransform4f().look_at(origin=[0, 0, 1], target=[0, 0, 0], up=[0, 1, 0])
@@ -110,7 +111,7 @@ def path_traced(relief: Path, light: dict[str, Any]) -> Float32[np.ndarray, "h w
         "sensor": sensor,
     }
     scene["relief"] = {"type": "obj", "filename": str(relief), "face_normals": True, "bsdf": diffuse}
-    return np.asarray(mi.render(mi.load_dict({**scene, "light": light})))[..., :3]
+    return np.asarray(mi.render(mi.load_dict({**scene, "light": light}), seed=seed))[..., :3]
 
 
 def lamp(towards: Float64[np.ndarray, "3"]) -> dict[str, Any]:
@@ -124,7 +125,9 @@ def lamp(towards: Float64[np.ndarray, "3"]) -> dict[str, Any]:
 
 def stack_of_relief(relief: Path) -> TextureStack:
     """Returns the ABTF of pictures with the light from the right."""
-    pictures = [path_traced(relief, lamp(direction(angle, 0))) for angle in ANGLES_DEG]
+    pictures = [
+        path_traced(relief, lamp(direction(angle, 0)), seed) for seed, angle in enumerate(ANGLES_DEG, 1)
+    ]
     return TextureStack(stack_of(np.stack(pictures), np.cos(np.radians(ANGLES_DEG))))
 
 
@@ -134,7 +137,8 @@ def polynomials_of_relief(relief: Path) -> PolynomialTexture:
     z, turn = 1 - (1 - LOWEST) * (k + 0.5) / FITTED, k * np.pi * (3 - np.sqrt(5))
     level = np.sqrt(1 - z * z)
     lamps = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
-    codes = np.stack([codes_of(path_traced(relief, lamp(each)).astype(np.float64)) for each in lamps]) / 255
+    pictures = (path_traced(relief, lamp(each), seed) for seed, each in enumerate(lamps, 1))
+    codes = np.stack([codes_of(picture.astype(np.float64)) for picture in pictures]) / 255
     fitted = np.linalg.lstsq(polynomial_terms(lamps), codes.reshape(FITTED, -1))[0]
     return PolynomialTexture(fitted.reshape(-1, *codes.shape[1:]).astype(np.float16))
 
@@ -171,7 +175,7 @@ def main(out: Path) -> None:
         write_material(folder / "ABTF.dlmat", stack_of_relief(folder / "relief.obj"))
         columns = []
         for title, light, lights, shading in lightings(folder):
-            rows = [codes_of(path_traced(folder / "relief.obj", light).astype(np.float64))]
+            rows = [codes_of(path_traced(folder / "relief.obj", light, TRUTH_SEED).astype(np.float64))]
             for kind in ("PTM", "ABTF"):
                 rows.append(
                     codes_of(drawn_picture(folder / "plate.obj", folder / f"{kind}.dlmat", lights, shading))

@@ -17,10 +17,9 @@ class Lag:
     is_waiting: bool = False  # in this frame
     _waited: int = 0  # frames in a row
     _may_wait: bool = False
-    _held: dict[tuple[object, ...], Sequence[int]] = field(
-        default_factory=dict
-    )  # by inputs, of stages that wait
-    _held_before: dict[tuple[object, ...], Sequence[int]] = field(default_factory=dict)  # in the frame before
+    # Versions of the inputs, by inputs, of stages that were asked in this frame, and in the one before.
+    _held: dict[tuple[object, ...], Sequence[int]] = field(default_factory=dict)
+    _held_before: dict[tuple[object, ...], Sequence[int]] = field(default_factory=dict)
 
     def begin_frame(self) -> None:
         """Decides whether the stages may wait in this frame: if they ran in the last, or have not waited long."""

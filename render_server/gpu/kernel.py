@@ -112,14 +112,14 @@ class _Program:
         for name in program:
             self._adopt(name, program[name])
         self._assign()
-        self._bound: Sequence[tuple[list[_Slot], Callable[[_Slot, Binding], None]]] = (
+        self._binders: Sequence[tuple[list[_Slot], Callable[[_Slot, Binding], None]]] = (
             (self._samplers, self._bind_sampler),
             (self._images, self._bind_image),
             (self._storage, self._bind_storage),
             (self._blocks, self._bind_block),
             (self._uniforms, self._write),
         )
-        self._needed = {slot.name for slots, _ in self._bound for slot in slots}
+        self._needed = {slot.name for slots, _ in self._binders for slot in slots}
 
     def _adopt(self, name: str, member: object) -> None:
         slot = _Slot(name, member, getattr(member, "gl_type", 0))
@@ -155,7 +155,7 @@ class _Program:
             if name not in self._declared.names:
                 raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
         self._require(self._needed, known)
-        for slots, bind in self._bound:
+        for slots, bind in self._binders:
             for slot in slots:
                 bind(slot, known[slot.name])
 

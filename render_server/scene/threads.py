@@ -8,9 +8,8 @@ from typing import TypeVar
 
 Result = TypeVar("Result")
 
-BAND_ROWS = (
-    120  # of a picture: few enough to stay in a core's cache, so many that threads seldom wait for each other
-)
+# Of a picture: few enough to stay in a core's cache, so many that threads seldom wait for each other.
+BAND_ROWS = 120
 
 
 def begun(call: Callable[[], Result]) -> "Future[Result]":
