@@ -75,6 +75,7 @@ class PlaybackCamera(Camera):
         self._due_ns = 0  # monotonic time at which that frame was or is due
         self._wall_ns = self._capture_ns = 0
         self._numbered = _RisingNumbers(self._period_ns)
+        self._read: tuple[int, SensorFrame] | None = None  # the last, which a pause repeats
         self.camera, self.board, self.extrinsics = source.camera, source.board, source.extrinsics
         self.depth_scale, self.notes = source.depth_scale, source.notes
 
@@ -163,7 +164,9 @@ class PlaybackCamera(Camera):
             jumped, self._jumped = self._jumped, False
             self._due_ns, self._index, self._is_shown = due_ns, index, True
             self._capture_ns = self._stamp_of(due_ns)
-        return self._numbered(self._source[index], index, self._capture_ns, jumped=jumped)
+        if self._read is None or self._read[0] != index:
+            self._read = index, self._source[index]
+        return self._numbered(self._read[1], index, self._capture_ns, jumped=jumped)
 
     def read_latest(self, max_age_s: float) -> SensorFrame:  # noqa: ARG002 - a replayed frame is never old
         """Like `read`: no frame is newer than the one that is due."""

@@ -102,6 +102,8 @@ def test_a_pause_repeats_the_frame_at_a_bounded_rate_with_a_new_stamp(source: So
     assert [later - earlier for earlier, later in pairwise(reader.stamps)] == [playback.LEAST_REPEAT_NS] * 2
     held = [frame.fisheye for frame in reader.frames]
     assert held[0] is held[1] is held[2], "light that stays is not computed again"
+    colors = [frame.color for frame in reader.frames]
+    assert colors[0] is colors[1] is colors[2], "nor is the picture unpacked again"
 
 
 def test_light_after_a_jump_is_not_older_than_the_jump(source: Source) -> None:
@@ -143,7 +145,9 @@ def test_a_reader_that_is_far_behind_gets_the_newest_frame(
     assert reader.frames[-1].frame_id == place, "what was left out is missing in the numbers"
 
 
-def test_commands_reach_a_camera_that_waits(source: Source) -> None:
+def test_commands_reach_a_camera_that_waits(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(playback, "LEAST_REPEAT_NS", 60 * 10**9)  # nothing but a command ends the wait
+    monkeypatch.setattr(playback, "MOST_REPEAT_NS", 60 * 10**9)
     with reading(source, playing=False, stays=True) as reader:
         reader.read(1)
         timer = threading.Timer(0.02, reader.camera.seek, [3 * PERIOD_S])
