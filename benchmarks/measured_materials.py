@@ -10,8 +10,10 @@ edition, 8.6.2): by Gaussian weights in (sin sin, azimuth / pi, cos cos).
 
 import sys
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,16 +27,13 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_png
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.scene import parse_scene
-from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.brdf_fit import fit_brdf
 from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX, BrdfMeasurements, read_brdf
 from deltalight.render_server.scene.material_file import write_material
-from deltalight.render_server.scene.polynomial_texture import (
-    INFO_NAME,
-    polynomial_terms,
-    read_polynomial_texture,
-)
+from deltalight.render_server.scene.texture_folder import INFO_NAME
+from deltalight.render_server.scene.textures_by_light import read_texture_by_light
 
 SIDE, FOCAL = 200, 380.0  # pixels
 EYE, RADIUS = np.array([0.0, 0.0, 1.0]), 0.22  # m
@@ -120,16 +119,29 @@ def measured_picture(brdf: Interpolated) -> Float64[np.ndarray, "h w 3"]:
     return picture
 
 
-def drawn_picture(asset: Path, material: Path, lamps: Sequence[Lamp]) -> Float64[np.ndarray, "h w 3"]:
-    """Returns the object as Deltalight draws it."""
-    lights = [
+def lamps_of(lamps: Sequence[Lamp]) -> dict[str, Any]:
+    """Returns the `lights` of a scene document."""
+    manual = [
         {"type": "directional", "direction": way, "irradiance": strength, "angular_radius_deg": radius_deg}
         for way, strength, radius_deg in lamps
     ]
+    return {"manual": manual, "surroundings": "none"}
+
+
+@cache
+def _gpu() -> GpuContext:
+    return create_context()
+
+
+def drawn_picture(
+    asset: Path, material: Path, lights: dict[str, Any], shading: str = "auto"
+) -> Float64[np.ndarray, "h w 3"]:
+    """Returns the object as Deltalight draws it."""
     document = {
         "objects": [{"asset": str(asset), "material": {"precomputed": str(material)}, "up_axis": "z"}],
-        "lights": {"manual": lights, "surroundings": "none"},
+        "lights": lights,
         "method": {"name": "none"},
+        "shading": {"name": shading},
     }
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = EYE
@@ -142,7 +154,7 @@ def drawn_picture(asset: Path, material: Path, lamps: Sequence[Lamp]) -> Float64
         pose=BoardPose(pose),
         depth=DepthImage(depth, depth > 0, _camera(), 0.001),
     )
-    renderer = SceneRenderer(create_context(), parse_scene(document), with_linear=True)
+    renderer = SceneRenderer(_gpu(), parse_scene(document), with_linear=True)
     try:
         linear = renderer.render(view).linear
     finally:
@@ -151,11 +163,13 @@ def drawn_picture(asset: Path, material: Path, lamps: Sequence[Lamp]) -> Float64
     return linear
 
 
-def _codes(linear: Float64[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def codes_of(linear: Float64[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns the sRGB codes of a radiance whose white is 1."""
     return np.asarray(np.searchsorted(decode_lut(None)[:, 0], np.clip(linear, 0, 1)), np.uint8)
 
 
-def _agreement(name: str, one: UInt8[np.ndarray, "..."], other: UInt8[np.ndarray, "..."]) -> str:
+def agreement(name: str, one: UInt8[np.ndarray, "..."], other: UInt8[np.ndarray, "..."]) -> str:
+    """Returns the PSNR of two pictures as a line."""
     error = np.mean((one.astype(float) - other) ** 2)
     return f"{name}: {10 * np.log10(255**2 / error):.1f} dB"
 
@@ -167,35 +181,37 @@ def draw_paint(path: Path, folder: Path) -> UInt8[np.ndarray, "h w 3"]:
     write_material(folder / "paint.dlmat", fit_brdf(samples))
     trimesh.creation.icosphere(5, RADIUS).export(folder / "ball.ply", vertex_normal=True)
     codes = [
-        _codes(measured_picture(Interpolated(samples))),
-        _codes(drawn_picture(folder / "ball.ply", folder / "paint.dlmat", PAINT_LAMPS)),
+        codes_of(measured_picture(Interpolated(samples))),
+        codes_of(drawn_picture(folder / "ball.ply", folder / "paint.dlmat", lamps_of(PAINT_LAMPS))),
     ]
     facing = (normals * views).sum(axis=1) > _GRAZING
-    typer.echo(_agreement(path.stem, codes[0][shown][facing], codes[1][shown][facing]))
+    typer.echo(agreement(path.stem, codes[0][shown][facing], codes[1][shown][facing]))
     return np.vstack(codes)
+
+
+def write_plate(path: Path) -> None:
+    """Writes a plate that fills the picture, with texture coordinates."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / FOCAL / 2
+    plate = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]])
+    plate.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
+    plate.export(path)
 
 
 def draw_map(source: Path, folder: Path) -> list[UInt8[np.ndarray, "h w 3"]]:
     """Returns plates with a polynomial texture map under lamps, above as the polynomials have it, below as drawn."""
-    texture = read_polynomial_texture(source)
+    texture = read_texture_by_light(source)
     write_material(folder / "map.dlmat", texture)
-    plate = trimesh.Trimesh(
-        np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / FOCAL / 2, [[0, 1, 2], [0, 2, 3]]
-    )
-    plate.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
-    plate.export(folder / "plate.obj")
+    write_plate(folder / "plate.obj")
     columns = []
     for way in MAP_LAMPS:
-        towards = -np.array([way]) / np.linalg.norm(way)
-        coded = np.clip(
-            np.tensordot(polynomial_terms(towards), texture.coefficients.astype(float), 1)[0], 0, 1
-        )
-        given = cv2.resize(coded.astype(np.float32), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        shown = texture.under(-np.array(way) / np.linalg.norm(way))
         codes = [
-            np.round(255 * given).astype(np.uint8),
-            _codes(drawn_picture(folder / "plate.obj", folder / "map.dlmat", [(way, np.pi, 0.0)])),
+            codes_of(cv2.resize(shown, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float64)),
+            codes_of(
+                drawn_picture(folder / "plate.obj", folder / "map.dlmat", lamps_of([(way, np.pi, 0.0)]))
+            ),
         ]
-        typer.echo(_agreement(f"{source.name}, light along {way}", *codes))
+        typer.echo(agreement(f"{source.name}, light along {way}", *codes))
         columns.append(np.vstack(codes))
     return columns
 

@@ -7,7 +7,6 @@ before they allocate a picture.
 import math
 from typing import Literal
 
-import blosc2
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
@@ -185,6 +184,8 @@ def stated_jpeg_size(part: Buffer) -> tuple[int, int] | None:
 
 
 def _compress(values: Shaped[np.ndarray, "..."]) -> bytes:
+    import blosc2  # late, for processes that handle pictures alone: it takes a tenth of a second
+
     # One thread: a frame takes about 1 ms, and the cores belong to the renderer.
     code: bytes = blosc2.compress2(
         values,
@@ -198,6 +199,8 @@ def _compress(values: Shaped[np.ndarray, "..."]) -> bytes:
 
 
 def _decompress(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np.ndarray, "..."]:
+    import blosc2
+
     data = memoryview(part).cast("B")
     values = np.dtype(dtype).newbyteorder("<")
     _check_chunk(data, math.prod(shape) * values.itemsize, values.itemsize)

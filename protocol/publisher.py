@@ -9,7 +9,7 @@ from deltalight.protocol.curve import guard
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import MAX_PART_BYTES
-from deltalight.protocol.sockets import HIGH_WATER_MARK, attach, open_socket
+from deltalight.protocol.sockets import HIGH_WATER_MARK, attach, open_context, open_socket
 
 STREAMS_OF_A_NODE = 9
 
@@ -30,7 +30,7 @@ class Publisher:
         streams: int = STREAMS_OF_A_NODE,
         keys: Keys | None = None,
     ) -> None:
-        self._context = zmq.Context()
+        self._context = open_context()
         self._lock = threading.Lock()
         self._socket = open_socket(self._context, zmq.PUB, high_water_mark=HIGH_WATER_MARK * streams)
         self._guard = guard(self._context, self._socket, keys, bind=bind)

@@ -43,6 +43,6 @@ TIERS: dict[Quality, QualityTier] = {
         edge_samples=4,
         caustic_blocks=32,
         refresh_tiles=16,
-        bounce_turns=2,
+        bounce_turns=3,
     ),
 }

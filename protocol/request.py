@@ -19,7 +19,7 @@ from deltalight.protocol.message_fields import as_sentence
 from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, SCHEMA_VERSION, ControlReply, ControlRequest
 from deltalight.protocol.payloads import Control, decode_control, encode_control
 from deltalight.protocol.rights import CONTROL, Rights, refusal
-from deltalight.protocol.sockets import attach, open_socket
+from deltalight.protocol.sockets import attach, open_context, open_socket
 
 OPEN_OPS = (CLOCK_OP, "ping")  # for every trusted host: nodes compare clocks
 UNREADABLE_ID = "unreadable"
@@ -100,7 +100,7 @@ class ReplyServer:
         self._node = node
         self._memory = ReplyMemory()
         self._answering = threading.Lock()
-        self._context = zmq.Context()
+        self._context = open_context()
         self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_PIECE_BYTES)
         self._guard = guard(self._context, self._socket, keys, bind=True)
         self._rights = None if keys is None else Rights(keys)
@@ -213,7 +213,7 @@ class RequestClient:
     def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
         self.endpoint = endpoint
         self._keys = keys
-        self._context = zmq.Context()
+        self._context = open_context()
         self._lock = threading.Lock()
         self._abandoned = threading.Event()
         self._socket: zmq.Socket[bytes] | None = None

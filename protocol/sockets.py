@@ -1,8 +1,10 @@
-"""Common to all sockets of the wire: allowed endpoints, and socket options (SPEC.md, section 5)."""
+"""Common to all sockets of the wire: contexts, allowed endpoints, and socket options (SPEC.md, section 5)."""
+
+import threading
 
 import zmq
 
-from deltalight.protocol.curve import secure
+from deltalight.protocol.curve import Context, secure
 from deltalight.protocol.endpoints import Endpoint, parse_endpoint
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import CREATE_HINT, Keys
@@ -17,6 +19,22 @@ RECONNECT_MAX_MS = 1000
 # the next of them where a peer hung up while the queue of what it had sent was full.
 KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 4
 HANDSHAKE_MS = 10_000  # who says nothing for so long takes nobody's place
+
+_contexts: set[Context] = set()
+_contexts_lock = threading.Lock()
+
+
+def open_context() -> Context:
+    """Create a context, and keep it until it is ended.
+
+    One that is forgotten stays. Its finalizer would stop whatever thread collects garbage for ever: it waits for the
+    context's sockets, which are collected with it and of which it no longer knows.
+    """
+    context: Context = zmq.Context()
+    with _contexts_lock:
+        _contexts.difference_update([each for each in _contexts if each.closed])
+        _contexts.add(context)
+    return context
 
 
 def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
@@ -34,7 +52,7 @@ def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
 
 
 def open_socket(
-    context: zmq.Context[zmq.Socket[bytes]],
+    context: Context,
     kind: int,
     *,
     high_water_mark: int = HIGH_WATER_MARK,

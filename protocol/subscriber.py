@@ -12,7 +12,7 @@ from deltalight.protocol.envelope import MAX_TOPIC_BYTES
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.rights import Rights
-from deltalight.protocol.sockets import HIGH_WATER_MARK, attach, check_endpoint, open_socket
+from deltalight.protocol.sockets import HIGH_WATER_MARK, attach, check_endpoint, open_context, open_socket
 
 
 class ReceivedMultipart(list[memoryview]):
@@ -47,7 +47,7 @@ class Subscriber(ABC):
         self._changed = threading.Condition()
         self._closed = False
         self._keys, self._rights = keys, None if keys is None else Rights(keys)
-        self._context = zmq.Context()
+        self._context = open_context()
         self._guards: list[Guard] = []
         self._keys_of: dict[zmq.Socket[bytes], bytes | None] = {}  # of the host at a socket's other end
         self._subscriptions, self._high_water_mark = tuple(subscriptions), high_water_mark

@@ -1,4 +1,4 @@
-"""Memory that the last method's passes have left goes back to the kernel."""
+"""Memory that nothing uses any more goes back to the kernel: what a method's passes, or many viewers, have left."""
 
 import ctypes
 import sys

@@ -1,6 +1,6 @@
 """Triangles on the GPU as stages receive them: those of the real scene and of the virtual objects."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,8 @@ from deltalight.render_server.scene.depth_mesh import back_faces
 from deltalight.render_server.scene.depth_views import DepthViews
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+
+Corners = Float32[np.ndarray, "m 3 10"]
 
 # Half the edge of a volume by how far objects reach from its middle, at least. Less than 2 / sqrt(3): twice the edge
 # of a cube leaves it that much in any turn.
@@ -83,25 +85,28 @@ class GeometryState:
     """
 
     buffers: MeshBuffers
-    corners: Float32[np.ndarray, "m 3 10"]
+    corners: Corners
     points: Float64[np.ndarray, "n 3"]
     materials: MaterialTable
-    coarse_corners: Float32[np.ndarray, "k 3 10"] | None = (
-        None  # fewer triangles for what lies far; None: all
-    )
+    coarse: Callable[[], Corners] | None = None  # makes fewer triangles for what lies far; None: all serve
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
     extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
     fronts_of: DepthViews | None = None  # what is solid as cameras see it: backs are not in it
 
-    def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
+    @cached_property
+    def coarse_corners(self) -> Corners:
+        """`corners` of fewer triangles, for what lies far."""
+        return self.corners if self.coarse is None else self.coarse()
+
+    def solid_corners(self, voxel_edge: float) -> Corners:
         """Returns `corners` for voxels of that edge (m), with coarse backs if cameras saw the fronts alone.
 
         What is thinner than two voxels has none where another camera sees that nothing is there.
         """
         if self.fronts_of is None:
             return self.corners
-        backs = back_faces(self.corners if self.coarse_corners is None else self.coarse_corners, voxel_edge)
+        backs = back_faces(self.coarse_corners, voxel_edge)
         if len(self.fronts_of.frames) > 1:
             middles = backs[..., :3].mean(axis=1, dtype=np.float64)
             backs = backs[~self.fronts_of.in_free_space(middles)]

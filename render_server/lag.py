@@ -1,7 +1,7 @@
 """Stages of a frame graph that may show what moves as it was some frames before."""
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(eq=False)
@@ -17,12 +17,16 @@ class Lag:
     is_waiting: bool = False  # in this frame
     _waited: int = 0  # frames in a row
     _may_wait: bool = False
+    # Versions of the inputs, by inputs, of stages that were asked in this frame, and in the one before.
+    _held: dict[tuple[object, ...], Sequence[int]] = field(default_factory=dict)
+    _held_before: dict[tuple[object, ...], Sequence[int]] = field(default_factory=dict)
 
     def begin_frame(self) -> None:
         """Decides whether the stages may wait in this frame: if they ran in the last, or have not waited long."""
         self._waited = self._waited + 1 if self.is_waiting else 0
         self._may_wait = (self.has_run or self.is_waiting) and self._waited < self.turns - 1
         self.has_run = self.is_waiting = False
+        self._held_before, self._held = self._held, {}
 
     def holds(self, inputs: Sequence[object], seen: Sequence[int] | None, versions: Sequence[int]) -> bool:
         """Whether a stage waits; its inputs had the versions `seen` when it last ran (None: never). Notes it."""
@@ -31,6 +35,8 @@ class Lag:
         changed = (item for item, old, new in zip(inputs, seen, versions, strict=True) if old != new)
         if any(item not in self.behind for item in changed):
             return False
-        self.is_waiting |= self._may_wait
-        self.has_run |= not self._may_wait
-        return self._may_wait
+        waits = self._may_wait and self._held_before.get(tuple(inputs)) != versions
+        self._held[tuple(inputs)] = versions
+        self.is_waiting |= waits
+        self.has_run |= not waits
+        return waits

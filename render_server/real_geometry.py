@@ -1,6 +1,7 @@
 """The real scene's triangles: meshed from the frame's depth, fused from all frames, or given as a model."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import ModelGeometry, RealScene
 from deltalight.render_server.camera_history import CameraHistory
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.gpu_scene import Corners, GeometryState
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from deltalight.render_server.scene.depth_mesh import depth_mesh
-from deltalight.render_server.scene.depth_surface import grazing_depth_fill, noise_sigma
+from deltalight.render_server.scene.depth_surface import DepthSurface, grazing_depth_fill, noise_sigma
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
 from deltalight.render_server.scene.tsdf_mesh import TsdfScene
 from deltalight.render_server.view import CameraView, PosedFrame
@@ -141,26 +143,34 @@ class RealGeometry:
         if not any(len(mesh.triangles) for mesh in coarse):
             self.state = None
             return
-        self._build(fine, triangle_corners(merge_for_gpu(coarse)))
+        self._build(fine, partial(_corners, coarse))
 
     def _build_from_depth(self) -> None:
-        """Meshes the depth images, and a second time with few triangles for geometry far from the objects.
+        """Meshes the depth images, and with few triangles again once geometry far from the objects is asked for.
 
         What several cameras see is kept of the one that shows it largest.
         """
-        shown = DepthViews(tuple(_posed_surface(camera, camera.seen) for camera in self.cameras))
-        budgets = self.budget, self.budget // COARSE_DIVISOR
-        meshes = zip(*(_depth_meshes(camera, budgets) for camera in self.cameras), strict=True)
-        fine, coarse = (shown.without_copies(*pair) for pair in zip(meshes, budgets, strict=True))
+        seen = [camera.seen for camera in self.cameras]
+        grazing = [begun(partial(_grazing_depth, each)) for each in seen]  # while surfaces are fitted
+        shown = DepthViews(tuple(map(_posed_surface, self.cameras, seen)))
+        known = [
+            (each, frame.surface, fill.result())
+            for each, frame, fill in zip(seen, shown.frames, grazing, strict=True)
+        ]
+
+        def meshes(budget: int) -> list[TriangleMesh]:
+            return shown.without_copies([_depth_mesh(*each, budget) for each in known], budget)
+
+        fine, coarse_budget = meshes(self.budget), self.budget // COARSE_DIVISOR
         if not any(len(mesh.triangles) for mesh in fine):
             self.state = None
             return
-        self._build(fine, triangle_corners(merge_for_gpu(coarse)), fronts_of=shown)
+        self._build(fine, lambda: _corners(meshes(coarse_budget)), fronts_of=shown)
 
     def _build(
         self,
         meshes: list[TriangleMesh],
-        coarse_corners: Float32[np.ndarray, "k 3 10"] | None,
+        coarse: Callable[[], Corners] | None,
         *,
         fronts_of: DepthViews | None = None,
     ) -> None:
@@ -174,7 +184,7 @@ class RealGeometry:
             triangle_corners(merged),
             _sample(merged.vertices[:, :3]),
             self._materials,
-            coarse_corners,
+            coarse,
             fronts_of=fronts_of,
         )
 
@@ -185,13 +195,24 @@ class RealGeometry:
             self._materials.release()
 
 
-def _depth_meshes(camera: CameraHistory, budgets: Sequence[int]) -> list[TriangleMesh]:
-    """Returns a mesh, within each triangle budget, of what a camera saw when something last moved."""
-    frame, view, surface = camera.seen.frame, camera.seen.view, camera.surface_of(camera.seen)
-    assert frame.depth is not None
-    grazing = grazing_depth_fill(frame.depth, frame.color, view.camera)
-    place = view.camera, view.world_from_camera
-    return [depth_mesh(frame.depth, *place, budget, surface, grazing=grazing) for budget in budgets]
+def _corners(meshes: Sequence[TriangleMesh]) -> Corners:
+    return triangle_corners(merge_for_gpu(meshes))
+
+
+def _grazing_depth(seen: PosedFrame) -> Float32[np.ndarray, "h w"]:
+    assert seen.frame.depth is not None
+    return grazing_depth_fill(seen.frame.depth, seen.frame.color, seen.view.camera)
+
+
+def _depth_mesh(
+    seen: PosedFrame, surface: DepthSurface, grazing: Float32[np.ndarray, "h w"], triangle_budget: int
+) -> TriangleMesh:
+    """Returns a mesh of what a camera saw."""
+    view = seen.view
+    assert seen.frame.depth is not None
+    return depth_mesh(
+        seen.frame.depth, view.camera, view.world_from_camera, triangle_budget, surface, grazing=grazing
+    )
 
 
 def _posed_surface(camera: CameraHistory, taken: PosedFrame) -> PosedSurface:

@@ -10,12 +10,14 @@ from jaxtyping import Float64
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage, ViewFrame
-from deltalight.protocol.messages import MAX_PART_BYTES
+from deltalight.protocol.messages import MAX_CAMERAS, MAX_PART_BYTES
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
 
 NEAR_M = 0.02
 FAR_M = 100.0
+# Of so many lenses is kept what is the same in each frame: a room's cameras, at their own size and at the picture's.
+LENSES_KEPT = 2 * MAX_CAMERAS
 RECTANGLE_MARGIN_PX = 8  # a lens bends the edges between the corners of a box
 
 Rectangle = tuple[int, int, int, int]  # first column and row, width and height
@@ -219,7 +221,7 @@ def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
     return replace(frame, color=color, camera=camera, depth=depth)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=LENSES_KEPT)
 def _ray_extremes(camera: CameraModel) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
     """Returns the least and greatest (x/z, y/z) of the pixels' centres."""
     rays = camera.rays().reshape(-1, 2)

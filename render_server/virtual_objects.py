@@ -108,11 +108,11 @@ class VirtualObjects:
 
     def _check_material(self, item: SceneObject) -> None:
         material = self._given_material(item)
-        if material is None or material.polynomial is None:
+        if material is None or material.by_light is None:
             return
         if any(mesh.uv is None for mesh in self._assets[item.asset].meshes):
             raise DeltalightError(
-                f"object `{item.id}`: a polynomial texture map needs texture coordinates, and {item.asset} has none; "
+                f"object `{item.id}`: its material's texture needs texture coordinates, and {item.asset} has none; "
                 "unwrap the mesh, or take another material."
             )
 
@@ -252,7 +252,9 @@ def given_material(document: AnyMaterial) -> Material:
     if isinstance(document, MaterialDocument):
         return Material.from_document(document)
     read = read_material(Path(document.precomputed))
-    return Material.from_measured(read) if isinstance(read, GaussianBrdf) else Material.from_polynomial(read)
+    if isinstance(read, GaussianBrdf):
+        return Material.from_measured(read)
+    return Material.from_texture_by_light(read)
 
 
 def _materials(objects: Sequence[SceneObject]) -> set[AnyMaterial]:

@@ -1,6 +1,6 @@
 """Conversion of raw frames to the renderer's input: pose, registered and clean depth. The same live and offline."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
@@ -66,6 +66,7 @@ class ViewFrameBuilder:
         self._needs_depth, self._needs_light = needs_depth, needs_light
         self._fisheye = FisheyeLight(rig, self._pose_alone)
         self._lamps: tuple[LampPose, ...] = ()
+        self._last: tuple[SensorFrame, ViewFrame] | None = None
         if self._reference is not None:
             self._check_depth(self._reference)
 
@@ -73,11 +74,16 @@ class ViewFrameBuilder:
         """Return the renderer's input for a frame.
 
         `pose` is None if the board is not visible. `depth` is None if the source has no depth; a single frame without
-        has a depth image that is unknown everywhere.
+        has a depth image that is unknown everywhere. Of a picture that is repeated nothing is computed again.
 
         Raises:
             DeltalightError: depth and colour, or colour and camera, do not fit each other.
         """
+        if self._last is None or not _is_repeated(frame, self._last[0]):
+            self._last = frame, self._made(frame)
+        return replace(self._last[1], frame_id=frame.frame_id, timestamp_ns=frame.timestamp_ns)
+
+    def _made(self, frame: SensorFrame) -> ViewFrame:
         if self._reference is None:
             self._reference = _Reference.of(frame)
             self._check_depth(self._reference)
@@ -153,6 +159,16 @@ class ViewFrameBuilder:
         if depth.camera is not camera and depth.camera != camera:
             depth = register_depth(depth, camera, self._color_from_depth)
         return clean_depth(depth, frame.color, self._settings)
+
+
+def _is_repeated(frame: SensorFrame, last: SensorFrame) -> bool:
+    """Whether a frame differs from the last in its number and times alone."""
+    own = {"frame_id", "timestamp_ns", "depth_timestamp_ns"}
+    return all(
+        getattr(frame, each.name) is getattr(last, each.name)
+        for each in fields(frame)
+        if each.name not in own
+    )
 
 
 def _unknown(frame: SensorFrame) -> DepthImage:

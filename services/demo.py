@@ -51,7 +51,10 @@ def run_live(
         DeltalightError: a port is in use, or a process died for good.
     """
     with TemporaryDirectory(prefix="deltalight-demo-") as data, _kept(method, Path(data)) as session:
-        plan = replace(demo_plan(session), data=Path(data), page_port=port)
+        plan = demo_plan(session)
+        taken = (plan.node_port, plan.composite_port, plan.control_port, port)
+        (playback_port,) = ports.private_ports(1, avoid=taken)
+        plan = replace(plan, data=Path(data), page_port=port, playback_port=playback_port)
         plan.require_free_ports()
         address = f"http://{ports.LOOPBACK}:{port}"
         with Supervisor(plan.specs(), spares=spares) as supervisor:

@@ -37,6 +37,13 @@ class HostCommands:
         """Return a sensor node."""
         return self.child(label, "node", "--source", source, "--publish", publish, "--clock", clock, *more)
 
+    def player(
+        self, label: str, source: str, publish: str, clock: str, control: str, *more: str
+    ) -> ChildSpec:
+        """Return a node that plays a recording, paused at its start until it is told otherwise at `control`."""
+        options = ["--publish", publish, "--clock", clock, "--control", control, "--paused", *more]
+        return self.child(label, "replay", source, *options)
+
     def server(
         self, label: str, session: Path, publish: str, control: str, device: int | None, *more: str
     ) -> ChildSpec:
@@ -72,6 +79,7 @@ class HostPlan:
     `remote_node` on the network. `config` is the configuration file of all processes; None = the one they find, which
     overrides the defaults here. `data` is the folder of scenes of the web process, which runs only if it is given.
     With `spares`, a process that dies is replaced by one that has imported what it needs (some 100 MB each).
+    With `playback_port` the source is a recording that waits at its first frame, to be played and moved along there.
     """
 
     source: str | None
@@ -81,6 +89,7 @@ class HostPlan:
     node_port: int = ports.NODE_PORT
     composite_port: int = ports.COMPOSITE_PORT
     control_port: int = ports.CONTROL_PORT
+    playback_port: int | None = None
     data: Path | None = None
     page_port: int = ports.PAGE_PORT
     device: int | None = None
@@ -113,7 +122,11 @@ class HostPlan:
 
     def _node(self, source: str) -> ChildSpec:
         publish, clock = ports.endpoint(self.node_port), ports.endpoint(self.control_port)
-        return self._commands.node(NODE, source, publish, clock, *(["--loop"] if self.loop else []))
+        loop = ["--loop"] if self.loop else []
+        if self.playback_port is not None:
+            control = ports.endpoint(self.playback_port)
+            return self._commands.player(NODE, source, publish, clock, control, *loop)
+        return self._commands.node(NODE, source, publish, clock, *loop)
 
     def _server(self) -> ChildSpec:
         publish, control = ports.endpoint(self.composite_port), ports.endpoint(self.control_port)
@@ -139,6 +152,7 @@ class HostPlan:
             *("--control", ports.endpoint(self.control_port)),
             *("--subscribe", ports.endpoint(self.composite_port)),
             *self._frames,
+            *([] if self.playback_port is None else ["--playback", ports.endpoint(self.playback_port)]),
         )
 
 

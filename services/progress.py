@@ -6,7 +6,11 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Self
 
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import StatsMessage
 from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.watchdog import LATE_AFTER_S, ProcessorUse
 
 LOOK_INTERVAL_S = 1.0  # /proc counts in hundredths of a second
@@ -15,8 +19,9 @@ LOOK_INTERVAL_S = 1.0  # /proc counts in hundredths of a second
 class Progress:
     """Notes when one of some processes was last at work; a context manager.
 
-    Who waits reports each second, and who starts or renders does not: it uses the processor meanwhile. It may not
-    answer then, where the driver keeps the interpreter's lock. `endpoints` are those of the reports, by process.
+    Who waits reports each second, and who starts or renders does not, or says that it starts: it uses the processor
+    meanwhile. It may not answer then, where the driver keeps the interpreter's lock. `endpoints` are those of the
+    reports, by process.
     """
 
     def __init__(self, endpoints: Mapping[str, str]) -> None:
@@ -46,7 +51,17 @@ class Progress:
 
     def _is_at_work(self, name: str, process_id: int) -> bool:
         now_s = time.monotonic()
-        if self._receivers[name].latest(0.0):
+        reports = (self._receivers[name].latest(0.0) or {}).values()
+        if any(map(_is_of_who_waits, reports)):
             self._reported_s[name] = now_s
         works = self._uses.setdefault(process_id, ProcessorUse(process_id)).grew()
         return works and now_s - self._reported_s[name] > LATE_AFTER_S
+
+
+def _is_of_who_waits(multipart: ReceivedMultipart) -> bool:
+    """Whether a report is not that of a process which says that it starts; a malformed one is of nobody."""
+    try:
+        message, _ = decode(multipart)
+    except DeltalightError:
+        return False
+    return isinstance(message, StatsMessage) and message.state != "starting"

@@ -49,7 +49,7 @@ class SrtAddress:
         for key, value in parse_qsl(query, keep_blank_values=True):
             if key not in QUERY:
                 raise DeltalightError(
-                    f"An SRT address takes {', '.join(QUERY)}, each once, not '{key}'; it is always the caller."
+                    f"An SRT address takes {', '.join(QUERY)}, each once, not '{key:.40}'; it is always the caller."
                 )
             number, read = QUERY[key]
             options.append((number, read(value)))
@@ -77,7 +77,7 @@ def _key_bytes(text: str) -> int:
 
 
 def _latency_ms(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) <= 30_000):
+    if not (text.isascii() and text.isdigit() and len(text) <= 5 and int(text) <= 30_000):
         raise DeltalightError("latency of an SRT address is 0 to 30000 (ms).")
     return int(text)
 

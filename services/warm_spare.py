@@ -12,8 +12,9 @@ from deltalight.services.uncollected import uncollected
 SPARE_VARIABLE = "DELTALIGHT_SPARE_PREPARES"
 GO = b"1"
 PREPARED = {  # by spares of a command
-    "node": ("deltalight.services.node_process", "pydantic_settings"),
-    "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings"),
+    "node": ("deltalight.services.node_process", "pydantic_settings", "blosc2"),
+    "replay": ("deltalight.services.node_process", "pydantic_settings", "blosc2"),
+    "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings", "blosc2"),
     "api": ("deltalight.services.api.serve", "pydantic_settings"),
 }
 

@@ -16,6 +16,7 @@ import structlog
 
 from deltalight.services import ports
 from tests.lanes import SLOW_MARKERS, dealt, is_slow
+from tests.patience import LostTime, grant
 
 if TYPE_CHECKING:
     from deltalight.render_server.gpu.context import GpuContext
@@ -80,11 +81,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave slow tests out of the quick tier; in the full one they come first, so that none is waited for alone."""
+    grant(items)
     if config.getoption("all") or _are_slow_ones_named(config):
         items[:] = dealt(items, WORKERS)
     elif slow := [item for item in items if is_slow(item)]:
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if not is_slow(item)]
+
+
+lost_time = LostTime()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    lost_time.refuse(item)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    lost_time.note(report)
 
 
 def pytest_collection_finish() -> None:

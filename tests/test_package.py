@@ -1,5 +1,6 @@
 """The package deltalight: a wheel holds all of it alone and works anywhere; its dependencies are pinned."""
 
+import fcntl
 import json
 import os
 import re
@@ -38,7 +39,11 @@ def foreign(tmp_path: Path) -> Path:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", folder)
-    _run(sys.executable, "-m", "pip", "wheel", *options, ROOT)
+    with (ROOT / "hatch_build.py").open() as lock:
+        fcntl.flock(
+            lock, fcntl.LOCK_EX
+        )  # builds in the checkout itself, where another worker may do the same
+        _run(sys.executable, "-m", "pip", "wheel", *options, ROOT)
     (found,) = folder.glob("*.whl")
     return found
 

@@ -23,7 +23,7 @@ from deltalight.protocol.files import write_bytes
 from deltalight.services import ports
 from deltalight.services.files import make_output_folder
 
-START_TIMEOUT_S = 180.0  # a cold shader cache on a slow machine takes a while
+START_TIMEOUT_S = 300.0  # a cold shader cache on a slow machine takes a while, and each camera needs a frame
 END_TIMEOUT_S = 5.0  # a process whose supervisor is gone ends itself
 PLOT = "soak.svg"
 
@@ -76,16 +76,19 @@ def soak(job: SoakJob, say: Say) -> SoakReport:
         station = stack.enter_context(running_station(profile, thread, job.seed))
         say("starting the station")
         _wait_for_page(station)
-        run = Run(station, Crowd(thread, station.places.page), profile, Random(job.seed), thread)
+        run = Run(
+            station, Crowd(thread, station.places.page, station.cameras), profile, Random(job.seed), thread
+        )
         _wait_for_picture(run)
         log = _Log(time.monotonic())
         with Sampler(station) as sampler:
             _put_to_faults(job, run, log, say)
-        renderer, names, deaths = _renderer(station), station.names, station.deaths()
+        renderer, deaths = _renderer(station), station.deaths()
+        names, cameras = station.names, station.cameras
         seconds = time.monotonic() - log.began_s
         seen = run.crowd.between(log.began_s, float("inf"))
     soaked = Soaked(
-        profile, sampler.samples, log.calm, seen, log.faults, deaths, orphans=_orphans(station.ids)
+        profile, sampler.samples, log.calm, seen, log.faults, deaths, _orphans(station.ids), cameras
     )
     say(f"ended; {len(log.faults)} faults")
     return SoakReport(
@@ -100,7 +103,7 @@ def soak(job: SoakJob, say: Say) -> SoakReport:
         figures=all_figures(soaked),
         faults=log.faults,
         times_s=[round(each.at_s - log.began_s, 1) for each in sampler.samples],
-        courses=all_courses(sampler.samples, seen, names),
+        courses=all_courses(sampler.samples, seen, names, cameras),
     )
 
 
@@ -142,7 +145,10 @@ def _wait_for_page(station: Station) -> None:
 
 
 def _wait_for_picture(run: Run) -> None:
-    _wait(run.station, lambda: len(run.crowd.seen) > 1, "No picture came from the render server")
+    def all_came() -> bool:
+        return len(run.crowd.pictures()) == len(run.crowd.cameras)
+
+    _wait(run.station, all_came, "No picture of some camera came from the render server")
 
 
 def _wait(station: Station, condition: Callable[[], bool], otherwise: str) -> None:

@@ -19,7 +19,7 @@ from websockets.exceptions import WebSocketException
 from deltalight.benchmarks.soak.link import LoopThread
 from deltalight.services.live_message import LiveHeader, unpack
 
-KEPT_PICTURES = 200_000  # 3.7 hours at 15 a second; the oldest go first
+KEPT_PICTURES = 200_000  # 55 minutes of four cameras at 15 a second each; the oldest go first
 AGAIN_AFTER_S = 0.05
 SLOW_S = 1.0
 LONGEST_VISIT_S = 3.0
@@ -27,63 +27,76 @@ LONGEST_VISIT_S = 3.0
 
 @dataclass(frozen=True)
 class Seen:
-    """A picture as it came: seconds of the monotonic clock, its age and the part of it that was waiting, ms."""
+    """A camera's picture as it came: seconds of the monotonic clock, its age and how much of it was waiting, ms."""
 
     at_s: float
     capture_ns: int
     age_ms: float
     waiting_ms: float
+    camera: str = ""
 
 
 @dataclass(frozen=True)
 class Flow:
-    """Pictures that the measuring viewer got in a span: a second, ages in ms, and the longest wait for one in s."""
+    """Pictures that the measuring viewers got in a span: a second, ages in ms, and the longest wait for one in s.
+
+    `frames_per_s` is of all cameras together, `longest_gap_s` that of the camera which waited longest.
+    """
 
     frames_per_s: float
+    camera_frames_per_s: dict[str, float]
     age_p50_ms: float | None
     age_p95_ms: float | None
     unwaited_p95_ms: float | None = field(metadata={"what": "of the ages without waiting for the renderer"})
     longest_gap_s: float
 
     @classmethod
-    def of(cls, seen: Sequence[Seen], began_s: float, ended_s: float) -> "Flow":
-        """Describe pictures that came between two moments."""
-        moments = [began_s, *(each.at_s for each in seen), ended_s]
+    def of(
+        cls, seen: Sequence[Seen], began_s: float, ended_s: float, cameras: Sequence[str] = ("",)
+    ) -> "Flow":
+        """Describe pictures of some cameras that came between two moments."""
+        came_s = {name: [each.at_s for each in seen if each.camera == name] for name in cameras}
+        gaps_s = [np.max(np.diff([began_s, *own, ended_s])) for own in came_s.values()]
         ages = [each.age_ms for each in seen]
         unwaited = [each.age_ms - each.waiting_ms for each in seen]
         return cls(
             len(seen) / (ended_s - began_s),
+            {name: len(own) / (ended_s - began_s) for name, own in came_s.items() if name},
             _percentile(ages, 50),
             _percentile(ages, 95),
             _percentile(unwaited, 95),
-            float(np.max(np.diff(moments))),
+            float(max(gaps_s)),
         )
 
 
 class Crowd:
-    """Viewers in an event loop of their own; the measuring one connects again whenever it has to."""
+    """Viewers in an event loop of their own; one of each camera measures, and connects again when it must."""
 
-    def __init__(self, thread: LoopThread, port: int) -> None:
+    def __init__(self, thread: LoopThread, port: int, cameras: Sequence[str]) -> None:
+        self.cameras = cameras
         self.seen: deque[Seen] = deque(maxlen=KEPT_PICTURES)
         self._thread = thread
         self._address = f"ws://127.0.0.1:{port}/api/v1/live"
-        self._newest: tuple[LiveHeader, bytes] | None = None
+        self._newest: dict[str, tuple[LiveHeader, bytes]] = {}
         self._lock = threading.Lock()
-        thread.start(self._measure())
+        for camera in cameras:
+            thread.start(self._measure(camera))
 
-    def picture(self) -> tuple[int, UInt8[np.ndarray, "h w 3"]] | None:
-        """Return capture time (ns) and pixels of the newest picture, None before the first."""
+    def pictures(self) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+        """Return the pixels of each camera's newest picture; a camera that has sent none is missing."""
         with self._lock:
-            newest = self._newest
-        if newest is None:
-            return None
-        pixels = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
-        return None if pixels is None else (newest[0].capture_ns, pixels.astype(np.uint8))
+            newest = {name: jpeg for name, (_, jpeg) in self._newest.items()}
+        pixels = {name: cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1) for name, jpeg in newest.items()}
+        return {name: each.astype(np.uint8) for name, each in pixels.items() if each is not None}
 
     def between(self, began_s: float, ended_s: float) -> list[Seen]:
         """Return the pictures that came in a span of the monotonic clock."""
         with self._lock:
             return [each for each in self.seen if began_s <= each.at_s < ended_s]
+
+    def flow(self, began_s: float, ended_s: float) -> Flow:
+        """Describe the pictures that came in a span of the monotonic clock."""
+        return Flow.of(self.between(began_s, ended_s), began_s, ended_s, self.cameras)
 
     def join(self, behaviour: str) -> Callable[[], None]:
         """Add a viewer of BEHAVIOURS; return what makes it leave."""
@@ -101,25 +114,27 @@ class Crowd:
 
         return leave
 
-    async def _measure(self) -> None:
+    async def _measure(self, camera: str) -> None:
+        address = f"{self._address}?camera={camera}"  # refused until the render server has named it
         while True:
             with suppress(OSError, WebSocketException, TimeoutError):
-                async with connect(self._address, max_size=None, compression=None) as socket:
+                async with connect(address, max_size=None, compression=None) as socket:
                     while True:
-                        self._note(await socket.recv())
+                        self._note(camera, await socket.recv())
                         await socket.send("ack")
             await asyncio.sleep(AGAIN_AFTER_S)
 
-    def _note(self, message: str | bytes) -> None:
+    def _note(self, camera: str, message: str | bytes) -> None:
         assert isinstance(message, bytes)
         header, jpeg = unpack(message)
-        if header.status != "ok":
-            return  # a stranger's, whom nothing tells where it is
+        is_own = header.node == camera or (header.node is None and len(self.cameras) == 1)
+        if header.status != "ok" or not is_own:
+            return  # of a stranger, whom nothing tells where it is, or of another camera while its own is missing
         age_ms = (time.time_ns() - header.capture_ns) / 1e6  # one host, one clock
         waiting_ms = max(0.0, header.render_ms - sum(header.pass_times_ms.values()))
         with self._lock:
-            self._newest = header, jpeg
-            self.seen.append(Seen(time.monotonic(), header.capture_ns, age_ms, waiting_ms))
+            self._newest[camera] = header, jpeg
+            self.seen.append(Seen(time.monotonic(), header.capture_ns, age_ms, waiting_ms, camera))
 
 
 Behaviour = Callable[[ClientConnection], Coroutine[Any, Any, None]]

@@ -5,7 +5,7 @@ import signal
 import time
 import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from random import Random
@@ -15,12 +15,12 @@ import httpx
 import numpy as np
 from jaxtyping import UInt8
 
-from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Flow, Seen
+from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Seen
 from deltalight.benchmarks.soak.link import SHAPES, LoopThread
 from deltalight.benchmarks.soak.nonsense import send_nonsense
 from deltalight.benchmarks.soak.peers import peers_on
 from deltalight.benchmarks.soak.profiles import Profile
-from deltalight.benchmarks.soak.station import SERVER, WEB, Station
+from deltalight.benchmarks.soak.station import SERVER, WEB, Station, camera_of
 from deltalight.benchmarks.soak.takes_killed import kill_recorder
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
@@ -35,6 +35,7 @@ CUT_S = 5.0
 LARGEST_DIFFERENCE = 2.0  # mean of a picture's codes: noise and JPEG are below 1, a missing object is above
 
 Outcome = dict[str, Any]
+Pictures = dict[str, UInt8[np.ndarray, "h w 3"]]  # newest ones, by camera
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,10 @@ class Fault(ABC):
 
 @dataclass(frozen=True)
 class Kill(Fault):
-    """SIGKILL of a process: when the picture is back, and whether the scene is the same by document and by pixels."""
+    """SIGKILL of a process: when the picture is back, and whether the scene is the same by document and by pixels.
+
+    Of a node its own camera's picture, of another process those of all cameras.
+    """
 
     process: str
 
@@ -70,7 +74,7 @@ class Kill(Fault):
         """Do it, and wait for a picture captured later."""
         station = run.station
         name = _chosen(self.process, run)
-        documents, picture = _documents(station), _picture(run)
+        documents, pictures = _documents(station), _pictures(run)
         restarts, spare = station.restarts()[name], station.spare_id(name)
         killed_ns, killed_s = time.time_ns(), time.monotonic()
         station.kill(name)
@@ -82,7 +86,7 @@ class Kill(Fault):
             "back_s": back_s,
             "by_spare": station.process_id(name) == spare,
             "same_document": _documents(station) == documents,
-            "difference": _settled_difference(run, picture),
+            "difference": _settled_difference(run, pictures),
         }
 
 
@@ -117,7 +121,7 @@ class Viewers(Fault):
 
     def run(self, run: Run) -> Outcome:
         """Have one of each watch for a while."""
-        with _compared(run, after=True) as outcome:
+        with _compared(run, calm_s=run.profile.load_s) as outcome:
             leave = [run.crowd.join(behaviour) for behaviour in BEHAVIOURS]
             time.sleep(run.profile.load_s)
             for each in leave:
@@ -131,7 +135,7 @@ class Churn(Fault):
 
     def run(self, run: Run) -> Outcome:
         """Have them do so for a while."""
-        with _compared(run, after=True) as outcome:
+        with _compared(run, calm_s=run.profile.load_s) as outcome:
             leave = run.crowd.come_and_go(run.profile.viewers, run.dice.randrange(2**32))
             time.sleep(run.profile.load_s)
             leave()
@@ -144,7 +148,7 @@ class Nonsense(Fault):
 
     def run(self, run: Run) -> Outcome:
         """Have it send for a while."""
-        with _compared(run, after=True) as outcome:
+        with _compared(run, calm_s=run.profile.load_s) as outcome:
             sent = send_nonsense(run.station.places.stranger, run.profile.load_s, run.dice)
         return {"sent": sent, **outcome}
 
@@ -184,7 +188,7 @@ class Cut(Fault):
             for link in links:
                 link.cut(False)
         mended_ns, mended_s = time.time_ns(), time.monotonic()
-        _wait(run, lambda: any(each.capture_ns > mended_ns for each in _since(run, mended_s)))
+        _wait(run, lambda: _all_seen(run, run.crowd.cameras, mended_ns, mended_s))
         return {"cut_s": CUT_S, "back_s": time.monotonic() - mended_s}
 
 
@@ -233,21 +237,22 @@ def parse_faults(text: str) -> list[str]:
 
 
 @contextmanager
-def _compared(run: Run, *, after: bool = False) -> Iterator[Outcome]:
+def _compared(run: Run, *, calm_s: float = 0.0) -> Iterator[Outcome]:
     """Yield an outcome that holds, after the block, the flow of pictures before it and during it.
 
-    With `after`, also the flow after it, since the rate wanders without any fault.
+    With `calm_s`, that before is of so many seconds, and there is one of as many after it: the rate wanders without
+    any fault, and how far shows in what two calm spans differ by.
     """
     outcome: Outcome = {}
+    time.sleep(max(0.0, calm_s - run.profile.calm_s))  # as long as the profile says it has been calm already
     began_s = time.monotonic()
     yield outcome
     ended_s = time.monotonic()
-    calm_s = run.profile.calm_s
-    spans = {"before": (began_s - calm_s, began_s), "during": (began_s, ended_s)}
-    if after:
+    spans = {"before": (began_s - (calm_s or run.profile.calm_s), began_s), "during": (began_s, ended_s)}
+    if calm_s:
         time.sleep(calm_s)
         spans["after"] = (ended_s, ended_s + calm_s)
-    outcome |= {name: vars(Flow.of(run.crowd.between(*span), *span)) for name, span in spans.items()}
+    outcome |= {name: vars(run.crowd.flow(*span)) for name, span in spans.items()}
 
 
 def _chosen(process: str, run: Run) -> str:
@@ -259,15 +264,20 @@ def _since(run: Run, began_s: float) -> list[Seen]:
 
 
 def _is_back(run: Run, name: str, after_ns: int, after_s: float) -> bool:
-    """Whether a picture captured later has come, and of a node that it reports again."""
-    if not any(each.capture_ns > after_ns for each in _since(run, after_s)):
-        return False
-    return name not in run.station.node_names or _reports(run.station, name, after_s)
+    """Whether pictures captured later have come: of a node, which has to report too, or of all."""
+    if name not in run.station.node_names:
+        return _all_seen(run, run.crowd.cameras, after_ns, after_s)
+    is_seen = _all_seen(run, [camera_of(name)], after_ns, after_s)
+    return is_seen and _reports(run.station, camera_of(name), after_s)
 
 
-def _reports(station: Station, name: str, after_s: float) -> bool:
+def _all_seen(run: Run, cameras: Sequence[str], after_ns: int, after_s: float) -> bool:
+    """Whether a picture captured later has come of each of these cameras."""
+    return {each.camera for each in _since(run, after_s) if each.capture_ns > after_ns}.issuperset(cameras)
+
+
+def _reports(station: Station, topic: str, after_s: float) -> bool:
     """Whether a node has reported since then."""
-    topic = name.replace(" ", "")
     try:
         known = station.client.get("/nodes").raise_for_status().json()
     except httpx.HTTPError:
@@ -287,22 +297,26 @@ def _documents(station: Station) -> tuple[object, object]:
     return stored, reply.payload.get("scene")
 
 
-def _picture(run: Run) -> UInt8[np.ndarray, "h w 3"]:
-    found = run.crowd.picture()
-    if found is None:
+def _pictures(run: Run) -> Pictures:
+    found = run.crowd.pictures()
+    if len(found) < len(run.crowd.cameras):
         raise DeltalightError("There is no picture yet to which a later one could be compared.")
-    return found[1]
+    return found
 
 
-def _settled_difference(run: Run, before: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Return the mean difference of codes from the picture before, as soon as it is small or time is up."""
+def _settled_difference(run: Run, before: Pictures) -> float:
+    """Return the greatest mean difference of codes from the pictures before, once it is small or time is up."""
     deadline_s = time.monotonic() + SETTLE_S
     while True:
-        now = _picture(run)
-        found = np.inf if now.shape != before.shape else float(np.abs(now.astype(int) - before).mean())
+        now = _pictures(run)
+        found = max(_difference(now[name], each) for name, each in before.items())
         if found <= LARGEST_DIFFERENCE or time.monotonic() > deadline_s:
             return found
         time.sleep(0.2)
+
+
+def _difference(one: UInt8[np.ndarray, "h w 3"], other: UInt8[np.ndarray, "h w 3"]) -> float:
+    return np.inf if one.shape != other.shape else float(np.abs(one.astype(int) - other).mean())
 
 
 def _wait(run: Run, condition: Callable[[], bool]) -> None:

@@ -1,10 +1,12 @@
 """Figures of a soak, from samples, pictures and outcomes of faults."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from deltalight.benchmarks.soak.crowd import Flow, Seen
 from deltalight.benchmarks.soak.faults import LARGEST_DIFFERENCE
@@ -27,6 +29,7 @@ BACK = Bar("< 3 s", lambda value: value < 3.0)
 BACK_FROM_CUT = Bar("< 1 s", lambda value: value < 1.0)
 NONE = Bar("0", lambda value: value == 0)
 ALL = Bar("every time", lambda value: value == 1)
+SHOWN = Bar("shown", lambda _value: True)
 LOST = Bar("<= 1 s", lambda value: value <= 1.0)
 
 
@@ -41,6 +44,7 @@ class Soaked:
     faults: Sequence[FaultRecord]
     deaths: Mapping[str, int]
     orphans: int
+    cameras: Sequence[str]
 
     def is_calm(self, at_s: float) -> bool:
         """Whether there was no fault then."""
@@ -56,6 +60,7 @@ def all_figures(soaked: Soaked) -> list[Figure]:
         worst("orphans", "processes that outlived the station", [soaked.orphans], NONE, ""),
         *_resources(soaked),
         _age(soaked),
+        _rate(soaked),
         *_kills(outcomes),
         *_loads(outcomes, soaked.profile),
         *_links(outcomes),
@@ -106,6 +111,15 @@ def _age(soaked: Soaked) -> Figure | None:
     return worst("age of a picture without waiting", how, p95_ms, period_bar(soaked.profile), "ms")
 
 
+def _rate(soaked: Soaked) -> Figure | None:
+    """Pictures a second of each camera, over all that was calm."""
+    calm_s = sum(ended_s - began_s for began_s, ended_s in soaked.calm)
+    counts = Counter(each.camera for each in soaked.seen if soaked.is_calm(each.at_s))
+    rates = [counts[name] / calm_s for name in soaked.cameras] if calm_s else []
+    how = f"without a fault, of {soaked.profile.frames_per_s:g} that its node sends"
+    return worst("pictures a second of a camera", how, rates, SHOWN, "")
+
+
 def _kills(outcomes: _Outcomes) -> list[Figure | None]:
     names = {"kill-node": "node", "kill-server": SERVER, "kill-web": WEB}
     figures = [
@@ -127,7 +141,8 @@ def _kills(outcomes: _Outcomes) -> list[Figure | None]:
 
 def _loads(outcomes: _Outcomes, profile: Profile) -> list[Figure | None]:
     near = Bar("within 5 %", lambda value: value <= 5.0)
-    figures = []
+    figures: list[Figure | None] = []
+    by_themselves: list[float] = []
     for name, what in (
         ("viewers", "slow, silent and never acknowledging viewers"),
         ("churn", "viewers that join and leave"),
@@ -137,13 +152,19 @@ def _loads(outcomes: _Outcomes, profile: Profile) -> list[Figure | None]:
             np.array(outcomes.of(name, when, "frames_per_s")) for when in ("before", "during", "after")
         )
         calm = (before + after) / 2
-        changes = [float(each) for each in 100 * np.abs(during - calm)[calm > 0] / calm[calm > 0]]
+        changes = _per_cent(during - calm, calm)
+        by_themselves += _per_cent(after - before, calm)
         ages_ms = outcomes.of(name, "during", "unwaited_p95_ms")
         figures += [
             worst("change of others' rate", f"{what}, against before and after", changes, near, "%"),
             worst("others' age without waiting, 95 of 100", what, ages_ms, period_bar(profile), "ms"),
         ]
-    return figures
+    how = "from the calm span before each of these loads to that after it, equally long"
+    return [*figures, worst("change of the rate by itself", how, by_themselves, SHOWN, "%")]
+
+
+def _per_cent(changes: Float64[np.ndarray, " n"], of: Float64[np.ndarray, " n"]) -> list[float]:
+    return [float(each) for each in 100 * np.abs(changes)[of > 0] / of[of > 0]]
 
 
 def _links(outcomes: _Outcomes) -> list[Figure | None]:
@@ -162,9 +183,8 @@ def _links(outcomes: _Outcomes) -> list[Figure | None]:
 
 
 def _flow_figures(outcomes: _Outcomes, path: tuple[str, str], what: str) -> list[Figure | None]:
-    shown = Bar("shown", lambda _value: True)
     return [
-        worst(title, what, outcomes.of(*path, key), shown, unit)
+        worst(title, what, outcomes.of(*path, key), SHOWN, unit)
         for key, title, unit in (
             ("age_p50_ms", "age, median", "ms"),
             ("age_p95_ms", "age, 95 of 100", "ms"),
@@ -174,10 +194,10 @@ def _flow_figures(outcomes: _Outcomes, path: tuple[str, str], what: str) -> list
 
 
 def all_courses(
-    samples: Sequence[Sample], seen: Sequence[Seen], names: Sequence[str]
+    samples: Sequence[Sample], seen: Sequence[Seen], names: Sequence[str], cameras: Sequence[str]
 ) -> dict[str, dict[str, list[float | None]]]:
     """Return what is plotted, by panel and line, at the times of the samples."""
-    flows = [Flow.of(own, *span) for span, own in _by_sample(samples, seen)]
+    flows = [Flow.of(own, *span, cameras) for span, own in _by_sample(samples, seen)]
 
     def of_each(read: Callable[[ProcessSample], float]) -> dict[str, list[float | None]]:
         known = {name: [sample.processes.get(name) for sample in samples] for name in names}
@@ -191,7 +211,9 @@ def all_courses(
             "median": _rounded(flow.age_p50_ms for flow in flows),
             "95 of 100": _rounded(flow.age_p95_ms for flow in flows),
         },
-        "pictures a second": {"at a viewer": _rounded(flow.frames_per_s for flow in flows)},
+        "pictures a second": {
+            name: _rounded(flow.camera_frames_per_s[name] for flow in flows) for name in cameras
+        },
         "RSS, MB": of_each(lambda process: process.rss_bytes / 1e6),
         "open handles": of_each(lambda process: process.handles),
         "GL objects": {SERVER: _rounded(each.gl_objects for each in samples)},

@@ -25,6 +25,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.recording_reader import RecordingReader
+from deltalight.protocol.sockets import open_context
 from deltalight.services import ports
 from deltalight.services.demo import RECORDING
 
@@ -76,7 +77,7 @@ class Queued(_Peer):
     """Queues everything at both ends, and lets the kernel hold what it wants."""
 
     def __init__(self, port: int, link_port: int) -> None:
-        self._context = zmq.Context()
+        self._context = open_context()
         self._sender, self._receiver = self._context.socket(zmq.PUB), self._context.socket(zmq.SUB)
         self._sender.sndhwm = self._receiver.rcvhwm = 0
         self._receiver.subscribe(TOPIC)

@@ -87,6 +87,11 @@ class Station:
         self.client.close()
 
     @property
+    def cameras(self) -> list[str]:
+        """Names of the nodes' cameras, in the order of the nodes."""
+        return [camera_of(name) for name in self.node_names]
+
+    @property
     def names(self) -> list[str]:
         """Names of all processes."""
         return [*self.node_names, SERVER, WEB]
@@ -231,4 +236,10 @@ def _specs(places: Ports, take: Path, session: Path, data: Path) -> list[ChildSp
 
 def _node(plan: HostPlan, number: int, port: int) -> ChildSpec:
     spec = replace(plan, node_port=port).specs()[0]
-    return replace(spec, name=f"node {number}", arguments=(*spec.arguments, "--name", f"node{number}"))
+    name = f"node {number}"
+    return replace(spec, name=name, arguments=(*spec.arguments, "--name", camera_of(name)))
+
+
+def camera_of(node_name: str) -> str:
+    """Return the name in a node's topics, which is also that of its camera, by the name of its process."""
+    return node_name.replace(" ", "")

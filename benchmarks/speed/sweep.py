@@ -75,21 +75,32 @@ def _volumes() -> Iterator[Point]:
         yield Point(f"{voxels}^3", method, times_ms, voxels == 64)
 
 
-def _image_based(samples: int, width: int, height: int) -> str:
-    settings = {"name": "image_based", "samples": samples}
+def _receivers() -> Iterator[Point]:
+    """About as many pixels as [D] has vertices (100 first), each of which looks up its light."""
+    published = {(16, 16): 3.22, (40, 25): 4.45, (400, 250): 27.39, (640, 480): 43.2}
+    for (width, height), published_ms in published.items():
+        picture = f"output.width={width},output.height={height}"
+        method = f"aroof:rays=64,shading_scale=1,indirect=false,{picture}"
+        yield Point(f"{width * height} pixels", method, (published_ms,), width <= 400)
+
+
+def _shaded(name: str, samples: int, width: int, height: int) -> str:
+    settings = {"name": name, "samples": samples}
     picture = {"width": width, "height": height}
     written = [f"shading.{key}={value}" for key, value in settings.items()]
     return f"raster:{','.join([*written, *(f'output.{key}={value}' for key, value in picture.items())])}"
 
 
-def _pictures() -> Iterator[Point]:
-    for (width, height), published_ms in {(640, 480): 1.3, (1280, 720): 6.1, (1920, 1080): 14.4}.items():
-        yield Point(f"{height} rows", _image_based(40, width, height), (published_ms,), height < 1080)
+def _pictures(shading: str, published_ms: Sequence[float]) -> Iterator[Point]:
+    for (width, height), each_ms in zip(((640, 480), (1280, 720), (1920, 1080)), published_ms, strict=True):
+        yield Point(f"{height} rows", _shaded(shading, 40, width, height), (each_ms,), height < 1080)
 
 
 def _samples() -> Iterator[Point]:
     for samples, published_ms in {1: 0.028, 10: 0.546, 20: 1.538, 30: 2.328, 40: 3.162}.items():
-        yield Point(f"{samples} samples", _image_based(samples, 1280, 720), (published_ms,), samples <= 20)
+        yield Point(
+            f"{samples} samples", _shaded("image_based", samples, 1280, 720), (published_ms,), samples <= 20
+        )
 
 
 SWEEPS = (
@@ -97,13 +108,25 @@ SWEEPS = (
         "Image-based shading by picture, 40 samples ([D] 4.2)",
         "camera",
         {"shading": ("ambient occlusion", "image-based surface")},
-        tuple(_pictures()),
+        tuple(_pictures("image_based", (1.3, 6.1, 14.4))),
+    ),
+    Sweep(
+        "Shading by precomputed transfer by picture ([D] table 4.1)",
+        "camera",
+        {"shading": ("transferred light", "precomputed surface")},
+        tuple(_pictures("precomputed", (0.02, 0.021, 0.04))),
     ),
     Sweep(
         "Image-based shading by samples, 1280x720 ([D] figure 4.5)",
         "camera",
         {"shading": ("image-based surface",)},
         tuple(_samples()),
+    ),
+    Sweep(
+        "Light that occlusion fields leave, by places that receive it ([D] table 5.1)",
+        "camera",
+        {"fields": ("occlusion real",)},
+        tuple(_receivers()),
     ),
     Sweep(
         "Light injected into DLPVs by size of the shadow maps ([D] table 5.3)",

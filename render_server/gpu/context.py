@@ -57,6 +57,9 @@ class GpuMemoryError(DeltalightError):
     """The driver had no memory for what it was asked; OpenGL's state is undefined now (OpenGL 4.3, 2.3.1)."""
 
 
+CompileWatcher = Callable[[str, Mapping[str, str]], None]
+
+
 class Program(Protocol):
     """A linked program and the ids of what uses it."""
 
@@ -104,7 +107,7 @@ class GpuContext:
     is_software: bool
     watchers: list[Callable[[Any], None]] = field(default_factory=list)
     """Told of every run of a kernel (gpu/kernel.py)."""
-    compile_watchers: list[Callable[[str, Mapping[str, str]], None]] = field(default_factory=list)
+    compile_watchers: list[CompileWatcher] = field(default_factory=list)
     """Told of every program that a kernel asks for: its label and the text of each of its stages."""
 
     programs: SharedPrograms = field(default_factory=SharedPrograms)

@@ -5,10 +5,11 @@ needs.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -111,6 +112,14 @@ class _Program:
         for name in program:
             self._adopt(name, program[name])
         self._assign()
+        self._binders: Sequence[tuple[list[_Slot], Callable[[_Slot, Binding], None]]] = (
+            (self._samplers, self._bind_sampler),
+            (self._images, self._bind_image),
+            (self._storage, self._bind_storage),
+            (self._blocks, self._bind_block),
+            (self._uniforms, self._write),
+        )
+        self._needed = {slot.name for slots, _ in self._binders for slot in slots}
 
     def _adopt(self, name: str, member: object) -> None:
         slot = _Slot(name, member, getattr(member, "gl_type", 0))
@@ -136,8 +145,8 @@ class _Program:
                 slot.place = slots.index(slot)
                 slot.member.binding = slot.place
 
-    def bind(self, shared: Sequence[Bindings], own: Bindings) -> dict[str, object]:
-        """Binds everything that the program reads and writes; returns what it may write.
+    def bind(self, own: Bindings, known: Bindings) -> None:
+        """Binds everything that the program reads and writes, of what is `known`; `own` names must be declared.
 
         Raises:
             BindingError: a name or value does not fit.
@@ -145,33 +154,25 @@ class _Program:
         for name in own:
             if name not in self._declared.names:
                 raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
-        sources = (own, *shared)
-        written: dict[str, object] = {}
-        for slot in self._samplers:
-            self._bind_sampler(slot, self.find(slot.name, sources))
-        for slot in self._images:
-            written[slot.name] = self._bind_image(slot, self.find(slot.name, sources))
-        for slot in self._storage:
-            value = self.find(slot.name, sources)
-            self._bind_storage(slot, value)
-            if value is not None:
-                written[slot.name] = value
-        for slot in self._blocks:
-            self._bind_block(slot, self.find(slot.name, sources))
-        for slot in self._uniforms:
-            self._write(slot, self.find(slot.name, sources))
-        return {name: item for name, item in written.items() if name in self._declared.written}
+        self._require(self._needed, known)
+        for slots, bind in self._binders:
+            for slot in slots:
+                bind(slot, known[slot.name])
 
-    def find(self, name: str, sources: Sequence[Bindings]) -> Binding:
-        """Returns what the first of the sources that knows it binds to a name.
+    def _require(self, names: Set[str], known: Bindings) -> None:
+        if not names <= known.keys():
+            missing = min(names - known.keys())
+            raise BindingError(f"Kernel {self.label} needs `{missing}`, which it was not given.")
+
+    def switched_on(self, known: Bindings) -> tuple[str, ...]:
+        """Returns the names of the defines that bindings turn on.
 
         Raises:
-            BindingError: none does.
+            BindingError: one is missing.
         """
-        for source in sources:
-            if name in source:
-                return source[name]
-        raise BindingError(f"Kernel {self.label} needs `{name}`, which it was not given.")
+        switches = self._declared.switches
+        self._require(set(switches), known)
+        return tuple(name for name in switches if known[name])
 
     def _nearest(self, name: str) -> str:
         close = get_close_matches(name, self._declared.names, 1)
@@ -193,7 +194,7 @@ class _Program:
             )
         texture.use(location=slot.place)
 
-    def _bind_image(self, slot: _Slot, value: Binding) -> Texture:
+    def _bind_image(self, slot: _Slot, value: Binding) -> None:
         kind = IMAGES[slot.kind]
         if not isinstance(value, Texture) or not isinstance(value, kind):
             raise self._wrong(slot, value, f"a {kind.__name__} that is written or read texel by texel")
@@ -205,7 +206,6 @@ class _Program:
                 f"but the texture is {found}."
             )
         value.bind_to_image(slot.place, read=True, write=True)
-        return value
 
     def _bind_storage(self, slot: _Slot, value: Binding) -> None:
         is_written = slot.name in self._declared.written
@@ -249,11 +249,6 @@ class _Program:
         self._last[slot.name] = data
 
     @property
-    def switches(self) -> tuple[str, ...]:
-        """Names of the defines that bindings turn on."""
-        return self._declared.switches
-
-    @property
     def local_size(self) -> tuple[int, int, int]:
         """Invocations of a workgroup."""
         return self._declared.local_size
@@ -277,10 +272,16 @@ class _Program:
         """Frees the GL object."""
         self.program.release()
 
-    def report(self, size: tuple[int, ...], written: Mapping[str, object]) -> None:
-        """Tells the watchers that the program ran."""
+    def written(self, known: Bindings) -> dict[str, object]:
+        """Images and buffers that it may write, of what its names were bound to."""
+        slots = (*self._images, *self._storage)
+        bound = {slot.name: known[slot.name] for slot in slots if slot.name in self._declared.written}
+        return {name: item for name, item in bound.items() if item is not None}
+
+    def report(self, size: tuple[int, ...], written: Callable[[], Mapping[str, object]]) -> None:
+        """Tells the watchers that the program ran, and what `written` says it wrote."""
         for watch in self._gpu.watchers:
-            watch(Dispatch(self.label, size, written))
+            watch(Dispatch(self.label, size, written()))
 
 
 class _Shader(ABC):
@@ -304,9 +305,16 @@ class _Shader(ABC):
         assert isinstance(program, _Program)
         return program
 
-    def _program(self, *sources: Bindings) -> _Program:
-        """Returns the program that the bindings choose."""
-        on = tuple(name for name in self._plain.switches if self._plain.find(name, sources))
+    def _bound(self, own: Bindings, shared: Sequence[Bindings]) -> tuple[_Program, Bindings]:
+        """Returns the program that the bindings choose, with everything bound, and what each name is bound to."""
+        known: dict[str, Binding] = {}
+        for source in (*reversed(shared), own):
+            known.update(source)
+        program = self._chosen(self._plain.switched_on(known))
+        program.bind(own, known)
+        return program, known
+
+    def _chosen(self, on: tuple[str, ...]) -> _Program:
         if not on:
             return self._plain
         if on not in self._switched:
@@ -352,24 +360,22 @@ class Kernel(_Shader):
         Raises:
             BindingError: a name is undeclared or missing, or its value is of the wrong kind or format.
         """
-        program = self._program(own, *shared)
-        written = program.bind(shared, own)
+        program, known = self._bound(own, shared)
         counts = [*threads, 1, 1][:3]
         groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self.local_size, strict=True))
         program.compute.run(*groups)
         self._gpu.ctx.memory_barrier()
-        program.report(groups, written)
+        program.report(groups, partial(program.written, known))
 
     def run_counted(self, groups: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
         """Runs as many workgroups (x, y, z; three uint32) as `groups` holds on the GPU, perhaps none; else as `run`.
 
         Nothing is read back, so the CPU does not wait until the GPU has counted.
         """
-        program = self._program(own, *shared)
-        written = program.bind(shared, own)
+        program, known = self._bound(own, shared)
         program.compute.run_indirect(groups)
         self._gpu.ctx.memory_barrier()
-        program.report((), written)
+        program.report((), partial(program.written, known))
 
 
 class RasterKernel(_Shader):
@@ -405,8 +411,7 @@ class RasterKernel(_Shader):
         Raises:
             BindingError: as `Kernel.run`.
         """
-        linked = self._program(own, *shared)
-        linked.bind(shared, own)
+        linked, _ = self._bound(own, shared)
         target.use()
         target.viewport = box or (0, 0, *target.size)
         target.scissor = box  # type: ignore[assignment]  # None lifts it, which the stubs do not know
@@ -418,9 +423,12 @@ class RasterKernel(_Shader):
         if clips:
             self._gpu.ctx.disable_direct(CLIP_DISTANCE0)
         target.scissor = None  # type: ignore[assignment]  # or it would cut what is cleared next
-        attachments = [*target.color_attachments, target.depth_attachment]
-        written = {f"attachment {number}": item for number, item in enumerate(attachments)}
-        linked.report((mesh.triangle_count,), written)
+        linked.report((mesh.triangle_count,), partial(_attachments, target))
+
+
+def _attachments(target: moderngl.Framebuffer) -> dict[str, object]:
+    items = [*target.color_attachments, target.depth_attachment]
+    return {f"attachment {number}": item for number, item in enumerate(items)}
 
 
 def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:
@@ -440,7 +448,7 @@ def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
     return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
 
 
-def _common_kernel(gpu: GpuContext, name: str) -> Kernel:
+def common_kernel(gpu: GpuContext, name: str) -> Kernel:
     """The kernel that all share, compiled on first use; it ends with the context."""
     if name not in gpu.common:
         gpu.common[name] = Kernel(gpu, name)
@@ -459,7 +467,7 @@ def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = No
     if gpu.is_software:
         buffer.clear(size)
         return
-    kernel = _common_kernel(gpu, "clear_buffer")
+    kernel = common_kernel(gpu, "clear_buffer")
     words = size // WORD_BYTES
     threads = min(words, CLEARING_GROUPS * kernel.local_size[0])
     kernel.run((threads,), Cleared=buffer, word_count=words)
@@ -467,25 +475,7 @@ def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = No
 
 def clear_volume(gpu: GpuContext, texture: moderngl.Texture3D) -> None:
     """Sets all texels to zero, without a copy of them on the CPU."""
-    _common_kernel(gpu, "clear_volume").run(texture.size, cleared=texture)
-
-
-class ListGroups:
-    """Counts the workgroups that walk a list of shaders/common/work_list.glsl, for `Kernel.run_counted`."""
-
-    def __init__(self, gpu: GpuContext, per_group: int) -> None:
-        self._per_group = per_group
-        self._groups = gpu.ctx.buffer(reserve=3 * WORD_BYTES)
-        self._kernel = _common_kernel(gpu, "count_groups")
-
-    def count(self, texels: moderngl.Buffer) -> moderngl.Buffer:
-        """Returns the workgroups (x, y, z) that `per_group` items each need; valid until the next call."""
-        self._kernel.run((1,), Texels=texels, Groups=self._groups, per_group=self._per_group)
-        return self._groups
-
-    def release(self) -> None:
-        """Frees the buffer."""
-        self._groups.release()
+    common_kernel(gpu, "clear_volume").run(texture.size, cleared=texture)
 
 
 @contextmanager

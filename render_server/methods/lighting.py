@@ -128,6 +128,22 @@ class Layers:
     error: Resource[Callable[[], moderngl.Texture]] | None = None
 
 
+class TracedObjects:
+    """What rays of all views meet: the objects, in one hierarchy."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._bvh = ObjectBvh(gpu)
+
+    def set_objects(self, objects: GeometryState) -> ObjectBvh:
+        """Sets the objects' triangles; their hierarchy is built when rays are traced."""
+        self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
+        return self._bvh
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._bvh.release()
+
+
 class Shading:
     """Shades the visible surfaces: cones at reduced resolution, direct light and objects at full resolution.
 
@@ -147,7 +163,6 @@ class Shading:
         self.tier = options.tier
         self.size, self._scale = size, resolved.cone_scale
         self.reuses_light = options.tier.refresh_tiles > 0
-        self._bvh = ObjectBvh(gpu)
         self.grid = LowResGrid(gpu, size, resolved.cone_scale)
         self.cones = ConeFields(gpu, self.grid.size, remembers=self.reuses_light)
         self._history: LightHistory | None = None
@@ -158,7 +173,7 @@ class Shading:
         self._caustics: Caustics | None = None
         if options.caustics:
             blocks = options.tier.caustic_blocks
-            self._caustics = Caustics(gpu, self.grid, self._bvh, blocks=blocks, reuses=self.reuses_light)
+            self._caustics = Caustics(gpu, self.grid, blocks=blocks, reuses=self.reuses_light)
         self._screen: ScreenCones | None = None
         if options.screen_space:
             self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
@@ -204,11 +219,6 @@ class Shading:
         low, high = objects.bounds
         return SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2)
 
-    def set_objects(self, objects: GeometryState) -> ObjectBvh:
-        """Sets the objects' triangles; their hierarchy is built when rays are traced."""
-        self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
-        return self._bvh
-
     def choose_pixels(self, scene: Bindings) -> LowResGrid:
         """Selects the pixel that represents each block of the picture."""
         self.grid.run(scene)
@@ -225,7 +235,7 @@ class Shading:
     def trace_beams(
         self,
         objects: GeometryState,
-        _bvh: ObjectBvh,
+        bvh: ObjectBvh,
         seen: Observation,
         volume: PlacedVolume,
         _lights: LightSet,
@@ -238,7 +248,9 @@ class Shading:
         own = {"normal_offset": self._normal_offset(objects)}
         scene = {**seen.bindings, **objects.materials.bindings, **self._lights.bindings, **own}
         transmits = objects.materials.transmits
-        self._caustics.trace(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach, transmits=transmits)
+        self._caustics.trace(
+            self._lights, bvh, scene, bias_m=seen.scan.bias_m, reach_m=reach, transmits=transmits
+        )
         return self._caustics
 
     def cast_caustics(self, scene: Bindings, _grid: LowResGrid, beams: Caustics | None) -> Caustics | None:
@@ -355,7 +367,6 @@ class Shading:
     def release(self) -> None:
         """Frees the GL objects."""
         held = (
-            self._bvh,
             self.grid,
             self._history,
             self.cones,
@@ -403,7 +414,8 @@ def shading_stages(
         *lit.all,
         s.lights,
     )
-    bvh = g.stage("object bvh", shading.set_objects, s.objects)
+    traced = g.shared("traced objects", lambda: TracedObjects(g.gpu))
+    bvh = g.stage("object bvh", traced.set_objects, s.objects)
     with bounced_later(g, s, lit, shading.tier, bvh):
         beams = g.stage(
             "caustic beams", shading.trace_beams, s.objects, bvh, s.own_measured, volume, s.lights, *lit.all

@@ -152,8 +152,7 @@ class FarScene:
         if self._is_used:
             low, high = real.bounds
             edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
-            corners = real.corners if real.coarse_corners is None else real.coarse_corners
-            self._set.fill(corners, place_volume(low, high, FAR_SIZE, edge))
+            self._set.fill(real.coarse_corners, place_volume(low, high, FAR_SIZE, edge))
             self._block.write(self._set.volume.placement.far_block(is_used=True))
         return self._set
 

@@ -32,10 +32,8 @@ class Caustics:
     extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.
     """
 
-    def __init__(
-        self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh, *, blocks: int, reuses: bool = False
-    ) -> None:
-        self._gpu, self._threads, self._grid, self._objects = gpu, list_threads(gpu), grid, objects
+    def __init__(self, gpu: GpuContext, grid: LowResGrid, *, blocks: int, reuses: bool = False) -> None:
+        self._gpu, self._threads, self._grid = gpu, list_threads(gpu), grid
         self._blocks = blocks
         size = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
         lower = "output.width and output.height"
@@ -61,9 +59,16 @@ class Caustics:
         return {"CausticSums": self._sums}
 
     def trace(
-        self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float, transmits: bool
+        self,
+        lights: LightBuffers,
+        objects: ObjectBvh,
+        scene: Bindings,
+        *,
+        bias_m: float,
+        reach_m: float,
+        transmits: bool,
     ) -> None:
-        """Traces the beams, through transparent objects too if any of them `transmits`.
+        """Traces the beams that the objects cast, through transparent ones too if any of them `transmits`.
 
         `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
         """
@@ -75,7 +80,7 @@ class Caustics:
                 )
             kernels.append((self._refracted_beams, 0.0, GREATEST_ALPHA))
         self._empty_beams(len(lights.virtual_views) * (1 + PATHS if transmits else 1))
-        own: Bindings = {**scene, "bias_real": bias_m, "reach": reach_m}
+        own: Bindings = {**scene, **objects.bindings, "bias_real": bias_m, "reach": reach_m}
         for view in range(len(lights.virtual_views)):
             self._trace_beams(lights, lights.first_virtual_view + view, own, kernels)
 
@@ -120,7 +125,6 @@ class Caustics:
             "view_index": view_index,
             "block_edge": max(lights.tile_size // self._blocks, 1),
             "Beams": self._beams,
-            **self._objects.bindings,
         }
         for kernel, least, greatest in kernels:
             kernel.run(

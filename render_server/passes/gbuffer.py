@@ -22,7 +22,7 @@ from deltalight.render_server.view import CameraView, Rectangle
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
 SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
-METALLIC, REFLECTANCE, ROUGHNESS, POLYNOMIAL = (
+METALLIC, REFLECTANCE, ROUGHNESS, BY_LIGHT = (
     3,
     slice(4, 7),
     7,
@@ -267,7 +267,7 @@ class MaterialTable:
         maps = [
             each
             for material in mesh.materials
-            for each in (*material.maps, *material.polynomial_maps)
+            for each in (*material.maps, *material.maps_by_light)
             if each is not None
         ]
         self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
@@ -281,8 +281,8 @@ class MaterialTable:
             self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
             table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
             for row, material in zip(table, mesh.materials, strict=True):
-                if material.polynomial is not None:
-                    row[POLYNOMIAL] = 1 + self._layer(material.polynomial_maps[0])
+                if material.maps_by_light:
+                    row[BY_LIGHT] = 1 + self._layer(material.maps_by_light[0])
         self._buffer = gpu.ctx.buffer(np.ascontiguousarray(table, np.float32).tobytes())
         self._transmittances = gpu.ctx.buffer(_transmittances(mesh).tobytes()) if self.transmits else None
         self._measured = _measured_texture(gpu, mesh)
@@ -347,7 +347,7 @@ class MapArray:
 def _measured_texture(gpu: GpuContext, mesh: GpuMesh) -> moderngl.Texture | None:
     """Returns the table of measured materials; None if there are none."""
     table = measured_table(mesh.materials)
-    if any(material.polynomial is not None for material in mesh.materials) and not len(table):
+    if any(material.by_light is not None for material in mesh.materials) and not len(table):
         table = np.zeros((1, *table.shape[1:]), np.float32)  # an image cannot be without texels
     if not len(table):
         return None

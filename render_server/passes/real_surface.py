@@ -83,8 +83,8 @@ class RealSurface:
 
     def from_depth(self, depth: DepthImage, fitted: Callable[[], DepthSurface], scene: Bindings) -> None:
         """Fills it from the clean, registered depth map; `fitted` fits it on the CPU if need be."""
-        known = np.where(depth.valid, depth.depth_m, 0.0).astype(np.float32)
-        self._depth.write(known.tobytes(), alignment=1)
+        known = np.where(depth.valid, depth.depth_m, np.float32(0))
+        self._depth.write(known.astype(np.float32, copy=False), alignment=1)
         self._from_depth.run(
             self.size, scene, self._normals(depth, fitted), depth_map=self._depth, **self._images()
         )
@@ -94,8 +94,7 @@ class RealSurface:
         if self._fit is not None:
             return self._fit.run(self._depth, depth, depth.camera)
         assert self._fitted is not None
-        normals = np.ascontiguousarray(fitted().normals, np.float32)
-        self._fitted.write(normals.tobytes(), alignment=1)
+        self._fitted.write(np.ascontiguousarray(fitted().normals, np.float32), alignment=1)
         return {"fitted_normals": self._fitted}
 
     def from_model(

@@ -20,6 +20,7 @@ from deltalight.render_server.scene.depth_surface import (
 )
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.view import LENSES_KEPT
 
 CELL_SAMPLES = 6
 # Pixels of two neighbouring nodes are at most this many cells apart: two in each direction.
@@ -125,7 +126,7 @@ def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]
     return slopes
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2 * LENSES_KEPT)  # meshes are made fine and coarse
 def _node_rays(
     camera: CameraModel, stride: int
 ) -> tuple[Float32[np.ndarray, "gh gw 2"], Float32[np.ndarray, "gh gw 2"]]:

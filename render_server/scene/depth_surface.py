@@ -19,6 +19,8 @@ from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage
+from deltalight.render_server.scene.threads import by_bands
+from deltalight.render_server.view import LENSES_KEPT
 
 ASSUMED_NOISE_SIGMA_M = 0.002
 MAX_SLOPE_DEG = 80.0
@@ -133,17 +135,42 @@ def _window_gradient(
 ) -> Float32[np.ndarray, "2 h w"]:
     """Returns the slope of w by pixel: least squares over a square window, valid pixels only.
 
-    Offsets count from the pixel itself, so that no large numbers cancel. Where pixels are too few or in a
-    line, the slope is NaN.
+    Where pixels are too few or in a line, the slope is NaN.
+    """
+    gradient = np.empty((2, *inverse.shape), np.float32)
+
+    def fit(rows: slice) -> None:
+        around = slice(max(rows.start - radius, 0), rows.stop + radius)
+        own = slice(rows.start - around.start, rows.stop - around.start)
+        _fit_windows(inverse[around], mask[around], radius, own, gradient[:, rows])
+
+    by_bands(fit, len(inverse))
+    return gradient
+
+
+def _fit_windows(
+    inverse: Float32[np.ndarray, "h w"],
+    mask: Float32[np.ndarray, "h w"],
+    radius: int,
+    rows: slice,
+    gradient: Float32[np.ndarray, "2 k w"],
+) -> None:
+    """Fills the slopes of some rows, which have their windows inside the image.
+
+    Offsets count from the pixel itself, so that no large numbers cancel.
     """
     one = np.ones(2 * radius + 1)
     ramp = np.arange(-radius, radius + 1.0)
-    per_pixel = 1 / np.maximum(_filtered(mask, one, one), 1)
-    w = _filtered(inverse, one, one)
-    mu, mv = _filtered(mask, ramp, one), _filtered(mask, one, ramp)
-    wu, wv = _filtered(inverse, ramp, one), _filtered(inverse, one, ramp)
-    uu, vv = _filtered(mask, ramp**2, one), _filtered(mask, one, ramp**2)
-    uv = _filtered(mask, ramp, ramp)
+
+    def summed(values: Map, across: np.ndarray, down: np.ndarray) -> Map:
+        return _filtered(values, across, down)[rows]
+
+    per_pixel = 1 / np.maximum(summed(mask, one, one), 1)
+    w = summed(inverse, one, one)
+    mu, mv = summed(mask, ramp, one), summed(mask, one, ramp)
+    wu, wv = summed(inverse, ramp, one), summed(inverse, one, ramp)
+    uu, vv = summed(mask, ramp**2, one), summed(mask, one, ramp**2)
+    uv = summed(mask, ramp, ramp)
     mean_u, mean_v = mu * per_pixel, mv * per_pixel
     uu -= mean_u * mu
     vv -= mean_v * mv
@@ -152,12 +179,10 @@ def _window_gradient(
     wv -= w * mean_v
     determinant = uu * vv - uv * uv
     full = (2 * radius + 1) ** 2 * radius * (radius + 1) / 3
-    known = (determinant > MIN_SUPPORT * full**2) & (mask > 0)
+    known = (determinant > MIN_SUPPORT * full**2) & (mask[rows] > 0)
     inverted = np.divide(1, determinant, out=np.full_like(determinant, np.nan), where=known)
-    gradient = np.empty((2, *inverse.shape), np.float32)
     np.multiply(wu * vv - wv * uv, inverted, out=gradient[0])
     np.multiply(wv * uu - wu * uv, inverted, out=gradient[1])
-    return gradient
 
 
 def _filtered(
@@ -232,7 +257,7 @@ def by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float
     return np.stack([(by_pixel * inverse[:, ray]).sum(axis=0) for ray in (0, 1)])
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=LENSES_KEPT)
 def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 h w"]:
     """Returns the change of pixel coordinates (first axis) by ray coordinates (second) at every pixel."""
     rays = camera.rays().astype(np.float64)
@@ -250,18 +275,33 @@ def surface_normals(
     They are in the optical frame, towards the camera. A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along
     (gradient, w - gradient.ray).
     """
+    normals = np.empty((*inverse.shape, 3), np.float32)
+    rays = _ray_planes(camera)
+    by_bands(
+        lambda rows: _fill_normals(inverse[rows], gradient[:, rows], rays[:, rows], normals[rows]),
+        len(inverse),
+    )
+    return normals
+
+
+def _fill_normals(
+    inverse: Float32[np.ndarray, "h w"],
+    gradient: Float32[np.ndarray, "2 h w"],
+    rays: Float32[np.ndarray, "2 h w"],
+    normals: Float32[np.ndarray, "h w 3"],
+) -> None:
     x, y = gradient
-    ray_x, ray_y = _ray_planes(camera)
-    z = inverse - x * ray_x - y * ray_y
+    z = inverse - x * rays[0] - y * rays[1]
     scale = x * x + y * y + z * z
     scale = -1 / np.sqrt(scale, out=scale)
     unknown = ~(scale > -np.inf)
-    scale[unknown] = 0
-    x, y, z = (np.where(unknown, 0, part) for part in (x, y, z))
-    return np.asarray(cv2.merge([x * scale, y * scale, z * scale]))
+    parts = [part * scale for part in (x, y, z)]
+    for part in parts:
+        part[unknown] = 0
+    cv2.merge(parts, normals)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=LENSES_KEPT)
 def _ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
     return np.ascontiguousarray(camera.rays().transpose(2, 0, 1))
 

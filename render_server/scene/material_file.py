@@ -14,39 +14,42 @@ import numpy as np
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_bytes
+from deltalight.render_server.scene import polynomial_texture, texture_stack
 from deltalight.render_server.scene.gaussian_brdf import MOST_LOBES, RISE_TERMS, GaussianBrdf
-from deltalight.render_server.scene.polynomial_texture import (
-    MOST_TEXELS_EDGE,
-    TERMS,
-    PolynomialTexture,
-)
+from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
+from deltalight.render_server.scene.texture_stack import BRIGHTEST, LAYERS, TextureStack
 
 MATERIAL_SUFFIX = ".dlmat"
+PrecomputedMaterial = GaussianBrdf | PolynomialTexture | TextureStack
 VERSION = 1
 _MAGIC = b"deltalight material "
 _LARGEST_BYTES = 16 << 20  # of the arrays
 _ADVICE = "make it with `deltalight precompute SOURCE --out FILE.dlmat`"
 
 
-def write_material(path: Path, material: GaussianBrdf | PolynomialTexture) -> None:
+def write_material(path: Path, material: PrecomputedMaterial) -> None:
     """Writes a precomputed material, atomically.
 
     Raises:
         DeltalightError: the disk refuses.
     """
     stream = BytesIO()
-    if isinstance(material, PolynomialTexture):
-        np.savez_compressed(stream, coefficients=material.coefficients)
-    else:
-        np.savez_compressed(
-            stream, diffuse=material.diffuse, sigmas=material.sigmas, weights=material.weights
-        )
+    np.savez_compressed(stream, **_arrays_of(material))
     content = stream.getvalue()
     head = _MAGIC + f"{VERSION} {hashlib.sha256(content).hexdigest()}\n".encode()
     write_bytes(path, head + content)
 
 
-def read_material(path: Path) -> GaussianBrdf | PolynomialTexture:
+def _arrays_of(material: PrecomputedMaterial) -> dict[str, Any]:
+    match material:
+        case PolynomialTexture():
+            return {"coefficients": material.coefficients}
+        case TextureStack():
+            return {"layers": material.layers, "coat": np.array([material.f0, material.roughness])}
+    return {"diffuse": material.diffuse, "sigmas": material.sigmas, "weights": material.weights}
+
+
+def read_material(path: Path) -> PrecomputedMaterial:
     """Reads a file of `write_material`.
 
     Raises:
@@ -89,13 +92,15 @@ def _unpacked(content: bytes) -> Mapping[str, object]:
         return {}
 
 
-def _made(arrays: Mapping[str, Any]) -> GaussianBrdf | PolynomialTexture | None:
+def _made(arrays: Mapping[str, Any]) -> PrecomputedMaterial | None:
     """The material of these arrays; None if they are none."""
     # A member that is no array comes as bytes.
     if any(not isinstance(each, np.ndarray) or each.dtype.kind != "f" for each in arrays.values()):
         return None
     if arrays.keys() == {"coefficients"}:
         return _polynomial(arrays["coefficients"])
+    if arrays.keys() == {"layers", "coat"}:
+        return _stack(arrays["layers"], arrays["coat"])
     if arrays.keys() == {"diffuse", "sigmas", "weights"}:
         return _gaussians(
             *(np.asarray(arrays[name], np.float64) for name in ("diffuse", "sigmas", "weights"))
@@ -104,11 +109,27 @@ def _made(arrays: Mapping[str, Any]) -> GaussianBrdf | PolynomialTexture | None:
 
 
 def _polynomial(coefficients: np.ndarray) -> PolynomialTexture | None:
-    shape = coefficients.shape
-    fits = len(shape) == 4 and shape[0] == TERMS and shape[3] == 3 and 0 < max(shape[1:3]) <= MOST_TEXELS_EDGE
-    if not fits or not coefficients.size or not np.isfinite(coefficients).all():
+    if not _are_planes(coefficients, TERMS, polynomial_texture.MOST_TEXELS_EDGE):
         return None
     return PolynomialTexture(coefficients.astype(np.float16))
+
+
+def _stack(layers: np.ndarray, coat: np.ndarray) -> TextureStack | None:
+    whole = _are_planes(layers, LAYERS, texture_stack.MOST_TEXELS_EDGE) and coat.shape == (2,)
+    if (
+        not whole
+        or not ((layers >= 0) & (layers <= BRIGHTEST)).all()
+        or not ((coat >= 0) & (coat <= 1)).all()
+    ):
+        return None
+    return TextureStack(layers.astype(np.float16), *map(float, coat))
+
+
+def _are_planes(array: np.ndarray, count: int, most_edge: int) -> bool:
+    """Whether these are so many textures of finite R G B."""
+    shape = array.shape
+    fits = len(shape) == 4 and shape[0] == count and shape[3] == 3 and 0 < max(shape[1:3]) <= most_edge
+    return fits and array.size > 0 and bool(np.isfinite(array).all())
 
 
 def _gaussians(diffuse: np.ndarray, sigmas: np.ndarray, weights: np.ndarray) -> GaussianBrdf | None:

@@ -14,8 +14,9 @@ from PIL import Image
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.scene.gaussian_brdf import TABLE_TEXELS, GaussianBrdf
-from deltalight.render_server.scene.polynomial_texture import PolynomialTexture
 from deltalight.render_server.scene.texture_maps import TextureMap, TextureReader, linear_texture
+from deltalight.render_server.scene.texture_stack import TextureStack
+from deltalight.render_server.scene.textures_by_light import TextureByLight
 
 MATERIAL_FLOATS = 20
 DARKEST_ATTENUATION = 1e-4  # black has no logarithm
@@ -42,7 +43,7 @@ class Material:
     solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
 
     `measured` replaces the rest where the camera sees the surface; elsewhere a Lambertian of its albedo does.
-    `polynomial` replaces the light of lamps there alone.
+    `by_light` replaces the light of lamps there alone, and that of a map in image-based shading.
     """
 
     base_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, 0.8, np.float32))
@@ -65,7 +66,7 @@ class Material:
     occlusion_map: TextureMap | None = None
     emissive_map: TextureMap | None = None
     measured: GaussianBrdf | None = None
-    polynomial: PolynomialTexture | None = None
+    by_light: TextureByLight | None = None
     name: str = ""
 
     @property
@@ -157,20 +158,20 @@ class Material:
         )
 
     @classmethod
-    def from_polynomial(cls, texture: PolynomialTexture) -> Self:
-        """Makes a material from a polynomial texture map: its albedo for all light but that of lamps."""
+    def from_texture_by_light(cls, texture: TextureByLight) -> Self:
+        """Makes a material from a texture by the light's direction: its albedo for all light but that of lamps."""
         return cls(
             base_color=np.ones(3, np.float32),
-            specular=0.0,
-            roughness=1.0,
+            specular=texture.f0 / 0.08,
+            roughness=texture.roughness,
             base_color_map=TextureMap(texture.albedo),
-            polynomial=texture,
+            by_light=texture,
         )
 
     @cached_property
-    def polynomial_maps(self) -> tuple[TextureMap, ...]:
-        """The coefficients of `polynomial` as textures that follow each other."""
-        return () if self.polynomial is None else tuple(map(TextureMap, self.polynomial.coefficients))
+    def maps_by_light(self) -> tuple[TextureMap, ...]:
+        """The planes of `by_light` as textures that follow each other."""
+        return () if self.by_light is None else tuple(map(TextureMap, self.by_light.planes))
 
     @classmethod
     def from_gltf(cls, description: dict[str, Any], textures: TextureReader) -> Self:
@@ -306,7 +307,8 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]
     """Packs materials for a shader, five vectors each.
 
     (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, row + 1 of
-    `measured_table`, 0: not measured, a polynomial's place, 0), (absorption 1/m, index of refraction; 0: thin).
+    `measured_table`, 0: not measured, a place that the GPU knows, layers of a stack), (absorption 1/m, index of
+    refraction; 0: thin).
     """
     measured = 0
     table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
@@ -318,6 +320,8 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]
         if material.measured is not None:
             measured += 1
             row[13] = measured
+        if isinstance(material.by_light, TextureStack):
+            row[15] = len(material.by_light.layers)
         row[16:20] = *material.absorption_per_m, 0.0 if material.is_thin else material.refraction_index
     return table
 

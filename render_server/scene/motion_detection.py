@@ -11,6 +11,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
+from deltalight.render_server.view import LENSES_KEPT
 
 GRID_STEP_PX = 4
 
@@ -206,7 +207,7 @@ def _reprojected(
     return (row[shown], column[shown]), 1 / ahead[shown], chosen
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=LENSES_KEPT)
 def _sample_rays(camera: CameraModel, shape: tuple[int, int]) -> Float64[np.ndarray, "gh gw 3"]:
     """Returns (x/z, y/z, 1) of the grid's pixels, of which every fourth has its depth."""
     first = GRID_STEP_PX // 2

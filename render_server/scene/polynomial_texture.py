@@ -1,25 +1,27 @@
 """Polynomial texture maps (Malzbender et al. 2001): texels by the light's direction (docs/method.md 6.8)."""
 
-import json
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-import cv2
 import numpy as np
 from jaxtyping import Float16, Float32, Float64
-from PIL import Image
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
 from deltalight.render_server.lights.octahedral import even_directions
+from deltalight.render_server.scene.texture_folder import (
+    INFO_NAME,
+    averaged,
+    finite_array,
+    read_codes,
+    read_info,
+)
 
 TERMS = 6  # 1, lu, lv, lu^2, lu lv, lv^2
-INFO_NAME = "info.json"
+POLYNOMIAL_TYPE = "ptm"
 MOST_TEXELS_EDGE = 512  # that are kept
-_LARGEST_PLANE_PIXELS = 64_000_000
 _DIRECTIONS = 64  # over which a texel's albedo is averaged
 _ROWS = 32  # of texels that are decoded at a time
 _ADVICE = "export it again as a PTM of RGB coefficients (18 planes in JPEG)"
@@ -35,6 +37,19 @@ class PolynomialTexture:
     """
 
     coefficients: Float16[np.ndarray, "6 h w 3"]
+    f0: ClassVar[float] = 0.0  # it has no coat
+    roughness: ClassVar[float] = 1.0
+
+    @property
+    def planes(self) -> Float16[np.ndarray, "6 h w 3"]:
+        """What the GPU holds as textures that follow each other."""
+        return self.coefficients
+
+    def under(self, light: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "h w 3"]:
+        """Returns what a lamp in a unit direction (right, up, towards the viewer) shows, relative to that white."""
+        terms = polynomial_terms(light[None])[0].astype(np.float32)
+        codes = np.clip(np.tensordot(terms, self.coefficients.astype(np.float32), 1), 0, 1)
+        return np.asarray(decode_lut(None)[np.rint(255 * codes).astype(np.uint8), 0])
 
     @cached_property
     def albedo(self) -> Float16[np.ndarray, "h w 3"]:
@@ -63,51 +78,17 @@ def read_polynomial_texture(folder: Path) -> PolynomialTexture:
     Raises:
         DeltalightError: a file is missing or damaged, or it is another kind of map.
     """
-    info = _info(folder / INFO_NAME)
+    info = read_info(folder, "a PTM")
+    if (info.get("type"), info.get("colorspace"), info.get("nplanes")) != (POLYNOMIAL_TYPE, "rgb", 3 * TERMS):
+        raise DeltalightError(f"{folder}/{INFO_NAME} describes no PTM of RGB coefficients; {_ADVICE}.")
     try:
-        scale, bias = (_array(info["materials"][0][key]).reshape(TERMS, 1, 1, 3) for key in ("scale", "bias"))
+        scale, bias = (
+            finite_array(info["materials"][0][key]).reshape(TERMS, 1, 1, 3) for key in ("scale", "bias")
+        )
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise DeltalightError(f"{folder / INFO_NAME} lacks whole scales and biases; {_ADVICE}.") from error
-    each = [_plane(folder / f"plane_{term}.jpg") for term in range(TERMS)]
+        raise DeltalightError(f"{folder}/{INFO_NAME} lacks whole scales and biases; {_ADVICE}.") from error
+    codes = (read_codes(folder / f"plane_{term}.jpg").astype(np.float32) for term in range(TERMS))
+    each = [averaged(plane, MOST_TEXELS_EDGE) for plane in codes]
     if len({plane.shape for plane in each}) > 1:
         raise DeltalightError(f"the planes of {folder} have several sizes; {_ADVICE}.")
     return PolynomialTexture(np.asarray((np.stack(each) / 255 - bias) * scale, np.float16))
-
-
-def _info(path: Path) -> dict[str, Any]:
-    try:
-        info = json.loads(path.read_text())
-    except OSError as error:
-        raise DeltalightError(
-            f"{path} cannot be read ({error.strerror}); a PTM is a folder with it."
-        ) from error
-    except ValueError as error:
-        raise DeltalightError(f"{path} is no JSON document; {_ADVICE}.") from error
-    kind = (info.get("type"), info.get("colorspace"), info.get("nplanes")) if isinstance(info, dict) else None
-    if kind != ("ptm", "rgb", 3 * TERMS):
-        raise DeltalightError(f"{path} describes no PTM of RGB coefficients; {_ADVICE}.")
-    return dict(info)
-
-
-def _array(numbers: object) -> Float64[np.ndarray, "..."]:
-    """Raises ValueError or TypeError if these are no finite numbers."""
-    array = np.array(numbers, np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError
-    return array
-
-
-def _plane(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the codes of a plane, averaged down to MOST_TEXELS_EDGE."""
-    try:
-        with Image.open(path) as image:
-            if image.width * image.height > _LARGEST_PLANE_PIXELS:
-                raise DeltalightError(f"{path} has {image.width}x{image.height} pixels, which is too many.")
-            codes = np.asarray(image.convert("RGB"), np.float32)
-    except OSError as error:
-        raise DeltalightError(f"{path} cannot be read as a picture; {_ADVICE}.") from error
-    by = MOST_TEXELS_EDGE / max(codes.shape[:2])
-    if by >= 1:
-        return codes
-    size = tuple(max(1, math.floor(edge * by + 0.5)) for edge in codes.shape[1::-1])
-    return np.asarray(cv2.resize(codes, size, interpolation=cv2.INTER_AREA), np.float32)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.render_server.scene.depth_surface import DepthSurface
-from deltalight.render_server.view import NEAR_M, CameraView
+from deltalight.render_server.view import LENSES_KEPT, NEAR_M, CameraView
 
 BLOCK = 8  # voxels per edge of a block
 GRID = 128  # blocks per edge of the largest box
@@ -220,7 +220,7 @@ def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> 
     return np.flatnonzero((inverse > 0) & (((row | column) & (stride - 1)) == 0))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=LENSES_KEPT)
 def _pixel_rays(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
     """Returns (x/z, y/z, 1) of each pixel."""
     rays = camera.rays().reshape(-1, 2)
@@ -256,7 +256,7 @@ def _pixel_rows(points: Float32[np.ndarray, "3 n"], view: CameraView) -> Int32[n
     return np.where(seen, table[flat], np.int32(view.camera.width * view.camera.height))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=LENSES_KEPT)
 def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
     """Returns for each texel of the view's pinhole raster the pixel with the same ray, width * height for none."""
     (fx, fy, cx, cy), (width, height) = CameraView(camera, np.eye(4)).raster

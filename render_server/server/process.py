@@ -31,7 +31,7 @@ from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument, load_scene
-from deltalight.render_server.gpu.context import count_gl_objects, create_context
+from deltalight.render_server.gpu.context import CompileWatcher, count_gl_objects, create_context
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
@@ -43,6 +43,7 @@ from deltalight.render_server.server.session import RenderedFrame, RenderSession
 SHORT_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive
 STATS_INTERVAL_S = 1.0
+PREPARING_INTERVAL_S = 0.5
 LAST_WORDS_MS = 100  # for what was sent at the end, where a subscriber is slow
 ANSWER_TIMEOUT_S = 20.0
 SNAPSHOT_TIMEOUT_S = 120.0  # a frame in many views and by several methods, in software
@@ -228,6 +229,7 @@ def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
             renderer_name=gpu.renderer_name,
             keys=keys,
             count_objects=count_gl_objects,
+            compile_watchers=gpu.compile_watchers,
         )
 
 
@@ -239,10 +241,12 @@ def serve(
     renderer_name: str,
     keys: Keys | None = None,
     count_objects: Callable[[], Mapping[str, int]] = dict,
+    compile_watchers: list[CompileWatcher] | None = None,
 ) -> None:
     """Opens the sockets around a renderer that shows `scene`, and serves until a `shutdown` command.
 
-    Renders in the calling thread. `count_objects` is as for `RenderSession`.
+    Renders in the calling thread. `count_objects` is as for `RenderSession`; `compile_watchers` are those of the
+    renderer's context.
 
     Raises:
         DeltalightError: a port is in use, or an endpoint leaves the host without keys.
@@ -277,6 +281,8 @@ def serve(
             count_objects=count_objects,
             mailbox_drops=drops,
         )
+        if compile_watchers is not None:
+            compile_watchers.append(_Preparation(session, sender))
         commands = CommandQueue()
         replies = ReplyServer(settings.control, commands.ask, node=settings.name, keys=keys)
         stack.callback(replies.close)
@@ -287,6 +293,28 @@ def serve(
         except GpuResetError as fault:
             sender.say_last(session.stats(ends_by=fault))
             raise
+
+
+class _Preparation:
+    """Reports how many shaders the first picture has taken so far, between two of them.
+
+    Without a shader cache of the driver that picture takes a minute and more, and nothing else is reported meanwhile.
+    """
+
+    def __init__(self, session: RenderSession, sender: Sender) -> None:
+        self._session, self._sender = session, sender
+        self._compiled: set[str] = set()
+        self._due_s = time.monotonic()
+
+    def __call__(self, label: str, _sources: Mapping[str, str]) -> None:
+        finished = len(self._compiled)
+        self._compiled.add(label)
+        if time.monotonic() < self._due_s:
+            return
+        self._due_s = time.monotonic() + PREPARING_INTERVAL_S
+        report = self._session.preparation(finished)
+        if report is not None:
+            self._sender.offer(report)
 
 
 def _patience_s(session: RenderSession) -> float:

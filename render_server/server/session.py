@@ -43,7 +43,9 @@ RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
 MAXIMUM_FAULTS_IN_A_ROW = 30
 LOG_INTERVAL_NS = 10**9
+SAME_LOG_INTERVAL_NS = 60 * 10**9  # of one sentence, whose fault may come and go
 WATCHED_NS = 60 * 10**9
+SOME_SHADERS = 60  # of a first picture; that of the demo has 57
 
 log = structlog.get_logger()
 
@@ -158,10 +160,11 @@ class RenderSession:
         self._finished: deque[RenderedFrame] = deque()
         self._started: tuple[_Started, ...] = ()
         self._rendered: deque[tuple[int, str]] = deque()  # when, and the camera
+        self._is_starting = True  # until the first picture
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._logged_notices = 0
-        self._logged_ns = -LOG_INTERVAL_NS
+        self._logged = "", -SAME_LOG_INTERVAL_NS  # which fault, and when
 
     def receive(self, multipart: ReceivedMultipart) -> None:
         """Takes a message of the sensor node; a malformed one is counted and logged."""
@@ -239,6 +242,18 @@ class RenderSession:
             detail=as_sentence("; ".join(filter(None, (self._renderer_name, fault, *self._cameras.remarks)))),
             rates=self._rates(),
             drops=self.drops(),
+        )
+
+    def preparation(self, shaders: int) -> StatsMessage | None:
+        """Returns how far the first picture is, of whose shaders so many were compiled; None once there was one."""
+        if not self._is_starting:
+            return None
+        some = max(SOME_SHADERS, shaders)
+        return StatsMessage(
+            node=self._name,
+            capture_ns=self._clock_ns(),
+            state="starting",
+            detail=f"Preparing shaders, which are compiled once on a machine: {shaders} of some {some}.",
         )
 
     def _rates(self) -> dict[str, float]:
@@ -379,6 +394,7 @@ class RenderSession:
         composite, frame = started.pending.finish(), started.frame
         self._last_fault = ""
         self._faults_in_a_row = 0
+        self._is_starting = False
         self._log_notices()
         rendered_ns = self._clock_ns()
         self._rendered.append((rendered_ns, started.camera))
@@ -454,10 +470,11 @@ class RenderSession:
         self.counts[kind] += 1
         named = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
         sentence = as_sentence(named)
-        now_ns = self._clock_ns()
+        now_ns, (logged, logged_ns) = self._clock_ns(), self._logged
+        interval_ns = SAME_LOG_INTERVAL_NS if sentence == logged else LOG_INTERVAL_NS
         # A fault of every frame is one line, not thirty a second, and a node that finds others fills no disk.
-        if sentence != self._last_fault and now_ns - self._logged_ns >= LOG_INTERVAL_NS:
-            self._logged_ns = now_ns
+        if sentence != self._last_fault and now_ns - logged_ns >= interval_ns:
+            self._logged = sentence, now_ns
             log.warning(kind, fault=sentence)
             log.debug("traceback", exc_info=fault)
         self._last_fault = sentence

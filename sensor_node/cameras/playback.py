@@ -14,8 +14,8 @@ from deltalight.sensor_node.cameras.base import Camera, EndOfStream
 from deltalight.sensor_node.cameras.replay import CLOCK_STEP_NS, DEFAULT_PERIOD_NS, LATE_NS
 
 MIN_RATE, MAX_RATE = 0.05, 20.0
-# Period of repeating a frame that stands still: a change of the scene shows, and nothing looks lost.
-REPEAT_NS = 500_000_000
+# Bounds of the period of repeating a frame that stands still: what moves in the scene goes on moving as it did.
+LEAST_REPEAT_NS, MOST_REPEAT_NS = 66_666_667, 500_000_000
 # Time between frames on both sides of a jump: longer than the memory of any filter.
 JUMP_NS = 1_000_000_000
 
@@ -36,7 +36,7 @@ class PlaybackCamera(Camera):
 
     Every frame is stamped with the moment at which it is due here, whatever its position in the recording: numbers,
     times and stamps keep rising after a pause, a seek or a new round, so that whoever pairs, smooths or records the
-    streams sees one camera. While paused, the frame is repeated twice a second.
+    streams sees one camera. While paused, the frame is repeated at the recording's rate, 2 to 15 times a second.
 
     Args:
         source: what to replay.
@@ -64,6 +64,7 @@ class PlaybackCamera(Camera):
         self._times = np.asarray(source.timestamps_ns, np.int64)
         steps = np.diff(self._times)
         self._period_ns = int(np.median(steps)) if len(steps) else DEFAULT_PERIOD_NS
+        self._repeat_ns = min(max(self._period_ns, LEAST_REPEAT_NS), MOST_REPEAT_NS)
         self._loop, self._stays, self._rate = loop, stays, _checked_rate(rate)
         self._playing = playing
         self._changed = threading.Condition()
@@ -74,6 +75,7 @@ class PlaybackCamera(Camera):
         self._due_ns = 0  # monotonic time at which that frame was or is due
         self._wall_ns = self._capture_ns = 0
         self._numbered = _RisingNumbers(self._period_ns)
+        self._read: tuple[int, SensorFrame] | None = None  # the last, which a pause repeats
         self.camera, self.board, self.extrinsics = source.camera, source.board, source.extrinsics
         self.depth_scale, self.notes = source.depth_scale, source.notes
 
@@ -162,7 +164,9 @@ class PlaybackCamera(Camera):
             jumped, self._jumped = self._jumped, False
             self._due_ns, self._index, self._is_shown = due_ns, index, True
             self._capture_ns = self._stamp_of(due_ns)
-        return self._numbered(self._source[index], index, self._capture_ns, jumped=jumped)
+        if self._read is None or self._read[0] != index:
+            self._read = index, self._source[index]
+        return self._numbered(self._read[1], index, self._capture_ns, jumped=jumped)
 
     def read_latest(self, max_age_s: float) -> SensorFrame:  # noqa: ARG002 - a replayed frame is never old
         """Like `read`: no frame is newer than the one that is due."""
@@ -189,7 +193,7 @@ class PlaybackCamera(Camera):
                 raise EndOfStream
             self._playing = False
         if not self._playing:
-            return self._index, self._due_ns + REPEAT_NS
+            return self._index, self._due_ns + self._repeat_ns
         return self._following()
 
     def _following(self) -> tuple[int, int]:

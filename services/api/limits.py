@@ -6,6 +6,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 
+from deltalight.services.api.memory_return import MemoryReturn
 from deltalight.services.api.problems import ProblemError
 
 REMEMBERED_CLIENTS = 4096
@@ -48,6 +49,7 @@ class StreamLimits:
 
     def __init__(self) -> None:
         self._open: Counter[str] = Counter()
+        self._memory = MemoryReturn()
 
     @contextmanager
     def slot(self, client: str) -> Iterator[None]:
@@ -67,6 +69,7 @@ class StreamLimits:
             self._open[client] -= 1
             if not self._open[client]:
                 del self._open[client]
+            self._memory.note_ended()
 
 
 async def run_while(stream: Awaitable[None], is_allowed: Callable[[], Awaitable[bool]]) -> bool:

@@ -116,14 +116,18 @@ class _Reported(Collector):
         drops = CounterMetricFamily(
             "deltalight_process_drops", "What a process lost, by cause.", labels=["process", "cause"]
         )
+        degraded = CounterMetricFamily(
+            "deltalight_process_degraded", "How often a process became degraded.", labels=["process"]
+        )
         for report in self._watch.reports():
             process = report.message.node
+            degraded.add_metric([process], report.degraded)
             age.add_metric([process], report.age_s)
             for name, value in report.message.rates.items():
                 rate.add_metric([process, name], value)
             for cause, count in report.lost.items():
                 drops.add_metric([process, cause], count)
-        return [age, rate, drops]
+        return [age, rate, drops, degraded]
 
 
 class _Streams(Collector):

@@ -120,7 +120,7 @@ class AssetAnswer(BaseModel):
     facts: dict[str, Any] = Field(
         description="Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the "
         "clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, "
-        "polynomial_texture), base_color, and lobes and roughness, or width and height in texels.",
+        "polynomial_texture, texture_stack), base_color, and lobes and roughness, or width and height in texels.",
         examples=[{"triangles": 1000, "vertices": 502, "minimum": [0, 0, 0], "maximum": [0.1, 0.1, 0.2]}],
     )
 

@@ -1,8 +1,10 @@
-"""Replays a recording in place of the live nodes: a `replay` child publishes it for the render server."""
+"""Replays a recording in place of the live nodes: a `replay` child publishes it for the render server.
+
+Where the node itself plays a recording, that is moved along in the same way while it is shown.
+"""
 
 import threading
 import time
-import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,34 +16,21 @@ import structlog
 from deltalight.protocol.endpoints import parse_endpoint
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import ControlRequest
-from deltalight.protocol.request import RequestClient
 from deltalight.services import ports
 from deltalight.services.api.child_process import ChildProcess
+from deltalight.services.api.playback_client import PlaybackClient, Position
 from deltalight.services.api.render_link import RenderLink, UnansweredError
 from deltalight.services.storage.faults import ConflictError
 
 # A child takes two seconds for imports and its first frame on a slow machine, five with two busy cores.
 START_TIMEOUT_S = 20.0
-ASK_TIMEOUT_S, POLL_PERIOD_S = 2.0, 0.5
+POLL_PERIOD_S = 0.5
 START_ASK_TIMEOUT_S = 0.5  # short, to notice soon that a child ended instead of answering
 END_TIMEOUT_S = 3.0
 NODE = "replay"
 IPC = "ipc://"
 
 log = structlog.get_logger()
-
-
-@dataclass(frozen=True)
-class Position:
-    """Position of a replay, in seconds from the recording's first frame."""
-
-    recording: str
-    position_s: float
-    duration_s: float
-    playing: bool
-    rate: float
-    loop: bool
 
 
 @dataclass(frozen=True)
@@ -96,8 +85,9 @@ class ReplayEndpoints:
 class ReplayControl:
     """Runs at most one replay, watched by a thread; when it ends for any reason the live nodes are shown again.
 
-    `server` is the endpoint of the render server's commands. Calls `publish` with the position twice a second while
-    it moves and with None when live is back, and `notice` with sentences for the user.
+    `server` is the endpoint of the render server's commands, `playback` that at which the recording that the node
+    plays is controlled (None: it is a camera). Calls `publish` with the position of what is shown twice a second
+    while it moves and with None when a camera is shown again, and `notice` with sentences for the user.
     """
 
     def __init__(
@@ -106,12 +96,17 @@ class ReplayControl:
         server: str,
         publish: Callable[[Position | None], None],
         notice: Callable[[str], None],
+        *,
         keys: Keys | None = None,
+        playback: str | None = None,
     ) -> None:
         self._link, self._server, self._keys = link, server, keys
         self._publish, self._notice = publish, notice
         self._changing = threading.Lock()
         self._replay: _Replay | None = None
+        self._source = None if playback is None else PlaybackClient(None, playback, keys)
+        if self._source is not None:
+            self._start_watching(self._source)
 
     @property
     def recording(self) -> str | None:
@@ -120,13 +115,18 @@ class ReplayControl:
         return None if replay is None else replay.order.recording
 
     def position(self) -> Position | None:
-        """Return the position of the replay; None = live."""
-        replay = self._replay
-        if replay is None:
+        """Return the position of what is shown; None = a camera is."""
+        shown = self._shown
+        if shown is None:
             return None
         with suppress(UnansweredError):  # it is slow, or is just ending
-            return replay.ask("position")
-        return replay.last if self._replay is replay else None
+            return shown.ask("position")
+        return shown.last if self._shown is shown else None
+
+    @property
+    def _shown(self) -> PlaybackClient | None:
+        replay = self._replay
+        return self._source if replay is None else replay.playback
 
     def start(self, order: ReplayOrder) -> Position:
         """Replay a recording.
@@ -150,7 +150,7 @@ class ReplayControl:
                 self._replay = None
                 replay.close()
                 raise
-            threading.Thread(target=self._watch, args=(replay,), name="replay-control", daemon=True).start()
+            self._start_watching(replay.playback)
         self._publish(position)
         return position
 
@@ -164,22 +164,22 @@ class ReplayControl:
         """Seek, then step, pause, resume, or change the rate.
 
         Raises:
-            ConflictError: nothing is replayed.
+            ConflictError: no recording is shown.
             DeltalightError: the rate is out of range.
         """
         with self._changing:
-            replay = self._replay
-            if replay is None:
+            shown = self._shown
+            if shown is None:
                 raise ConflictError("no recording is replayed; begin one with PUT.")
             if rate is not None:
-                replay.ask("rate", {"rate": rate})
+                shown.ask("rate", {"rate": rate})
             if playing is False:
-                replay.ask("pause")
+                shown.ask("pause")
             if position_s is not None:
-                replay.ask("seek", {"position_s": position_s})
+                shown.ask("seek", {"position_s": position_s})
             if step_frames is not None:
-                replay.ask("step", {"frames": step_frames})
-            position = replay.ask("play" if playing else "position")
+                shown.ask("step", {"frames": step_frames})
+            position = shown.ask("play" if playing else "position")
         self._publish(position)
         return position
 
@@ -188,12 +188,15 @@ class ReplayControl:
         with self._changing:
             was_replayed = self._end()
         if was_replayed:
-            self._publish(None)
+            self._publish(self.position())
 
     def close(self) -> None:
         """Stop the replay at the end of the service, without publishing."""
         with self._changing:
             self._end()
+            source, self._source = self._source, None
+            if source is not None:
+                source.close()
 
     def _end(self) -> bool:
         replay, self._replay = self._replay, None
@@ -218,23 +221,30 @@ class ReplayControl:
                 return
             self._end()
         self._notice(f"The replay of {replay.order.recording} ended, and live is back: {sentence}")
-        self._publish(None)
+        self._publish(self.position())
 
-    def _watch(self, replay: "_Replay") -> None:
+    def _start_watching(self, playback: PlaybackClient) -> None:
+        threading.Thread(target=self._watch, args=(playback,), name="replay-control", daemon=True).start()
+
+    def _watch(self, playback: PlaybackClient) -> None:
+        """Publish how a position changes while it is shown, until that is over for good."""
         last = None
-        while self._replay is replay:
-            try:
-                position = replay.ask("position")
-            except DeltalightError:  # it is ending, or slow; its end is handled elsewhere
-                position = None
-            if position is not None and position != last and self._replay is replay:
+        while playback in (self._shown, self._source):
+            position = self._moved(playback) if playback is self._shown else None
+            if position is not None and position != last and playback is self._shown:
                 self._publish(position)
                 last = position
             time.sleep(POLL_PERIOD_S)
 
+    @staticmethod
+    def _moved(playback: PlaybackClient) -> Position | None:
+        with suppress(DeltalightError):  # it is ending, or slow; its end is handled elsewhere
+            return playback.ask("position")
+        return None
+
 
 class _Replay:
-    """A replay's child process and the client that controls it; `last` is its last known position."""
+    """A replay's child process, and the client that controls it."""
 
     def __init__(
         self,
@@ -245,9 +255,8 @@ class _Replay:
         ended: Callable[["_Replay", str], None],
     ) -> None:
         self.order = order
-        self.last: Position | None = None
+        self.playback = PlaybackClient(order.recording, endpoints.control, keys)
         self._endpoints = endpoints
-        self._client = RequestClient(endpoints.control, keys=keys)
         words = ["replay", str(order.path), "--publish", endpoints.streams, "--control", endpoints.control]
         words += ["--name", NODE, "--clock", server]
         words += ["--rate", str(order.rate), "--start", str(order.position_s)]
@@ -269,7 +278,7 @@ class _Replay:
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline_s and self._child.is_running:
             with suppress(UnansweredError):
-                position = self.ask("position", timeout_s=START_ASK_TIMEOUT_S)
+                position = self.playback.ask("position", timeout_s=START_ASK_TIMEOUT_S)
                 self._has_answered = True
                 if self._child.is_running:  # otherwise nobody would notice its end
                     return position
@@ -277,30 +286,9 @@ class _Replay:
         sentence = self._child.last_sentence.replace(str(self.order.path), self.order.recording)
         raise DeltalightError(sentence or f"The replay of {self.order.recording} does not start; try again.")
 
-    def ask(
-        self, op: str, payload: dict[str, object] | None = None, timeout_s: float = ASK_TIMEOUT_S
-    ) -> Position:
-        """Execute a command and return the position after it.
-
-        Raises:
-            UnansweredError: it does not answer.
-            DeltalightError: it refuses.
-        """
-        request = ControlRequest(
-            node="api", capture_ns=time.time_ns(), id=uuid.uuid4().hex, op=op, payload=payload or {}
-        )
-        try:
-            reply = self._client.request(request, timeout_s)
-        except DeltalightError as fault:
-            raise UnansweredError(f"The replay does not answer ({fault}).") from fault
-        if reply.error is not None:
-            raise DeltalightError(reply.error)
-        self.last = Position(recording=self.order.recording, **reply.payload)  # type: ignore[arg-type]
-        return self.last
-
     def close(self) -> None:
         """End the child process."""
         self._is_closing = True
         self._child.end(END_TIMEOUT_S)
-        self._client.close()
+        self.playback.close()
         self._endpoints.clear()

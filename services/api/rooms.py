@@ -160,7 +160,12 @@ class _Builder:
         """Return the room of an installation that has one."""
         settings = self._settings
         context = self._context(
-            ONLY_ROOM, self._store, settings.control, settings.subscribe, settings.control
+            ONLY_ROOM,
+            self._store,
+            settings.control,
+            settings.subscribe,
+            settings.control,
+            playback=settings.playback,
         )
         return self._room(context, settings.subscribe)
 
@@ -180,9 +185,16 @@ class _Builder:
         return Room(context, streams, self._metrics, nodes)
 
     def _context(
-        self, room: str, store: Store, control: str | None, endpoints: Sequence[str], beside: str
+        self,
+        room: str,
+        store: Store,
+        control: str | None,
+        endpoints: Sequence[str],
+        beside: str,
+        *,
+        playback: str | None = None,
     ) -> Context:
-        """`beside`: an endpoint of the host that replays are started for."""
+        """`beside`: an endpoint of the host that replays are started for; `playback`: as for `ReplayControl`."""
         events, watch = EventHub(), ProcessWatch()
         link = RenderLink(
             store,
@@ -205,6 +217,7 @@ class _Builder:
             ),
             notice=lambda text: events.publish("notice", {"text": text}),
             keys=self._keys,
+            playback=playback,
         )
         return Context(
             store=store,

@@ -52,6 +52,11 @@ class ApiSettings(StrictModel):
         default=(endpoint(COMPOSITE_PORT), endpoint(NODE_PORT)),
         description="Endpoints of the render server and of the nodes: pictures, and how they are doing.",
     )
+    playback: str | None = Field(
+        default=None,
+        description="Endpoint at which the recording that the node plays (`replay --control`) is paused and moved "
+        "along; null = the node has a camera.",
+    )
     rooms: str | None = Field(
         default=None,
         description="Endpoint of the directory of rooms, which says where their render servers and nodes are; null = "

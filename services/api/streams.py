@@ -4,7 +4,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import structlog
 
@@ -18,6 +18,7 @@ from deltalight.protocol.subscriber import ReceivedMultipart
 
 RECEIVE_TIMEOUT_S = 0.2
 LOG_INTERVAL_S = 1.0  # a faulty node sends hundreds of messages a second
+DEGRADED_LOG_INTERVAL_S = 60.0  # of one process, whose state may come and go
 FORGOTTEN_AFTER_S = 3600.0
 RADIANCE = "radiance."  # prefix of the topics on which nodes publish measured light
 
@@ -30,13 +31,23 @@ log = structlog.get_logger()
 class Report:
     """The newest report of a process, its time of arrival (monotonic seconds) and its latency.
 
-    `before` holds what processes of its name had lost that said that they end, by cause.
+    `before` holds what processes of its name had lost that said that they end, by cause. `degraded` is how often a
+    process of its name came into that state, `logged_s` when that was last logged, and `is_told` whether it was of
+    the present time.
     """
 
     message: StatsMessage
     received_s: float
     delay_ms: float
     before: Mapping[str, int] = field(default_factory=dict)
+    degraded: int = 0
+    logged_s: float | None = None
+    is_told: bool = False
+
+    @property
+    def is_degraded(self) -> bool:
+        """Whether the process works, but not as it should."""
+        return self.message.state == "degraded"
 
     @property
     def lost(self) -> dict[str, int]:
@@ -63,8 +74,9 @@ class ProcessWatch:
         sent_ns = message.capture_ns + message.clock_offset_ns
         delay_ms = (time.time_ns() - sent_ns) / 1e6
         with self._lock:
+            earlier = self._reports.get(message.node)
             report = Report(message, time.monotonic(), delay_ms, self._lost_before(message.node))
-            self._reports[message.node] = report
+            report = self._reports[message.node] = _judged(report, earlier)
         return report
 
     def _lost_before(self, name: str) -> Mapping[str, int]:
@@ -83,6 +95,25 @@ class ProcessWatch:
         """Return the detail of a process's newest report; empty if there is none."""
         report = self._reports.get(name)
         return "" if report is None else report.message.detail
+
+
+def _judged(report: Report, earlier: Report | None) -> Report:
+    """Count and log that a process has become degraded, or is no longer."""
+    if earlier is not None:
+        report = replace(report, degraded=earlier.degraded, logged_s=earlier.logged_s)
+        if earlier.is_degraded and report.is_degraded:
+            return replace(report, is_told=earlier.is_told)
+        if earlier.is_told:
+            log.info("a process is no longer degraded", process=report.message.node, times=report.degraded)
+    return _newly_degraded(report) if report.is_degraded else report
+
+
+def _newly_degraded(report: Report) -> Report:
+    is_told = report.logged_s is None or report.received_s - report.logged_s >= DEGRADED_LOG_INTERVAL_S
+    if is_told:
+        log.warning("a process is degraded", process=report.message.node, detail=report.message.detail)
+    logged_s = report.received_s if is_told else report.logged_s
+    return replace(report, degraded=report.degraded + 1, logged_s=logged_s, is_told=is_told)
 
 
 class Streams:

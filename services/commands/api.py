@@ -62,6 +62,12 @@ def serve(
         ),
     ] = None,
     node: NodeName = None,
+    playback: Annotated[
+        str | None,
+        typer.Option(
+            help="Control endpoint of the recording that the node plays, for a timeline on the page."
+        ),
+    ] = None,
     rooms: Annotated[
         str | None, typer.Option(help="Endpoint of the directory of rooms, for several rooms.")
     ] = None,
@@ -84,13 +90,15 @@ def serve(
         "token_file": token_file,
         "view_token_file": view_token_file,
         "control": control,
+        "playback": playback,
         "rooms": rooms,
     }
     configuration = load_configuration(config_file)
     key_settings = configuration.section("keys", KeySettings)
     given["subscribe"] = _subscriptions(subscribe, node, key_settings)
     settings = configuration.section("api", ApiSettings, {k: v for k, v in given.items() if v is not None})
-    endpoints = [settings.rooms or settings.control, *settings.subscribe]
+    playback_endpoints = [] if settings.playback is None else [settings.playback]
+    endpoints = [settings.rooms or settings.control, *playback_endpoints, *settings.subscribe]
     run_api(settings, key_settings.load(endpoints), scene)
 
 

@@ -11,7 +11,7 @@ from deltalight.services.child import NODE, SERVER, WEB, early_spares
 from deltalight.services.commands.options import MethodName
 from deltalight.services.ports import PAGE_PORT, require_free
 
-EARLY = {SERVER: "server", NODE: "node", WEB: "api"}
+EARLY = {SERVER: "server", NODE: "replay", WEB: "api"}
 
 
 def demo(

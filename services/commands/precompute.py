@@ -13,7 +13,7 @@ def precompute(
         Path,
         typer.Argument(
             help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf), or the folder of a "
-            "polynomial texture map (info.json)."
+            "polynomial texture map or an ABTF (info.json)."
         ),
     ],
     out: Annotated[
@@ -25,7 +25,8 @@ def precompute(
 
     What is in the cache already is not computed again; Ctrl-C keeps the objects that are done.
 
-    A measured BRDF or a polynomial texture map becomes a file for `material: {precomputed: FILE}` of scene documents.
+    A measured BRDF, a polynomial texture map or an ABTF becomes a file for `material: {precomputed: FILE}` of scene
+    documents.
     """
     from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX
 
@@ -34,7 +35,7 @@ def precompute(
     elif out is not None:
         raise DeltalightError(
             f"{source} is taken for a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the folder "
-            "of a polynomial texture map; leave it out."
+            "of a texture by the light; leave it out."
         )
     else:
         _precompute_scene(source)
@@ -59,20 +60,22 @@ def _precompute_material(source: Path, out: Path | None) -> None:
             f"{source} is a measured material; say where it goes: --out {source.stem}{MATERIAL_SUFFIX}."
         )
     if source.is_dir():
-        _convert_polynomials(source, out)
+        _convert_textures(source, out)
     else:
         _fit_brdf(source, out)
 
 
-def _convert_polynomials(folder: Path, out: Path) -> None:
+def _convert_textures(folder: Path, out: Path) -> None:
     from deltalight.render_server.scene.material_file import write_material
-    from deltalight.render_server.scene.polynomial_texture import read_polynomial_texture
+    from deltalight.render_server.scene.texture_stack import TextureStack
+    from deltalight.render_server.scene.textures_by_light import read_texture_by_light
 
-    texture = read_polynomial_texture(folder)
+    texture = read_texture_by_light(folder)
     write_material(out, texture)
     height, width = texture.albedo.shape[:2]
     albedo = " ".join(f"{each:.3f}" for each in texture.albedo.mean(axis=(0, 1), dtype=float))
-    typer.echo(f"{out}: polynomials of {width}x{height} texels, reflects {albedo} of light from everywhere")
+    kind = f"a stack of {len(texture.planes)}" if isinstance(texture, TextureStack) else "polynomials"
+    typer.echo(f"{out}: {kind} of {width}x{height} texels, reflects {albedo} of light from everywhere")
 
 
 def _fit_brdf(source: Path, out: Path) -> None:

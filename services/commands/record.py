@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.text import Text
 
 from deltalight.services.commands.options import ConfigFile, NodeName, NodeStreams, node_endpoints
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
     from deltalight.protocol.keys import Keys
     from deltalight.protocol.scene import SceneDocument
     from deltalight.services.recorder import Recorder, RecordStatus
@@ -54,6 +54,8 @@ def record(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Record every raw frame of a node until Ctrl-C, or for --duration or --frames."""
+    from rich.console import Console
+
     from deltalight.protocol.calibration import load_extrinsics_yaml
     from deltalight.protocol.keys import KeySettings
     from deltalight.services.recorder import Recorder, RecordJob
@@ -92,7 +94,9 @@ def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "Scen
 
 
 @contextmanager
-def _progress_on(console: Console) -> "Iterator[Show]":
+def _progress_on(console: "Console") -> "Iterator[Show]":
+    from rich.live import Live
+
     with Live(console=console, transient=True, auto_refresh=False) as live:
         yield lambda status: live.update(_line(status), refresh=True)
 
@@ -134,7 +138,9 @@ def _run(recorder: "Recorder", progress: "AbstractContextManager[Show]", summari
         raise ended_by  # Ctrl-C ends a recording normally; without a frame there is none
 
 
-def _line(status: "RecordStatus") -> Text:
+def _line(status: "RecordStatus") -> "Text":
+    from rich.text import Text
+
     words = (
         f"{status.out.name}: {status.frames} frames, {status.seconds:.0f} s, {status.size_bytes / 1e6:.1f} MB,"
         f" {status.bytes_per_s / 1e6:.1f} MB/s, lost {_losses(status)}, {status.free_bytes / 1e9:.1f} GB free"

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deltalight.services.exports import ExportFormat
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
     from rich.table import Table
 
     from deltalight.services.recording_copies import Copied, Track
@@ -35,6 +34,8 @@ def info(
     if as_json:
         typer.echo(json.dumps(found))
     else:
+        from rich.console import Console
+
         console = Console(soft_wrap=True)
         for table in (_summary_table(found), _stream_table(found)):
             console.print(table)
@@ -109,7 +110,10 @@ def export(
     _print_copied(export_as(format, file, out, scene, _track("exporting")), as_json=as_json)
 
 
-def _progress(words: str, *, show_count: bool = True) -> Progress:
+def _progress(words: str, *, show_count: bool = True) -> "Progress":
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     columns = [TextColumn(words), BarColumn(), *([MofNCompleteColumn()] if show_count else [])]
     console = Console(stderr=True)
     is_hidden = not console.is_terminal

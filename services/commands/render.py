@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deltalight.services.commands.options import Quality, View
 
@@ -100,6 +98,9 @@ class _Bar:
     """Shows a job on stderr: a bar, warnings above it."""
 
     def __init__(self, total: int, *, warn: bool) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
         columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         self.progress = Progress(*columns, console=Console(stderr=True, soft_wrap=True), transient=True)
         self._task = self.progress.add_task("rendering", total=total)

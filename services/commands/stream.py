@@ -5,8 +5,6 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.live import Live
 
 from deltalight.services.commands.options import ConfigFile, OneCamera
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
@@ -39,6 +37,9 @@ def stream(
     config_file: ConfigFile = None,
 ) -> None:
     """Send the relit picture to a media server (H.264), for many viewers, until Ctrl-C."""
+    from rich.console import Console
+    from rich.live import Live
+
     from deltalight.protocol.errors import DeltalightError
     from deltalight.protocol.keys import KeySettings
     from deltalight.protocol.receiver import Receiver

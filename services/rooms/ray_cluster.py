@@ -24,6 +24,8 @@ DISTINGUISHING = 6  # digits of a node's id
 NO_STATISTICS = {"RAY_USAGE_STATS_ENABLED": "0"}  # read by Ray when it is imported, as the next
 # Makes Ray use the loopback address in place of the host's own; named after where it is the default.
 LOOPBACK_ONLY = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+# Of hosts that are started here. Ray would give render servers the priority of background work (nice 15).
+FULL_PRIORITY = {"RAY_worker_niceness": "0"}
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class RayCluster:
 
 
 def _import_ray(*, is_alone: bool) -> Any:  # noqa: ANN401 (a module)
-    os.environ.update(NO_STATISTICS)
+    os.environ.update(NO_STATISTICS | FULL_PRIORITY)
     if is_alone:
         os.environ.update(LOOPBACK_ONLY)
     try:

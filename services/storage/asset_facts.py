@@ -98,14 +98,15 @@ def map_facts(path: Path) -> Facts:
 def material_facts(path: Path) -> Facts:
     """Load a precomputed material; return its `model`, mean `base_color` (linear) and what it is made of.
 
-    A `measured_brdf` has `lobes` and the `roughness` of their mean, a `polynomial_texture` `width` and `height` in
-    texels.
+    A `measured_brdf` has `lobes` and the `roughness` of their mean, a `polynomial_texture` or `texture_stack` (ABTF)
+    `width` and `height` in texels.
 
     Raises:
         DeltalightError: the file is wrong; the sentence says how.
     """
     from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
     from deltalight.render_server.scene.material_file import read_material
+    from deltalight.render_server.scene.texture_stack import TextureStack
 
     material = read_material(path)
     if isinstance(material, GaussianBrdf):
@@ -117,4 +118,5 @@ def material_facts(path: Path) -> Facts:
         }
     height, width = material.albedo.shape[:2]
     mean = material.albedo.mean(axis=(0, 1), dtype="float64")
-    return {"model": "polynomial_texture", "base_color": _rounded(mean), "width": width, "height": height}
+    model = "texture_stack" if isinstance(material, TextureStack) else "polynomial_texture"
+    return {"model": model, "base_color": _rounded(mean), "width": width, "height": height}

@@ -1,4 +1,4 @@
-"""Small pictures of precomputed materials: a ball of a measured paint, a lit square of a polynomial texture map."""
+"""Small pictures of precomputed materials: a ball of a measured paint, a lit square of a texture by the light."""
 
 from pathlib import Path
 
@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from deltalight.protocol.frames import decode_lut
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.material_file import read_material
-from deltalight.render_server.scene.polynomial_texture import PolynomialTexture, polynomial_terms
+from deltalight.render_server.scene.textures_by_light import TextureByLight
 from deltalight.services.storage.asset_kinds import Facts
 from deltalight.services.storage.thumbnails import (
     AMBIENT_LIGHT,
@@ -77,17 +76,15 @@ def _in_tangent_frame(
     return np.stack([frame @ direction for frame in (tangent, bitangent, normals)], axis=1)
 
 
-def _square(material: PolynomialTexture) -> Pixels:
-    """Return the map, seen and lit from in front, in the middle of the picture."""
-    height, width = material.coefficients.shape[1:3]
+def _square(material: TextureByLight) -> Pixels:
+    """Return the texture, seen from in front, in the middle of the picture."""
+    height, width = material.albedo.shape[:2]
     scale = SIZE / max(height, width)
     size = [max(1, round(edge * scale)) for edge in (width, height)]
-    planes = [_resized(plane, size) for plane in material.coefficients]
     color = AMBIENT_LIGHT * _resized(material.albedo, size)
     for strength, direction in LIGHTS:
-        terms = polynomial_terms((direction / np.linalg.norm(direction))[None].astype(np.float64))[0]
-        codes = np.clip(sum(term * plane for term, plane in zip(terms, planes, strict=True)), 0, 1)
-        color += strength * decode_lut(None)[np.rint(255 * codes).astype(np.uint8), 0]
+        shown = material.under(np.asarray(direction / np.linalg.norm(direction), np.float64))
+        color += strength * _resized(shown, size)
     picture = np.zeros((SIZE, SIZE, 4), np.float32)
     top, left = (SIZE - size[1]) // 2, (SIZE - size[0]) // 2
     picture[top : top + size[1], left : left + size[0]] = np.dstack([color, np.ones(color.shape[:2])])

@@ -16,7 +16,7 @@ from deltalight.benchmarks.variants import parse_variants
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(seconds=10)
 SIZE = (320, 240)  # smaller, a stereo sensor sees less of slanted surfaces
 LIGHT_PATHS = 32
 PICTURE_FLOOR_DB = {"two_lights": 35.7, "natural_light": 37.0}  # (37.7, 38.6)

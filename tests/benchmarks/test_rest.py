@@ -25,7 +25,7 @@ def test_the_page_counts_as_it_is_sent(tmp_path: Path) -> None:
     assert sizes["gzipped_bytes"] == len(gzip.compress(text)) + len(font)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=25)
 @pytest.mark.skipif(
     not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
 )

@@ -165,6 +165,17 @@ def test_flow_is_of_the_span_with_its_ends() -> None:
     assert Flow.of([], 0.0, 4.0).age_p50_ms is None
 
 
+def test_flow_of_several_cameras_waits_as_long_as_the_one_that_waits_longest() -> None:
+    seen = [Seen(at_s, 0, 30.0, 0.0, "left") for at_s in (0.5, 1.5, 2.5, 3.5)] + [
+        Seen(1.0, 0, 30.0, 0.0, "right")
+    ]
+    flow = Flow.of(seen, 0.0, 4.0, ["left", "right", "gone"])
+    assert flow.frames_per_s == 1.25
+    assert flow.camera_frames_per_s == {"left": 1.0, "right": 0.25, "gone": 0.0}
+    assert flow.longest_gap_s == 4.0
+    assert Flow.of(seen, 0.0, 4.0, ["left", "right"]).longest_gap_s == 3.0
+
+
 def soaked(**changed: object) -> Soaked:
     """Two minutes of a station in which nothing happens; the process `leaky` opens a handle a second."""
     samples = [
@@ -181,7 +192,7 @@ def soaked(**changed: object) -> Soaked:
         for second in range(120)
     ]
     seen = [Seen(second / 15, 0, 60.0, 20.0) for second in range(15 * 120)]
-    record = Soaked(PROFILES["station"], samples, [(0.0, 200.0)], seen, [], {"leaky": 0}, 0)
+    record = Soaked(PROFILES["station"], samples, [(0.0, 120.0)], seen, [], {"leaky": 0}, 0, ["", "dark"])
     return replace(record, **changed)  # type: ignore[arg-type]
 
 
@@ -201,6 +212,7 @@ def test_figures_meet_their_bars_or_not() -> None:
         "growth of open handles": False,
         "growth of GL objects": True,
         "age of a picture without waiting": True,
+        "pictures a second of a camera": True,
         "picture back, render server": False,
         "scene equal by document": True,
         "scene equal by pixels": True,
@@ -208,6 +220,19 @@ def test_figures_meet_their_bars_or_not() -> None:
     assert figures["picture back, render server"].result == "3.5 s"
     assert figures["growth of open handles"].result == "0 to 59"
     assert figures["age of a picture without waiting"].result == "40 ms"
+    assert figures["pictures a second of a camera"].result == "0 to 15"
+
+
+def test_a_load_is_compared_with_calm_spans_beside_which_their_own_difference_is_shown() -> None:
+    outcome = {
+        when: {"frames_per_s": rate, "unwaited_p95_ms": 40.0}
+        for when, rate in (("before", 50.0), ("during", 57.0), ("after", 54.0))
+    }
+    load = FaultRecord(name="nonsense", began_s=1, ended_s=9, outcome=outcome)
+    figures = {each.what: each for each in all_figures(soaked(faults=[load]))}
+    change, by_itself = figures["change of others' rate"], figures["change of the rate by itself"]
+    assert (change.result, change.is_met) == ("9.62 %", False)
+    assert (by_itself.result, by_itself.is_met) == ("7.69 %", True)
 
 
 def test_only_calm_samples_and_late_ones_count() -> None:
@@ -236,7 +261,7 @@ def test_wrong_options_are_sentences(
     assert parse_faults("none") == []
 
 
-@pytest.mark.slow(seconds=145)
+@pytest.mark.slow(seconds=170)
 @pytest.mark.skipif(
     not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
 )

@@ -23,7 +23,7 @@ from tests.deploy.chart_samples import SOFTWARE, of_kind, pods, rendered
 from tests.deploy.test_deploy import DEPLOY, check_names
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.slow(seconds=40),
     pytest.mark.skipif(find_spec("helm_python") is None, reason="Helm's library is not installed"),
     pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
 ]

@@ -20,6 +20,7 @@ from deltalight.benchmarks.soak.nonsense import mutated
 from deltalight.benchmarks.soak.profiles import PROFILES
 from deltalight.benchmarks.soak.station import Station, running_station
 from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.sockets import open_context
 from deltalight.protocol.vectors import FOLDER, unframe_pieces
 from deltalight.services import ports
 
@@ -38,7 +39,7 @@ def main() -> None:
     with ExitStack() as stack:
         thread = stack.enter_context(LoopThread("links"))
         station = stack.enter_context(running_station(PROFILES["small"], thread, options.seed))
-        _until_shown(station)
+        until_shown(station)
         print(json.dumps(attacked(station, options.messages, Random(options.seed))), flush=True)
 
 
@@ -95,7 +96,8 @@ class Gaps:
             self._shown, self._since_s = shown, now_s
 
 
-def _until_shown(station: Station) -> None:
+def until_shown(station: Station) -> None:
+    """Wait for the first picture."""
     deadline_s = time.monotonic() + START_S
     while time.monotonic() < deadline_s:
         station.check()
@@ -110,7 +112,7 @@ def _until_shown(station: Station) -> None:
 
 def _asking(stack: ExitStack, endpoint: str) -> Callable[[Sequence[bytes]], bool]:
     """Return what sends a request and tells whether an answer came."""
-    context = zmq.Context()
+    context = open_context()
     stack.callback(context.destroy, 0)
     socket = context.socket(zmq.DEALER)
     socket.connect(endpoint)

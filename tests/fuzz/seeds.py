@@ -22,6 +22,7 @@ from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.vectors import FOLDER, unframe_pieces
 from deltalight.render_server.scene.material_file import write_material
 from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
+from deltalight.render_server.scene.texture_stack import LAYERS, TextureStack
 from tests.fuzz.targets import RECORD_TOPICS, packed
 from tests.render_server.brdf_samples import grey_brdf
 from tests.render_server.gltf_samples import QUARTER_TURN, bent_bar
@@ -162,7 +163,8 @@ def _maps(folder: Path) -> Iterator[tuple[str, bytes]]:
 def _materials(folder: Path) -> Iterator[tuple[str, bytes]]:
     path, paint = folder / "paint.dlmat", grey_brdf(0.2, (0.1, 0.1, 0.5))
     texels = np.full((TERMS, 4, 6, 3), 0.1, np.float16)
-    for material in (paint, PolynomialTexture(texels)):
+    stack = TextureStack(np.full((LAYERS, 4, 6, 3), 0.1, np.float16), 0.04, 0.5)
+    for material in (paint, PolynomialTexture(texels), stack):
         write_material(path, material)
         yield "material", b"f" + path.read_bytes()
         yield "material", b"a" + path.read_bytes().split(b"\n", 1)[1]

@@ -10,7 +10,7 @@ from tests.fuzz.seeds import CORPUS, KEPT, corpus, kept, seeds
 from tests.fuzz.targets import TARGETS, attempt
 
 LARGEST_BYTES = 200_000
-MUTATIONS, SEED = 10_000, 1  # the same in every run, so that only a change of the code finds something new
+MUTATIONS, SEED = 2_000, 1  # the same in every run, so that only a change of the code finds something new
 
 
 @pytest.mark.filterwarnings(
@@ -33,7 +33,7 @@ def test_the_corpus_stays_small() -> None:
     assert sum(path.stat().st_size for path in files) < LARGEST_BYTES
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=8)
 @pytest.mark.skipif(find_spec("atheris") is None, reason=NO_ATHERIS)
 @pytest.mark.parametrize("target", TARGETS)
 def test_mutations_that_reach_new_code_are_taken_or_refused(target: str, tmp_path: Path) -> None:

@@ -21,14 +21,34 @@ def multipart(pieces: Sequence[bytes]) -> bytes:
     return b"".join(frame(piece, kind=MORE) for piece in first) + frame(last)
 
 
-class RawPeer:
-    """Connects to a loopback port as a socket of this kind."""
+PING = frame(b"\x04PING\x00\x00", kind=COMMAND)
+"""A heartbeat (ZMTP 3.1, RFC 37), after which the connection does not expire."""
 
-    def __init__(self, port: int, kind: str) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", port), timeout=10)
+
+class RawPeer:
+    """Connects to a loopback port as a socket of this kind, or is one already."""
+
+    def __init__(self, port: int, kind: str, connected: socket.socket | None = None) -> None:
+        self.socket = connected or socket.create_connection(("127.0.0.1", port), timeout=10)
         greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
         ready = b"\x05READY" + _property(b"Socket-Type", kind.encode()) + _property(b"Identity", b"")
         self.socket.sendall(greeting + frame(ready, kind=COMMAND))
+
+    @classmethod
+    def accepted(cls, listener: socket.socket, kind: str) -> "RawPeer":
+        """Wait for one that connects to us."""
+        connected, _ = listener.accept()
+        connected.settimeout(10)
+        return cls(0, kind, connected)
+
+    def wait_until_ready(self) -> "RawPeer":
+        """Wait for the other end's READY: what comes before it has sent that is a fault of the protocol."""
+        received = b""
+        while b"READY" not in received:
+            chunk = self.socket.recv(4096)
+            assert chunk, "the other end has hung up"
+            received += chunk
+        return self
 
     def send_what_fits(self, data: bytes) -> None:
         """Send until the other end takes no more for a moment."""

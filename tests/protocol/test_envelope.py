@@ -299,7 +299,7 @@ def test_numpy_scalars_and_arrays_cannot_slip_into_a_header() -> None:
 def test_every_stream_has_its_message_type() -> None:
     assert set(MESSAGE_TYPES) == {
         "color", "depth", "clean_depth", "fisheye", "radiance", "lights", "pose", "lamps", "composite", "stats",
-        "request", "reply",
+        "cameras", "request", "reply",
     }  # fmt: skip
 
 

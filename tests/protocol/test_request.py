@@ -21,6 +21,7 @@ from deltalight.protocol.messages import (
 )
 from deltalight.protocol.payloads import INLINE_CHARACTERS, decode_control, encode_control
 from deltalight.protocol.request import ReplyMemory, ReplyServer, RequestClient
+from deltalight.protocol.sockets import open_context
 
 ANY = "tcp://127.0.0.1:0"
 
@@ -266,7 +267,7 @@ def test_threads_may_share_a_client(opened: Callable[[Any], Any]) -> None:
 )
 def test_malformed_requests_get_a_sentence(opened: Callable[[Any], Any], pieces: list[bytes]) -> None:
     server = opened(ReplyServer(ANY, lambda _: {}))
-    context = zmq.Context()
+    context = open_context()
     try:
         socket = context.socket(zmq.REQ)
         socket.connect(server.endpoint)
@@ -283,7 +284,7 @@ def test_malformed_requests_get_a_sentence(opened: Callable[[Any], Any], pieces:
 @contextmanager
 def answering(answers: Callable[[list[bytes]], list[bytes]]) -> Iterator[str]:
     """Yield the endpoint of a socket that answers as a server of another version would."""
-    context = zmq.Context()
+    context = open_context()
     socket = context.socket(zmq.REP)
     port = socket.bind_to_random_port("tcp://127.0.0.1")
 
@@ -330,7 +331,7 @@ def test_a_client_of_the_version_before_is_answered_in_it(opened: Callable[[Any]
         return {"long": "x" * 100_000} if control.op == "long" else {}
 
     server = opened(ReplyServer(ANY, handle))
-    context = zmq.Context()
+    context = open_context()
     socket = context.socket(zmq.REQ)
     socket.connect(server.endpoint)
     for op in ("ping", "refuse", "long"):
@@ -351,7 +352,7 @@ def test_a_client_of_the_version_before_is_answered_in_it(opened: Callable[[Any]
     ],
 )
 def test_a_foreign_answer_is_refused(opened: Callable[[Any], Any], answer: list[bytes]) -> None:
-    context = zmq.Context()
+    context = open_context()
     socket = context.socket(zmq.REP)
     port = socket.bind_to_random_port("tcp://127.0.0.1")
 

@@ -1,9 +1,11 @@
 """Streams over real sockets on loopback: newest wins, slow consumers, lost peers, refused endpoints."""
 
+import gc
 import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from deltalight.protocol.messages import MAX_PART_BYTES, StatsMessage
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import ReplyServer, RequestClient
-from deltalight.protocol.sockets import check_endpoint
+from deltalight.protocol.sockets import check_endpoint, open_context
 from deltalight.protocol.subscriber import ReceivedMultipart
 
 ANY = "tcp://127.0.0.1:0"
@@ -184,9 +186,22 @@ def test_what_is_too_large_or_closed_is_said() -> None:
         publisher.send([b"color.a", b""])
 
 
+def test_a_context_that_is_forgotten_stays_and_one_that_was_ended_goes() -> None:
+    """A finalizer of the former would wait for its sockets, which are collected with it, for ever."""
+    forgotten = weakref.ref(open_context())
+    gc.collect()
+    context = forgotten()
+    assert context is not None
+    context.term()
+    del context
+    open_context().term()
+    gc.collect()
+    assert forgotten() is None
+
+
 def test_an_oversize_piece_does_not_reach_the_mailbox(opened: Callable[[Any], Any]) -> None:
     """The largest that is allowed comes through; whoever sends more is cut off."""
-    context = zmq.Context()
+    context = open_context()
     socket = context.socket(zmq.PUB)
     cut_off = socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
     port = socket.bind_to_random_port("tcp://127.0.0.1")

@@ -198,11 +198,12 @@ def image_based(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     ):
         for defines in ({}, {switch: 1}):
             Kernel(gpu, name, **defines).release()
+    Kernel(gpu, "image_based_surface", MATERIAL_MAPS=1, MEASURED=1).release()
 
 
 def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     """Compiles shading by precomputed transfer, without and with materials that have maps or are measured."""
-    for defines in ({}, {"MATERIAL_MAPS": 1}, {"MEASURED": 1}):
+    for defines in ({}, {"MATERIAL_MAPS": 1}, {"MEASURED": 1}, {"MATERIAL_MAPS": 1, "MEASURED": 1}):
         Kernel(gpu, "image_based_surface", PRECOMPUTED=1, **defines).release()
     Kernel(gpu, "transfer_light").release()
     RasterKernel(gpu, "transfer_raster").release()

@@ -12,10 +12,10 @@ from deltalight.render_server.gpu.kernel import (
     CLEARING_GROUPS,
     BindingError,
     Dispatch,
-    ListGroups,
     clear_buffer,
     watched,
 )
+from deltalight.render_server.gpu.list_groups import ListGroups
 from tests.render_server.tiny_kernel import MakeKernel, floats
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

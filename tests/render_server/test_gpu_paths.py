@@ -5,7 +5,7 @@ the frame makes the CPU wait; and some paths are taken only there.
 """
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from deltalight.render_server.gpu.kernel import Bindings, _Program
 from tests.render_server.protected_scenes import METHODS, Case, pictures_of
 from tests.render_server.test_golden import psnr_db
 
-pytestmark = [pytest.mark.slow(seconds=15), pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=8), pytest.mark.usefixtures("clean_gl")]
 CASES = [Case(method, "model", "mirror") for method in METHODS if method != "none"]
 POISON = b"\xff"  # NaN in floats, -1 or the greatest number in integers
 LEAST_PSNR_DB = 60.0  # light propagates in another order there
@@ -107,14 +107,12 @@ def audit(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     faults: list[str] = []
     bind = _Program.bind
 
-    def audited(program: _Program, shared: Sequence[Bindings], own: Bindings) -> dict[str, object]:
-        written = bind(program, shared, own)
-        slots = [*program._samplers, *program._images, *program._storage]
-        bound = [(slot.name, program.find(slot.name, (own, *shared))) for slot in slots]
-        for name, item in written.items():
-            others = [other for other, value in bound if value is item and other != name]
+    def audited(program: _Program, own: Bindings, known: Bindings) -> None:
+        bind(program, own, known)
+        names = [slot.name for slot in (*program._samplers, *program._images, *program._storage)]
+        for name, item in program.written(known).items():
+            others = [other for other in names if known[other] is item and other != name]
             faults.extend(f"{program.label}: {name} and {other}" for other in others)
-        return written
 
     monkeypatch.setattr(_Program, "bind", audited)
     return faults

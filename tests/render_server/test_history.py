@@ -104,7 +104,7 @@ def differing_pixels(one: CompositeFrame, other: CompositeFrame) -> int:
     return int(np.count_nonzero(differs.any(axis=-1)))
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 @pytest.mark.parametrize("has_model", [True, False], ids=["model", "depth"])
 @pytest.mark.parametrize("operator", ["exact", "paper"])
 def test_a_camera_that_steps_aside_and_back(

@@ -49,8 +49,9 @@ def test_stages_may_lag_behind_what_keeps_changing(graph: Graph, turns: int, exp
     assert shown_frames(graph, moves, [1, 2, 3, 4, 5]) == expected
 
 
-def test_stages_that_lag_catch_up_in_the_next_frame_without_a_change(graph: Graph) -> None:
-    moves, _ = lagging(graph, 2)
+@pytest.mark.parametrize("turns", [2, 3])
+def test_stages_that_lag_catch_up_in_the_next_frame_without_a_change(graph: Graph, turns: int) -> None:
+    moves, _ = lagging(graph, turns)
     assert shown_frames(graph, moves, [1, 2]) == [2, 3]
     assert graph.is_lagging
     assert shown_frames(graph, moves, [2]) == [4]
@@ -58,6 +59,14 @@ def test_stages_that_lag_catch_up_in_the_next_frame_without_a_change(graph: Grap
     assert shown_frames(graph, moves, [2]) == [4]
     assert not any(stage.ran for stage in graph.report())
     assert shown_frames(graph, moves, [5]) == [10]  # the first change after rest shows at once
+
+
+def test_stages_that_lag_wait_through_all_runs_of_a_frame(graph: Graph) -> None:
+    moves, _ = lagging(graph, 3)
+    assert shown_frames(graph, moves, [1, 2]) == [2, 3]
+    graph.run()
+    assert graph["shown"] == 3
+    assert shown_frames(graph, moves, [3]) == [4]
 
 
 def test_stages_lag_behind_nothing_else(graph: Graph) -> None:

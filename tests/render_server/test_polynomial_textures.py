@@ -115,7 +115,7 @@ def test_a_mesh_without_texture_coordinates_is_refused(gpu: GpuContext, tmp_path
     stage = Stage(tmp_path)
     material = plate(tmp_path)["material"]
     document = stage.document([{"id": "box", "asset": stage.asset(cube()), "material": material}], [])
-    with pytest.raises(DeltalightError, match="object `box`: a polynomial texture map needs texture coord"):
+    with pytest.raises(DeltalightError, match="object `box`: its material's texture needs texture coord"):
         SceneRenderer(gpu, document)
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float32
 
 from deltalight.benchmarks.ground_truth.assembly import environment_light
 from deltalight.benchmarks.ground_truth.render import choose_variant
+from deltalight.benchmarks.relief_materials import latitude_longitude
 from deltalight.protocol.frames import BoardPose
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_lights import EnvironmentLights, Lights
@@ -34,7 +35,7 @@ from tests.render_server.scenes import (
     with_neighbours,
 )
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=35), pytest.mark.usefixtures("clean_gl")]
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed", allow_module_level=True)
 WIDTH, HEIGHT, FOCAL = 320, 240, 420.0
@@ -59,14 +60,6 @@ def two_walls() -> trimesh.Trimesh:
     parts.append(((0.02, 0.32, 0.22), (0.17, 0, 0.13)))
     boxes = [shifted(trimesh.creation.box(size), *at) for size, at in parts]
     return trimesh.util.concatenate([*boxes, ball(0.07, (-0.02, 0.02, 0.09), 4)])
-
-
-def latitude_longitude() -> np.ndarray:
-    """Directions of a map whose centre looks along +x and has +y to its left."""
-    v, u = (np.mgrid[:128, :256] + 0.5) / np.reshape((128, 256), (2, 1, 1))
-    azimuth, elevation = np.pi * (1 - 2 * u), np.pi * (0.5 - v)
-    level = np.cos(elevation)
-    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def under_the_sky(folder: Path) -> SceneDocument:

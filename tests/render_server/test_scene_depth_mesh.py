@@ -7,6 +7,7 @@ import pytest
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.messages import MAX_CAMERAS
 from deltalight.render_server.scene.depth_mesh import depth_mesh, stride_for_budget
 from deltalight.render_server.scene.depth_surface import depth_surface
 
@@ -50,6 +51,25 @@ def test_a_plane_stays_a_plane_in_the_world(camera: CameraModel, budget: int) ->
     stride = stride_for_budget(WIDTH, HEIGHT, budget)
     rows, columns = -(-HEIGHT // stride), -(-WIDTH // stride)
     assert len(mesh.triangles) == 2 * (rows - 1) * (columns - 1)
+
+
+def test_rays_of_all_cameras_of_a_room_are_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    lenses = [
+        CameraModel(WIDTH, HEIGHT, MATRIX, "plumb_bob", np.array([-0.1 - 0.01 * number, 0, 0, 0]))
+        for number in range(MAX_CAMERAS)
+    ]
+
+    def mesh_all() -> None:
+        for lens in lenses:
+            for budget in (2_000, 300):
+                depth_mesh(image(plane_depth(lens, NORMAL, 0.9), lens), lens, np.eye(4), budget)
+
+    def again(*_: object) -> None:
+        pytest.fail("a lens is inverted again")
+
+    mesh_all()
+    monkeypatch.setattr(CameraModel, "unproject", again)
+    mesh_all()
 
 
 def test_stride_is_the_least_that_keeps_to_the_budget() -> None:

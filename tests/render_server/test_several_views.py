@@ -169,9 +169,8 @@ def test_the_world_is_made_once_and_each_view_by_itself(
     assert renderer.graph is not None
     doubled = {stage.name for stage in renderer.graph.report() if stage.name.endswith("(view 2)")}
     assert {"cones (view 2)", "real surface (view 2)"} <= doubled
-    assert (
-        not {f"{name} (view 2)" for name in ("voxelize real", "shadow maps real", "bounces joint")} & doubled
-    )
+    of_world = "voxelize real", "shadow maps real", "bounces joint", "object bvh"
+    assert not {f"{name} (view 2)" for name in of_world} & doubled
     again = counted(seen_room(FACING), small)
     assert set(again) == {"composite", "linearize"}, "nothing moved"
 

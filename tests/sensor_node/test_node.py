@@ -27,6 +27,7 @@ from deltalight.protocol.messages import (
 )
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import ReplyServer
+from deltalight.protocol.sockets import open_context
 from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_camera
 from deltalight.sensor_node.capture import CaptureThread
 from deltalight.sensor_node.frame_messages import depth_multipart, fitting_step_m
@@ -133,7 +134,7 @@ def test_a_node_publishes_every_stream_of_a_frame_with_one_id_and_time(take: Pat
 def test_colour_comes_after_what_belongs_to_it(endpoint: str, take: Path) -> None:
     import zmq
 
-    context = zmq.Context()
+    context = open_context()
     socket = context.socket(zmq.SUB)
     socket.rcvhwm = 1000
     socket.subscribe("")

@@ -39,7 +39,7 @@ from deltalight.sensor_node.node import NodeConfig, Repeater, run_node
 from deltalight.sensor_node.pose_filter import PoseFilterSettings
 from deltalight.services import ports
 
-PERIOD_NS = 33_333_333
+PERIOD_NS = 200_000_000  # so long that a busy machine also takes several frames under one sky
 SIZE = 96
 LIMIT_S = 20.0
 
@@ -64,7 +64,8 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ) as writer:
         for index in range(6):
             sky = pictures(PERIOD_NS * (3 * (index // 3)), 0.5 if index < 3 else 0.25)
-            writer.add(replace(camera.frame_at(index), fisheye=sky))
+            frame = camera.frame_at(index)
+            writer.add(replace(frame, timestamp_ns=PERIOD_NS * index, fisheye=sky))
     return path
 
 

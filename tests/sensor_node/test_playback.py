@@ -93,18 +93,17 @@ def test_steps_go_from_frame_to_frame_whatever_the_times_between_them(tmp_path: 
             assert reader.read(1) == [expected]
 
 
-def test_a_pause_repeats_the_frame_now_and_then_with_a_new_stamp(
-    source: Source, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(playback, "REPEAT_NS", 20_000_000)
+def test_a_pause_repeats_the_frame_at_a_bounded_rate_with_a_new_stamp(source: Source) -> None:
     with reading(source, start_s=5 * PERIOD_S, playing=False, stays=True) as reader:
         assert reader.read(3) == [5, 5, 5]
         state = reader.camera.playback
     assert (state.playing, state.position_s) == (False, pytest.approx(5 * PERIOD_S))
     assert state.duration_s == pytest.approx((COUNT - 1) * PERIOD_S)
-    assert [later - earlier for earlier, later in pairwise(reader.stamps)] == [20_000_000, 20_000_000]
+    assert [later - earlier for earlier, later in pairwise(reader.stamps)] == [playback.LEAST_REPEAT_NS] * 2
     held = [frame.fisheye for frame in reader.frames]
     assert held[0] is held[1] is held[2], "light that stays is not computed again"
+    colors = [frame.color for frame in reader.frames]
+    assert colors[0] is colors[1] is colors[2], "nor is the picture unpacked again"
 
 
 def test_light_after_a_jump_is_not_older_than_the_jump(source: Source) -> None:
@@ -126,10 +125,7 @@ def test_another_rate_spreads_the_stamps_and_not_the_recorded_times(source: Sour
     assert reader.frames[1].timestamp_ns - reader.frames[0].timestamp_ns == PERIOD_NS
 
 
-def test_at_its_end_it_waits_for_another_command_where_it_is_told_to(
-    source: Source, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(playback, "REPEAT_NS", 10_000_000)
+def test_at_its_end_it_waits_for_another_command_where_it_is_told_to(source: Source) -> None:
     with reading(source, start_s=99.0, stays=True) as reader:
         assert reader.read(2) == [COUNT - 1, COUNT - 1]
         assert not reader.camera.playback.playing
@@ -149,7 +145,9 @@ def test_a_reader_that_is_far_behind_gets_the_newest_frame(
     assert reader.frames[-1].frame_id == place, "what was left out is missing in the numbers"
 
 
-def test_commands_reach_a_camera_that_waits(source: Source) -> None:
+def test_commands_reach_a_camera_that_waits(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(playback, "LEAST_REPEAT_NS", 60 * 10**9)  # nothing but a command ends the wait
+    monkeypatch.setattr(playback, "MOST_REPEAT_NS", 60 * 10**9)
     with reading(source, playing=False, stays=True) as reader:
         reader.read(1)
         timer = threading.Timer(0.02, reader.camera.seek, [3 * PERIOD_S])

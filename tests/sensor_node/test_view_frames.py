@@ -46,6 +46,18 @@ def test_pose_and_depth_are_found_and_the_picture_is_untouched(camera: Synthetic
     assert view.depth.valid.mean() > 0.99
 
 
+def test_a_repeated_picture_is_not_examined_again(camera: SyntheticCamera) -> None:
+    builder, first, other = ViewFrameBuilder(camera), camera.frame_at(3), camera.frame_at(5)
+    view, again = builder(first), builder(replace(first, frame_id=9, timestamp_ns=10**9))
+    assert (again.frame_id, again.timestamp_ns) == (9, 10**9)
+    assert again.pose is view.pose
+    assert again.depth is view.depth
+    changed = builder(replace(first, color=other.color))
+    assert changed.pose is not None
+    assert pose_difference(changed.pose.world_from_camera, camera.pose_at(5))[0] < 0.001
+    assert builder(replace(first, color=other.color, depth=other.depth)).depth is not changed.depth
+
+
 def test_a_given_pose_wins_over_the_board(camera: SyntheticCamera) -> None:
     given = np.eye(4)
     given[:3, 3] = [1, 2, 3]

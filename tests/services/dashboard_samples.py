@@ -55,7 +55,7 @@ JPEG_QUALITY = 75  # keeps most below 100 kB
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NEEDS_BROWSER = [
-    pytest.mark.slow,
+    pytest.mark.slow(seconds=6),
     pytest.mark.skipif(
         CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
     ),

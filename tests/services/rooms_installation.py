@@ -24,6 +24,7 @@ from deltalight.services.rooms.status import RoomStatus
 from tests.services.conftest import ROOT
 
 PATIENCE_S = 150.0
+POLL_S = 0.05  # each look is a request, whose answer takes what it waits for from the processor
 ROOMS = """
 slots: 2
 nodes: {desk: {source: take.mcap}}
@@ -40,7 +41,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
         with suppress(httpx.TransportError):
             if condition():
                 return
-        time.sleep(0.02)
+        time.sleep(POLL_S)
     pytest.fail("it never came")
 
 

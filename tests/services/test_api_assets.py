@@ -16,6 +16,7 @@ from deltalight.protocol.radiance_files import write_exr
 from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrdf
 from deltalight.render_server.scene.material_file import write_material
 from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
+from deltalight.render_server.scene.texture_stack import LAYERS, TextureStack
 from deltalight.services.storage.asset_sandbox import probe
 from deltalight.services.storage.faults import RejectedAssetError
 from tests.services.api_samples import UPLOAD, RunningApi, running_api, sentence
@@ -151,6 +152,18 @@ def test_a_polynomial_texture_map_is_taken(api: RunningApi, tmp_path: Path) -> N
         6,
         4,
     )
+
+
+def test_a_texture_stack_is_taken_and_a_false_one_refused(api: RunningApi, tmp_path: Path) -> None:
+    path = tmp_path / "studs.dlmat"
+    write_material(path, TextureStack(np.full((LAYERS, 4, 6, 3), 0.5, np.float16), 0.04, 0.5))
+    found = upload(api.client, path.read_bytes(), "studs.dlmat").json()
+    facts = found["facts"]
+    assert (facts["model"], facts["width"], facts["height"]) == ("texture_stack", 6, 4)
+    assert facts["base_color"] == pytest.approx([1, 1, 1])
+    write_material(path, TextureStack(np.full((LAYERS, 4, 6, 3), 1e4, np.float16)))
+    refused = upload(api.client, path.read_bytes(), "studs.dlmat")
+    assert "holds no material that can be drawn" in sentence(refused, 422)
 
 
 def test_the_same_file_again_is_200_and_comes_back_byte_for_byte(api: RunningApi) -> None:

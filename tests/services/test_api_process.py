@@ -49,7 +49,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
     pytest.fail("it never came")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_path: Path) -> None:
     port, control_port, publish_port, node_port = ports.private_ports(4)
     control = ports.endpoint(control_port)
@@ -118,7 +118,7 @@ def test_tokens_are_made_listed_and_revoked(tmp_path: Path) -> None:
         run("revoke", "wall")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
     (port,) = ports.private_ports(1)
     command = [
@@ -170,7 +170,7 @@ def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:
 MOST_GROWTH_BYTES = 20 << 20  # imports would take 127 MB for the shelf and 131 to 175 MB for cameras
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_requests_that_need_large_packages_or_are_refused_leave_the_process_as_small(tmp_path: Path) -> None:
     port, control_port, stats_port = ports.private_ports(3)
     rest = ("api", "--port", port, "--data", tmp_path, "--control", ports.endpoint(control_port))

@@ -2,6 +2,8 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
 from threading import Event
 
 import httpx
@@ -10,12 +12,16 @@ import pytest
 
 from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.request import RequestClient
+from deltalight.protocol.source import open_source
+from deltalight.sensor_node.cameras.playback import PlaybackCamera
 from deltalight.services import ports
 from deltalight.services.api.replay_control import ReplayEndpoints
+from deltalight.services.node_process import playback_control
 from deltalight.services.recorder import Recorder as StreamRecorder
 from deltalight.services.recorder import RecordJob
 from deltalight.services.storage.faults import ConflictError
 from tests.services.api_samples import RunningApi, running_api, sentence
+from tests.services.live_samples import event_socket, next_event
 from tests.services.record_samples import PERIOD_NS, frames, write
 from tests.services.render_server_samples import Recorder
 
@@ -97,6 +103,41 @@ def test_a_recording_is_shown_moved_through_and_left(
     assert client.get("/replay").json()["recording"] is None
     assert not children()
     assert "no recording is replayed" in sentence(client.patch("/replay", json={"playing": True}), 409)
+
+
+def test_a_recording_that_the_node_plays_is_moved_through_where_no_other_is_shown(
+    tmp_path: Path,
+) -> None:
+    (port, control_port) = ports.private_ports(2)
+    (tmp_path / "recordings").mkdir()
+    take = write(tmp_path / "recordings" / "take.mcap", frames(COUNT))
+    camera = PlaybackCamera(open_source(take), loop=True, playing=False, stays=True)
+    endpoint, server = ports.endpoint(port), Recorder(control_port)
+    with ExitStack() as stack:
+        stack.callback(server.close)
+        stack.enter_context(playback_control(camera, endpoint, None))
+        options = {"playback": endpoint, "control": ports.endpoint(control_port)}
+        client = stack.enter_context(running_api(tmp_path, **options)).client  # type: ignore[arg-type]
+        first = client.get("/replay").json()
+        assert (first["recording"], first["position_s"], first["playing"]) == (None, 0, False)
+        moved = client.patch("/replay", json={"step_frames": 2, "rate": 2}).json()
+        assert (moved["position_s"], moved["rate"]) == (pytest.approx(2 * PERIOD_NS / 1e9, abs=1e-6), 2)
+        assert client.put("/replay", json={"recording": "take"}).json()["recording"] == "take"
+        client.patch("/replay", json={"playing": False, "position_s": 0}).raise_for_status()
+        assert camera.playback.position_s == moved["position_s"], "which is another one"
+        client.delete("/replay").raise_for_status()
+        assert client.get("/replay").json() == moved
+        with event_socket(f"{ports.LOOPBACK}:{client.base_url.port}") as events:
+            camera.seek(LENGTH_S)
+            while next_event(events, "replay")["position_s"] < LENGTH_S - 1e-6:
+                pass
+
+
+def test_a_node_that_plays_and_does_not_answer_keeps_the_service_from_nothing(tmp_path: Path) -> None:
+    (port,) = ports.private_ports(1)
+    with running_api(tmp_path, playback=ports.endpoint(port)) as api:
+        assert api.client.get("/replay").json()["position_s"] is None
+        sentence(api.client.patch("/replay", json={"playing": True}), 503)
 
 
 def test_what_a_killed_service_left_is_put_right(api: RunningApi, client: httpx.Client) -> None:

@@ -6,13 +6,19 @@ Node and renderer are stand-ins.
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
 
 import cv2
 import pytest
 from playwright.sync_api import Browser, Route, WebSocketRoute, expect
 
 from deltalight import __version__
+from deltalight.protocol.source import open_source
+from deltalight.sensor_node.cameras.playback import PlaybackCamera
+from deltalight.services import ports
 from deltalight.services.demo import POSTER, POSTER_BEFORE
+from deltalight.services.node_process import playback_control
 from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
     SCREENSHOTS,
@@ -22,6 +28,7 @@ from tests.services.dashboard_samples import (
     Stack,
 )
 from tests.services.live_samples import AGE_S, NOISE, LiveApi, live_api, shade
+from tests.services.record_samples import frames, write
 
 pytestmark = NEEDS_BROWSER
 LAMP = {"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}
@@ -31,12 +38,15 @@ TABS = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History")
 PANELS = ("Object", "Lights", "Real", "Method", "Output")
 
 
+def stand_in(data: Path, **settings: object) -> AbstractContextManager[LiveApi]:
+    """An API whose pictures are noise, or the demo's still where pictures are wanted."""
+    picture = cv2.cvtColor(cv2.imread(str(POSTER)), cv2.COLOR_BGR2RGB) if SCREENSHOTS else NOISE
+    return live_api(data, period_s=STAND_IN_PERIOD_S, picture=picture, **settings)
+
+
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
-    """Shows noise, or the demo's still where pictures are wanted."""
-    picture = cv2.cvtColor(cv2.imread(str(POSTER)), cv2.COLOR_BGR2RGB) if SCREENSHOTS else NOISE
-    data = tmp_path_factory.mktemp("data")
-    with live_api(data, period_s=STAND_IN_PERIOD_S, picture=picture) as running:
+    with stand_in(tmp_path_factory.mktemp("data")) as running:
         yield running
 
 
@@ -251,6 +261,53 @@ def test_the_guide_ticks_off_what_was_tried_and_keeps_it(stack: Stack, page: Des
     page.page.reload()
     expect(done).to_have_count(1)
     assert stack.document()["lights"]["manual"][-1]["type"] == "spot"
+
+
+@contextmanager
+def node_that_plays(folder: Path) -> Iterator[tuple[PlaybackCamera, LiveApi]]:
+    """A node whose source is a recording, paused at its start, and an API that is told where it is controlled."""
+    (port,) = ports.private_ports(1)
+    recording = open_source(write(folder / "a.mcap", frames(9)))
+    camera = PlaybackCamera(recording, loop=True, playing=False, stays=True)
+    endpoint = ports.endpoint(port)
+    with playback_control(camera, endpoint, None), stand_in(folder / "data", playback=endpoint) as api:
+        yield camera, api
+
+
+def test_the_camera_of_a_recording_that_the_node_plays_is_moved_by_a_slider(
+    browser: Browser, tmp_path: Path
+) -> None:
+    with ExitStack() as opened:
+        camera, api = opened.enter_context(node_that_plays(tmp_path))
+        store = api.api.store
+        scene = store.scenes.activate(store.scenes.create(SCENE).head.id).head.id
+        api.stream.scene = (scene, 1)
+        stack = Stack(api.address, api.client, f"/scenes/{scene}")
+        page = opened.enter_context(contextmanager(seat)(stack, browser, viewport=SIZE))
+        page.open()
+        bar = page.named("group", "Camera motion")
+        slider, end_s = bar.get_by_role("slider", name="Position"), camera.playback.duration_s
+        expect(slider).to_have_value("0")
+        expect(page.named("button", "Back to live")).to_have_count(0)
+        says(page, "Live")
+        step = page.named("region", "Try this").get_by_role("listitem").filter(has_text="Move the camera")
+        expect(step).not_to_have_class("done")
+        slider.press("End")
+        page.until(lambda: camera.playback.position_s == pytest.approx(end_s), "the end")
+        expect(step).to_have_class("done")
+        bar.get_by_role("button", name="Play", exact=True).click()
+        page.until(lambda: camera.playback.playing, "the motion")
+        bar.get_by_role("button", name="Pause").click()
+        page.until(lambda: not camera.playback.playing, "the pause")
+        page.photograph("camera_motion")
+        camera.seek(end_s / 2)  # as by another page
+        place_s = camera.playback.position_s
+        page.until(
+            lambda: float(slider.input_value()) == pytest.approx(place_s), "where another page moved it"
+        )
+        page.page.set_viewport_size(PHONE)  # type: ignore[arg-type]
+        assert page.beyond_the_edge() == []
+        expect(slider).to_be_in_viewport(ratio=1)
 
 
 def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, page: Desk) -> None:

@@ -47,7 +47,7 @@ CHEAP = {
 PLAIN = {"caustics": False, "screen_space": False, "far_volume": False, "shadow_samples": 1}
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_headless_demo_writes_composites_sheet_and_video(cli_process: RunCli, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ("--headless", "--frames", 3, "--out", out, "--method", "paper", "--json")
@@ -86,7 +86,7 @@ def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
     assert "--out" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_picture_returns_after_node_and_server_are_killed(tmp_path: Path) -> None:
     with session_file(demo_scene("paper").replaced(output=SMALL)) as session:
         plan = replace(demo_plan(session), source=str(slow_demo(tmp_path)))
@@ -184,7 +184,7 @@ def demo(page_port: int, *options: str) -> Iterator[str]:
     assert ports.is_free(page_port)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     """The first as people start it; in the second, a change by REST is in the next picture that is begun."""
     (page_port,) = ports.private_ports(1)
@@ -194,7 +194,13 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
             assert client.get("/poster.jpg").content == POSTER.read_bytes()
             assert client.get("/poster-before.jpg").content == POSTER_BEFORE.read_bytes()
             (recording,) = client.get("/recordings").json()
+            begins = client.get("/replay").json()
+            end_s = begins["duration_s"]
+            assert client.patch("/replay", json={"position_s": end_s}).json()["position_s"] == pytest.approx(
+                end_s
+            )
         assert (recording["id"], recording["frames"]) == ("demo", 30)
+        assert (begins["recording"], begins["position_s"], begins["playing"]) == (None, 0, False)
     with demo(page_port, "--method", "paper") as address:
         check_changes(address)
 
@@ -238,7 +244,7 @@ def test_page_port_in_use_is_a_sentence(cli: RunCli) -> None:
     assert "--port" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, cli_process: RunCli, tmp_path: Path) -> None:
     """The server's own sentence ends the command; no restarts are tried."""
     if "llvmpipe" not in cli("doctor", "--json").stdout:

@@ -17,6 +17,7 @@ from deltalight.protocol.keys import Keys, create_keys, load_keys, trust
 from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.payloads import encode_control
 from deltalight.protocol.rights import allow
+from deltalight.protocol.sockets import open_context
 from deltalight.services import ports
 from deltalight.services.rooms.directory import (
     DRAIN,
@@ -64,12 +65,14 @@ def order(op: str, number: int = 0, **payload: object) -> list[bytes]:
 @contextmanager
 def sender(endpoint: str, *, kept_answers: int = 1000) -> Iterator["zmq.Socket[bytes]"]:
     """A socket that may send what it likes, when it likes, and need not take answers."""
-    context = zmq.Context()
+    context = open_context()
     socket = context.socket(zmq.DEALER)
     socket.rcvhwm, socket.linger, socket.sndtimeo = kept_answers, 0, 10_000
     socket.connect(endpoint)
-    yield socket
-    context.destroy(0)
+    try:
+        yield socket
+    finally:
+        context.destroy(0)
 
 
 def answers(socket: "zmq.Socket[bytes]", count: int) -> list[list[bytes]]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
+from PIL import Image
 
 from tests.render_server.brdf_samples import brdf_file, grey_brdf
 from tests.services.conftest import RunCli
@@ -62,6 +63,24 @@ def test_what_cannot_be_precomputed_is_said_in_one_sentence(cli: RunCli, tmp_pat
         assert sentence in done.stderr
         assert len(done.stderr.splitlines()) == 1
     assert not kept.exists()
+
+
+def test_pictures_under_lights_of_several_angles_become_a_material(cli: RunCli, tmp_path: Path) -> None:
+    folder, out = tmp_path / "studs", tmp_path / "studs.dlmat"
+    folder.mkdir()
+    for name, code in (("low", 60), ("high", 160)):
+        Image.new("RGB", (12, 8), (code, code, code)).save(folder / f"{name}.png")
+    info = {"type": "abtf", "pictures": ["low.png", "high.png"], "angles_deg": [70, 0]}
+    (folder / "info.json").write_text(json.dumps(info))
+    done = cli("precompute", str(folder), "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    assert "studs.dlmat: a stack of 16 of 12x8 texels, reflects 0.277 0.277 0.277 of" in done.stdout
+    before = out.read_bytes()
+    (folder / "low.png").unlink()
+    refused = cli("precompute", str(folder), "--out", str(out))
+    assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)
+    assert "low.png cannot be read as a picture" in refused.stderr
+    assert out.read_bytes() == before
 
 
 def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None:

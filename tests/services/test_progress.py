@@ -82,6 +82,17 @@ def test_who_reports_waits(start: Start, publisher: Publisher) -> None:
         assert idle_looks(progress, start(BUSY), 5, lambda: publisher.send(encode(report("server"))))
 
 
+def test_who_reports_that_it_starts_is_at_work(start: Start, publisher: Publisher) -> None:
+    with Progress({SERVER: publisher.endpoint}) as progress:
+        busy, before_s = start(BUSY), progress.at_work_s
+        deadline_s = time.monotonic() + PATIENCE_S
+        while progress.at_work_s == before_s:
+            assert time.monotonic() < deadline_s
+            publisher.send(encode(report("server").model_copy(update={"state": "starting"})))
+            time.sleep(0.05)
+            progress.look({SERVER: busy})
+
+
 class Pictures:
     """A collector that has one after so many looks."""
 

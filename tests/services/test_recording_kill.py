@@ -13,7 +13,7 @@ from deltalight.services.recording_copies import recover_recording
 from tests.services.killed_writer import CYCLES, KilledWriter
 from tests.services.record_samples import BOARD, PERIOD_NS, STARTED_NS, frames
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(seconds=30)
 SOURCE = frames(2)
 
 

@@ -3,22 +3,36 @@
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+from structlog.testing import capture_logs
 
 from deltalight.protocol.envelope import decode
-from deltalight.protocol.messages import CompositeMessage, ControlReply, ControlRequest
+from deltalight.protocol.messages import (
+    CompositeMessage,
+    ControlReply,
+    ControlRequest,
+    ProcessState,
+    StatsMessage,
+)
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.gpu.context import CompileWatcher
+from deltalight.render_server.server import process
 from deltalight.render_server.server.process import ServerSettings, serve
+from deltalight.render_server.started_frame import CameraFrame
 from deltalight.services import ports
+from deltalight.services.api.streams import ProcessWatch
 from tests.services.api_samples import UPLOAD, running_api
 from tests.services.conftest import camera, color, depth, pose
+from tests.services.render_server_samples import Started
 from tests.services.storage_samples import TETRAHEDRON
 from tests.services.test_session import InvertingRenderer
 
@@ -53,13 +67,19 @@ class Node:
 class Server:
     """A render server in a thread, its control client, and a receiver of what it publishes."""
 
-    def __init__(self, renderer: InvertingRenderer, node_port: int, **settings: object) -> None:
-        self.control, publish = map(ports.endpoint, ports.private_ports(2))
+    def __init__(
+        self,
+        renderer: InvertingRenderer,
+        node_port: int,
+        compile_watchers: list[CompileWatcher] | None = None,
+        **settings: object,
+    ) -> None:
+        self.control, self.published = map(ports.endpoint, ports.private_ports(2))
         scene = SceneDocument(revision=7)
         self._settings = ServerSettings.model_validate(
             {
                 "subscribe": [ports.endpoint(node_port)],
-                "publish": publish,
+                "publish": self.published,
                 "control": self.control,
                 **settings,
             }
@@ -67,12 +87,12 @@ class Server:
         self._thread = threading.Thread(
             target=serve,
             args=(self._settings, renderer, scene),
-            kwargs={"renderer_name": "abacus"},
+            kwargs={"renderer_name": "abacus", "compile_watchers": compile_watchers},
             daemon=True,
         )
         self._thread.start()
         self.client = RequestClient(self.control)
-        self.receiver = Receiver([publish], ["composite"])
+        self.receiver = Receiver([self.published], ["composite"])
 
     def ask(self, op: str, **payload: object) -> ControlReply:
         request = ControlRequest(node="test", id=f"r{time.time_ns()}", op=op, payload=payload)
@@ -100,11 +120,17 @@ class Server:
 
 
 @contextmanager
-def serving(*, immediate: bool = True, **settings: object) -> Iterator[tuple[Server, InvertingRenderer, int]]:
-    renderer = InvertingRenderer()
+def serving(
+    renderer: InvertingRenderer | None = None,
+    compile_watchers: list[CompileWatcher] | None = None,
+    *,
+    immediate: bool = True,
+    **settings: object,
+) -> Iterator[tuple[Server, InvertingRenderer, int]]:
+    renderer = renderer or InvertingRenderer()
     renderer.immediate = immediate
     (node_port,) = ports.private_ports(1)
-    server = Server(renderer, node_port, **settings)
+    server = Server(renderer, node_port, compile_watchers, **settings)
     try:
         yield server, renderer, node_port
     finally:
@@ -199,6 +225,91 @@ def test_a_faulty_node_does_not_end_the_server() -> None:
         node = Node(ports.endpoint(node_port), first=2)
         assert server.first(lambda message: message.frame_id >= 2).status == "ok"
         node.close()
+
+
+def test_a_degraded_state_is_shown_logged_once_and_counted(tmp_path: Path) -> None:
+    wrong = {**camera().to_dict(), "distortion_model": "unheard of"}
+    numbers = itertools.count(1)
+    with (
+        capture_logs() as lines,
+        serving() as (server, _, node_port),
+        running_api(tmp_path, control=server.control, subscribe=[server.published]) as api,
+        closing(Publisher(ports.endpoint(node_port))) as node,
+    ):
+
+        def shown_when(state: str, own: dict[str, object] | None) -> dict[str, Any]:
+            """Send frames with that camera until the web process shows that state of the render server."""
+            deadline_s = time.monotonic() + PATIENCE_S
+            while time.monotonic() < deadline_s:
+                number = next(numbers)
+                for message in (color(number, number, 0, own), depth(number, number), pose(number, number)):
+                    node.send(message)
+                known = {each["name"]: each for each in api.client.get("/nodes").json()}
+                if known.get("render-server", {}).get("state") == state:
+                    return dict(known["render-server"])
+                time.sleep(0.01)
+            pytest.fail(f"never {state}")
+
+        shown_when("running", None)
+        degraded = shown_when("degraded", wrong)
+        assert "unheard of" in degraded["detail"]
+        assert api.client.get("/health").json()["status"] == "ok", "it works, and needs no restart"
+        after = shown_when("running", None)
+        assert "unheard of" not in after["detail"]
+        counts = api.client.get("/metrics").text.splitlines()
+    assert 'deltalight_process_degraded_total{process="render-server"} 1.0' in counts
+    assert after["drops"]["bad_frames"] > 1
+    told = [(each["event"], each["log_level"]) for each in lines if "degraded" in each["event"]]
+    assert told == [("a process is degraded", "warning"), ("a process is no longer degraded", "info")]
+    assert sum(each["event"] == "bad_frames" for each in lines) == 1, "the render server's own line"
+
+
+def test_a_state_that_comes_and_goes_is_counted_each_time_and_logged_once() -> None:
+    watch = ProcessWatch()
+    with capture_logs() as lines:
+        for number in range(40):
+            state: ProcessState = "degraded" if number % 4 < 2 else "running"
+            report = watch.note(StatsMessage(node="cam", capture_ns=number, state=state, detail="board"))
+    assert report.degraded == 10
+    assert [each["event"] for each in lines] == ["a process is degraded", "a process is no longer degraded"]
+
+
+class CompilingRenderer(InvertingRenderer):
+    """Compiles two shaders for its first picture, the second once `released`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.watchers: list[CompileWatcher] = []
+        self.released = threading.Event()
+
+    def submit_cameras(
+        self,
+        taken: Sequence[CameraFrame],
+        *,
+        with_linear: bool = False,
+        whole: bool = False,
+        others: Sequence[ShownView] = (),
+    ) -> list[Started]:
+        for label in ("clear", "shade"):
+            for watch in self.watchers:
+                watch(label, {})
+            self.released.wait(PATIENCE_S)
+        return super().submit_cameras(taken, with_linear=with_linear, whole=whole, others=others)
+
+
+def test_how_far_a_first_picture_is_comes_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "PREPARING_INTERVAL_S", 0.0)
+    renderer = CompilingRenderer()
+    with serving(renderer, renderer.watchers) as (server, _, node_port):
+        receiver, node = Receiver([server.published], ["stats"]), Node(ports.endpoint(node_port))
+        states = []
+        while "starting" not in states:
+            messages = [decode(each)[0] for each in (receiver.latest(PATIENCE_S) or {}).values()]
+            states += [message.state for message in messages if isinstance(message, StatsMessage)]
+        renderer.released.set()
+        assert server.first(lambda message: message.status == "ok")
+        node.close()
+        receiver.close()
 
 
 def test_frames_go_on_after_a_snapshot_and_commands_wait_for_it(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from deltalight.services import ports
 from tests.services.conftest import ROOT
 from tests.services.record_samples import PERIOD_NS, feeding, frames, write
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(seconds=10)
 COUNT = 40
 # JPEG loses a few steps of 255; two of these pictures differ by 80 in the mean.
 SAME, ANOTHER = 15.0, 40.0

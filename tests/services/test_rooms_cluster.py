@@ -19,7 +19,13 @@ import psutil
 import pytest
 
 from deltalight.services.rooms.follower import RoomFollower
-from deltalight.services.rooms.ray_cluster import LOOPBACK_ONLY, NO_STATISTICS, OBJECT_STORE_BYTES, RayCluster
+from deltalight.services.rooms.ray_cluster import (
+    FULL_PRIORITY,
+    LOOPBACK_ONLY,
+    NO_STATISTICS,
+    OBJECT_STORE_BYTES,
+    RayCluster,
+)
 from tests.services.rooms_installation import (
     PATIENCE_S,
     Installation,
@@ -31,7 +37,7 @@ from tests.services.rooms_installation import (
 )
 
 pytestmark = [
-    pytest.mark.slow(seconds=15),
+    pytest.mark.slow(seconds=25),
     pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
 ]
 # A host that is silent for a second and a half is dead (Ray's default is 15 s).
@@ -47,7 +53,7 @@ class Hosts:
     """A Ray cluster whose hosts have a slot each; the first process of the cluster has none."""
 
     def __init__(self) -> None:
-        os.environ.update(LOOPBACK_ONLY | NO_STATISTICS)
+        os.environ.update(LOOPBACK_ONLY | NO_STATISTICS | FULL_PRIORITY)
         from ray.cluster_utils import Cluster
 
         self.cluster = Cluster()
@@ -160,6 +166,8 @@ def test_two_rooms_run_on_two_hosts_and_the_third_waits_and_says_why(
     arrange(hosts, installation, "hall", "door")
     used = {installation.room(name).slot for name in ("hall", "door")}
     assert used == {f"{name}/1" for name in hosts.networks}
+    rendering_at = {server.nice() for name in hosts.networks for server in servers(hosts.raylet(name))}
+    assert max(rendering_at) <= psutil.Process().nice()
     installation.directory.command("start", "attic")
     wait_for(lambda: "all 2 slots are in use" in installation.room("attic").why)
     assert installation.room("attic").state == "waiting"

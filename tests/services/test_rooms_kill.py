@@ -6,7 +6,7 @@ import pytest
 
 from tests.services.rooms_installation import Installation, settled, started, wait_for
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(seconds=20)
 KILLS = 20
 
 
@@ -56,7 +56,7 @@ def test_a_drained_room_makes_place_for_the_one_that_waits(installation: Install
     wait_for(lambda: installation.is_shown("hall"))
 
 
-@pytest.mark.slow(seconds=55)
+@pytest.mark.slow(seconds=120)
 def test_twenty_kills_in_a_row_lose_no_room_and_leave_no_process(
     installation: Installation, capsys: pytest.CaptureFixture[str]
 ) -> None:

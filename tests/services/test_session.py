@@ -122,6 +122,17 @@ def test_bad_frame_is_counted_and_the_next_is_rendered(
     assert session.stats().state == "running"
 
 
+def test_the_first_picture_is_told_in_shaders_until_there_is_one(session: RenderSession) -> None:
+    first, many = session.preparation(12), session.preparation(99)
+    assert first is not None
+    assert many is not None
+    assert (first.state, "12 of some 60" in first.detail) == ("starting", True)
+    assert "99 of some 99" in many.detail
+    feed(session, 1)
+    assert session.step() is not None
+    assert session.preparation(12) is None
+
+
 def test_renderer_that_only_fails_ends_the_process_after_a_while(
     session: RenderSession, renderer: InvertingRenderer
 ) -> None:

@@ -11,7 +11,7 @@ from deltalight.services.storage.store import Store
 from tests.services.killed_writer import CYCLES, KilledWriter
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(seconds=30)
 # Makes a revision some 30 kB, so that the log is moved into the database several times during the test.
 LAMPS = [{"type": "sphere", "position_m": [0, 0, 1 + index / 100]} for index in range(64)]
 

@@ -200,7 +200,9 @@ def test_wrong_addresses_are_one_sentence(cli: RunCli) -> None:
     [
         ("", "a host and a port"),
         (":8890?mode=listener", "takes streamid, passphrase, pbkeylen, latency, each once, not 'mode'"),
+        (f":8890?{'k' * 5000}=1", f"each once, not '{'k' * 40}'"),
         (":8890?latency=1&latency=2", "each once"),
+        (f":8890?latency={'9' * 5000}", "latency of an SRT address is 0 to 30000"),
         (":8890?latency=soon", "latency of an SRT address is 0 to 30000"),
         (":8890?passphrase=short", "passphrase of an SRT address has 10 to 79 bytes"),
         (":8890?pbkeylen=17", "16, 24 or 32"),

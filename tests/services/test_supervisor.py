@@ -13,10 +13,13 @@ import psutil
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services import ports
 from deltalight.services.child import ChildSpec, early_spares
 from deltalight.services.supervisor import Supervisor
 from deltalight.services.warm_spare import PREPARED, SPARE_VARIABLE
+from tests.protocol.raw_peers import PING, RawPeer, multipart
 
+PATIENCE_S = 60.0
 SLEEP_FOREVER = "import time\nwhile True: time.sleep(60)"
 IGNORE_SIGTERM = f"import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n{SLEEP_FOREVER}"
 
@@ -44,6 +47,40 @@ def test_killed_child_is_started_again_and_the_other_left_alone() -> None:
         assert after["b"] == before["b"]
         assert psutil.pid_exists(after["a"])
     assert any("a: died with exit code -9" in line for line in lines)
+
+
+RECEIVER = """
+import sys, time, zmq
+from deltalight.protocol.sockets import attach, open_socket
+
+socket = open_socket(zmq.Context(), zmq.SUB)
+socket.subscribe("")
+attach(socket, sys.argv[1], bind=True)
+while True:
+    time.sleep(0.05)  # its queue is full meanwhile
+    print(socket.recv_multipart()[0].decode(), file=sys.stderr, flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_child_that_libzmq_aborts_receives_again() -> None:
+    """libzmq 4.3.5 aborts at heartbeats among more messages than a queue takes, of a peer that has hung up."""
+    (port,) = ports.private_ports(1)
+    lines: list[str] = []
+    spec = ChildSpec("receiver", ("-c", RECEIVER, ports.endpoint(port)))
+    with Supervisor([spec], forward=lines.append) as supervisor:
+        poll_until(supervisor, lambda: ports.answers(port), PATIENCE_S)
+        peer = RawPeer(port, "PUB").wait_until_ready()
+        peer.send_what_fits((multipart([b"flood", bytes(600)]) + PING) * 4000)
+        poll_until(supervisor, lambda: any(line.endswith("flood") for line in lines), PATIENCE_S)
+        peer.hang_up()
+        poll_until(supervisor, lambda: supervisor.restarts()["receiver"] == 1, PATIENCE_S)
+        poll_until(supervisor, lambda: ports.answers(port), PATIENCE_S)
+        later = RawPeer(port, "PUB").wait_until_ready()
+        later.send_what_fits(multipart([b"after", b""]))
+        poll_until(supervisor, lambda: any(line.endswith("after") for line in lines), PATIENCE_S)
+        later.hang_up()
+    assert any("receiver: died with exit code -6" in line for line in lines)
 
 
 def test_child_that_keeps_dying_is_given_up_with_its_last_line() -> None:

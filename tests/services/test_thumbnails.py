@@ -11,6 +11,7 @@ from deltalight.protocol.radiance_files import write_exr
 from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrdf
 from deltalight.render_server.scene.material_file import write_material
 from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
+from deltalight.render_server.scene.texture_stack import LAYERS, TextureStack
 from deltalight.services.storage.asset_sandbox import run_limited
 from deltalight.services.storage.faults import RejectedAssetError
 from deltalight.services.storage.store import Store
@@ -159,6 +160,17 @@ def test_a_polynomial_texture_map_is_upright_and_keeps_its_shape(tmp_path: Path)
     assert (picture[SIZE // 4 + 1 : 3 * SIZE // 4 - 1, :, 3] == 255).all()
     assert picture[SIZE // 3, SIZE // 2, 2] > 100 > picture[SIZE // 3, SIZE // 2, 0]
     assert picture[2 * SIZE // 3, SIZE // 2, 0] > 100 > picture[2 * SIZE // 3, SIZE // 2, 2]
+
+
+def test_a_texture_stack_is_lit_by_its_layers(tmp_path: Path) -> None:
+    """Under the thumbnails' lights, which are not at the horizon: what its lowest layers show is not seen."""
+    layers = np.zeros((LAYERS, 8, 8, 3), np.float16)
+    layers[:2, ..., 2] = layers[-8:, :4, :, 0] = 0.8  # blue where light grazes, else red above black
+    write_material(tmp_path / "stack", TextureStack(layers))
+    picture = drawn(tmp_path, "stack.dlmat", (tmp_path / "stack").read_bytes())
+    assert (picture[..., 3] == 255).all()
+    assert picture[SIZE // 4, SIZE // 2, 2] > 2 * picture[3 * SIZE // 4, SIZE // 2, 2]
+    assert picture[SIZE // 4, SIZE // 2, 2] > 2 * picture[SIZE // 4, SIZE // 2, 0]
 
 
 def test_a_mesh_that_lies_or_is_none_is_refused(tmp_path: Path) -> None:

@@ -20,10 +20,12 @@ from deltalight.services.api import limits, webrtc, whep
 from deltalight.services.api.webrtc import listen_at
 from deltalight.services.h264 import H264Encoder, rgb_picture
 from tests.services.api_samples import sentence
+from tests.services.camera_samples import SHADES, camera_api
 from tests.services.dashboard_samples import CHROMIUM, chromium
 from tests.services.live_samples import live_socket
 from tests.services.moving_samples import Picture, Running, moving_api, psnr_db
 
+MOST_CODES = 3.0  # of a grey picture's mean from what was sent
 LEAST_PSNR_DB = 35.0  # of a picture from its JPEG; those of the WebSocket agree as much
 PATIENCE_S = 60.0
 SDP = {"Content-Type": "application/sdp"}
@@ -138,6 +140,19 @@ def test_pictures_are_those_of_the_jpegs_from_the_shared_encoder_and_delete_ends
                 assert "no such session" in sentence(client.delete(session), 404)
 
     asyncio.run(watch())
+
+
+def test_each_viewer_gets_the_camera_that_it_names_and_else_the_first(tmp_path: Path) -> None:
+    async def watch(client: httpx.Client) -> None:
+        async with watching(client, "/whep?camera=right") as (right, _), watching(client) as (first, _):
+            for _ in range(5):
+                for player, camera in ((right, "right"), (first, "left")):
+                    shown = (await player.picture()).mean()
+                    assert shown == pytest.approx(SHADES[camera], abs=MOST_CODES)
+
+    with camera_api(tmp_path) as api:
+        wait_until(lambda: len(api.client.get("/state").json()["cameras"]) == len(SHADES))
+        asyncio.run(watch(api.client))
 
 
 def test_who_lost_a_picture_gets_a_keyframe(live: Running) -> None:

@@ -1,5 +1,5 @@
 // World position + depth along the optical axis, normal + material, texture coordinate, vertex colour; with MATERIAL_MAPS
-// what the maps give in place of the last two. CUTOUTS: some materials have alpha. MEASURED: some are polynomials.
+// what the maps give in place of the last two. CUTOUTS: some materials have alpha. MEASURED: some go by the light.
 #include "common/shown_maps.glsl"
 #include "common/camera.glsl"
 #pragma switch CUTOUTS
@@ -19,12 +19,13 @@ in vec2 second_uv;
 #include "common/fragment_maps.glsl"
 #ifdef MEASURED
 #include "common/basis.glsl"
-#include "common/polynomials.glsl"
+#include "common/textures_by_light.glsl"
 
-vec2 place_of_polynomial(int index, vec3 n) {
+// A stack leaves `roughness`, which it has in common with other surfaces.
+vec2 place_on_texture(int index, vec3 n, float roughness) {
     vec3 rightwards, upwards;
     map_axes(slopes_of(materials[index].maps[BASE_COLOR]), rightwards, upwards);
-    return pack_place(uv, n, rightwards, upwards);
+    return vec2(is_stack(index) ? roughness : pack_turn(n, rightwards, upwards), pack_place(uv));
 }
 #endif
 #endif
@@ -53,7 +54,7 @@ void main() {
     n = bent_normal(materials[int(material)].maps[NORMAL], n, normalize(view));
     pack_maps(fragment_maps(int(material), tint), out_uv, out_tint);
 #ifdef MEASURED
-    if (is_polynomial(int(material))) out_uv = place_of_polynomial(int(material), n);
+    if (is_by_light(int(material))) out_uv = place_on_texture(int(material), n, out_uv.x);
 #endif
 #else
     out_uv = uv;

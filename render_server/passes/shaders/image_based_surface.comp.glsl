@@ -11,6 +11,11 @@
 #include "common/shown_maps.glsl"
 #include "common/continuation.glsl"
 #include "common/surface_change.glsl"
+#ifdef MEASURED
+#ifdef MATERIAL_MAPS
+#include "common/texture_response.glsl"
+#endif
+#endif
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(rgba16f) writeonly uniform image2D radiance_out;
@@ -87,11 +92,50 @@ vec3 mirrored_radiance(vec3 n, vec3 v, Material m, float footprint, int count) {
     return lobe_radiance(n, v, m.f0, m.roughness, footprint, count);
 }
 
+#ifdef MEASURED
+#ifdef MATERIAL_MAPS
+const int LIT_FROM = 64;   // directions of equal solid angle over the hemisphere
+
+// Nine harmonics of the radiance that arrives from there, of which irradiance_coefficients have the clamped cosine's bands.
+vec3 radiance_from(vec3 direction) {
+    float basis[HARMONICS];
+    harmonics(direction, basis);
+    vec3 sum = basis[0] * irradiance_coefficients[0] / PI;
+    for (int k = 1; k < 4; ++k) sum += basis[k] * irradiance_coefficients[k] / (2.0 / 3.0 * PI);
+    for (int k = 4; k < 9; ++k) sum += basis[k] * irradiance_coefficients[k] / (0.25 * PI);
+    return sum;
+}
+
+// What a texture by light makes of these harmonics, as the irradiance of a white surface that would show the same.
+vec3 textured_irradiance(Material m, vec3 n) {
+    mat3 basis = basis_around(n);
+    vec3 sum = vec3(0.0);
+    for (int i = 0; i < LIT_FROM; ++i) {
+        float cosine = (float(i) + 0.5) / float(LIT_FROM), level = sqrt(1.0 - cosine * cosine), turn = GOLDEN_ANGLE * float(i);
+        vec3 l = basis * vec3(level * cos(turn), level * sin(turn), cosine);
+        sum += base_response(m, l, cosine) * radiance_from(l);
+    }
+    return max(2.0 * PI * PI / float(LIT_FROM) * sum, vec3(0.0));
+}
+#endif
+#endif
+
 vec3 shaded(ivec2 pixel, ivec2 raster, vec4 position) {
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
     vec3 n = normalize(normal.xyz), v = normalize(camera_position - position.xyz);
     Material m = material_at(raster, int(normal.w), texelFetch(virtual_raster_tint, raster, 0));
     vec4 light = arriving_light(pixel, position, n);
+#ifdef MEASURED
+#ifdef MATERIAL_MAPS
+    if (is_by_light(int(normal.w))) {
+        float size = position.w / camera_pinhole.x;
+        take_texture(m, int(normal.w), imageLoad(virtual_raster_uv, raster).xy, n, size);
+        vec3 passed = clamp(light.rgb / max(irradiance(n), vec3(1e-4)), 0.0, 2.0);   // the objects' own shadow and light
+        light.rgb = passed * textured_irradiance(m, n);
+        m.diffuse = vec3(1.0);
+    }
+#endif
+#endif
     vec3 across = change_along(pixel, ivec2(1, 0), position, normal).normal;
     vec3 down = change_along(pixel, ivec2(0, 1), position, normal).normal;
     float footprint = max(length(across), length(down));   // half of the turn of what is mirrored

@@ -48,8 +48,8 @@ void shade(ivec2 pixel) {
 #ifdef MEASURED
 #ifdef MATERIAL_MAPS
     float size = position.w / camera_pinhole.x;
-    if (is_polynomial(int(normal.w)))
-        take_polynomial(m, int(normal.w), imageLoad(virtual_raster_uv, raster).xy, normal.xyz, size);
+    if (is_by_light(int(normal.w)))
+        take_texture(m, int(normal.w), imageLoad(virtual_raster_uv, raster).xy, normal.xyz, size);
 #endif
 #endif
     vec3 v = normalize(camera_position - position.xyz);

@@ -13,10 +13,11 @@ from deltalight.protocol.message_fields import Name
 from deltalight.sensor_node.cameras.playback import MAX_RATE, MIN_RATE
 from deltalight.services.api.context import JOBS, Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
+from deltalight.services.api.playback_client import Position
 from deltalight.services.api.problems import responses
 from deltalight.services.api.recording_session import RecordingSession
 from deltalight.services.api.recording_store import NAME, Facts, RecordingStore, StoredRecording
-from deltalight.services.api.replay_control import Position, ReplayOrder
+from deltalight.services.api.replay_control import ReplayOrder
 from deltalight.services.api.request_bodies import AS_SENT, UPLOAD_TYPE, checked, require_upload_type
 from deltalight.services.storage.faults import ConflictError
 
@@ -198,9 +199,9 @@ class ReplayChange(StrictModel):
 
 
 class ReplayAnswer(StrictModel):
-    """Where the replay is; all null = the live nodes are shown."""
+    """Where the recording is that is shown; all null = a live camera is shown."""
 
-    recording: str | None
+    recording: str | None = Field(description="Null = what the node sends is shown, be it a recording too.")
     position_s: float | None = None
     duration_s: float | None = None
     playing: bool | None = None
@@ -334,7 +335,7 @@ def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
 @replay_router.get("", responses=responses(503))
 @in_pool("replay")
 def get_replay(shared: Shared) -> ReplayAnswer:
-    """Return which recording is shown and where it is."""
+    """Return which recording is shown and where it is; without one, where the node's own recording is."""
     return replay_answer(shared.replay.position())
 
 
@@ -360,7 +361,7 @@ def change_replay(
     shared: Shared,
     change: Annotated[ReplayChange, AS_SENT, Body(examples=[{"position_s": 4.2, "playing": False}])],
 ) -> ReplayAnswer:
-    """Seek, step from frame to frame, pause, go on, play slower or faster."""
+    """Seek, step from frame to frame, pause, go on, play slower or faster: what `GET /replay` returns."""
     wanted = checked(ReplayChange, change, "the change")
     return replay_answer(shared.replay.change(**dict(wanted)))
 
@@ -373,7 +374,7 @@ def end_replay(shared: Shared) -> None:
 
 
 def replay_answer(position: Position | None) -> ReplayAnswer:
-    """Describe where a replay is; None = live."""
+    """Describe where a recording is that is shown; None = a live camera is."""
     return ReplayAnswer(recording=None) if position is None else ReplayAnswer(**vars(position))
 
 

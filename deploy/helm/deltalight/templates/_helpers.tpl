@@ -94,6 +94,7 @@ securityContext:
 {{- define "deltalight.rayEnv" -}}
 - {name: RAY_AUTH_MODE, value: token}
 - {name: RAY_AUTH_TOKEN_PATH, value: /run/secrets/ray/ray_token}
+- {name: RAY_worker_niceness, value: "0"}
 {{- end }}
 
 {{- define "deltalight.webEnv" -}}

@@ -12,7 +12,7 @@ struct MaterialEntry {
     vec4 base_color;   // rgb linear; metallic
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
-    vec4 flags;        // double-sided; row + 1 of the measured materials, layer + 1 of a polynomial, 0: none
+    vec4 flags;        // double-sided; row + 1 of the measured, layer + 1 of a texture by light, 0: none; layers of a stack
     vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
 #ifdef MATERIAL_MAPS
     vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
@@ -37,6 +37,8 @@ struct Material {
     vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; vec3 passing;
 #ifdef MEASURED
     int measured;   // row, -1: none
+    int layers;     // of a stack, 0: none
+    vec4 stack;     // place on a texture by light; its first layer, mip level
     bool is_polynomial;
     vec3 polynomial[6];   // of the light's direction along the next two
     vec3 rightwards;
@@ -57,8 +59,12 @@ Material mapped(MaterialEntry e, vec3 base, float metallic, float roughness, flo
     m.passing = entering * e.emission.a;
 #ifdef MEASURED
     m.measured = int(e.flags.y) - 1;
+    m.layers = 0;
     m.is_polynomial = false;
-    if (e.flags.z > 0.0) m.occlusion = 1.0;   // its place holds something else (polynomials.glsl)
+    if (e.flags.z > 0.0) {   // their place holds something else (textures_by_light.glsl)
+        m.occlusion = 1.0;
+        m.roughness = e.dielectric.a;
+    }
 #endif
     return m;
 }

@@ -3,7 +3,7 @@
 
 #ifdef MEASURED
 #ifdef MATERIAL_MAPS
-#include "common/polynomial_light.glsl"
+#include "common/texture_response.glsl"
 #endif
 #endif
 
@@ -16,6 +16,7 @@ vec3 response_times_cosine(vec3 n, vec3 v, vec3 l, float cosine, Material m, flo
 #ifdef MEASURED
     if (m.measured >= 0) return measured_times_cosine(m.measured, n, v, l, radius);
 #ifdef MATERIAL_MAPS
+    if (m.layers > 0) return stack_response(m, n, v, l, cosine, radius);
     if (m.is_polynomial) return polynomial_response(m, l);
 #endif
 #endif

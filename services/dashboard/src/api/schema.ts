@@ -39,7 +39,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Upload Asset
-         * @description Upload a mesh, an environment map or a precomputed material as the body of the request; 200 where the same content is there already.
+         * @description Upload a mesh, map or precomputed material as the body of the request; 200 where the content is there already.
          *
          *     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
          *     A .zip of one glTF and its files is kept as one .glb.
@@ -617,7 +617,7 @@ export interface paths {
         };
         /**
          * Get Replay
-         * @description Return which recording is shown and where it is.
+         * @description Return which recording is shown and where it is; without one, where the node's own recording is.
          */
         readonly get: operations["get_replay"];
         /**
@@ -635,7 +635,7 @@ export interface paths {
         readonly head?: never;
         /**
          * Change Replay
-         * @description Seek, step from frame to frame, pause, go on, play slower or faster.
+         * @description Seek, step from frame to frame, pause, go on, play slower or faster: what `GET /replay` returns.
          */
         readonly patch: operations["change_replay"];
         readonly trace?: never;
@@ -1573,7 +1573,7 @@ export interface components {
             readonly asset: string;
             /**
              * Facts
-             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, polynomial_texture), base_color, and lobes and roughness, or width and height in texels.
+             * @description Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the clips that it can play (name, duration_s). Map: width and height, pixels. Material: model (measured_brdf, polynomial_texture, texture_stack), base_color, and lobes and roughness, or width and height in texels.
              * @example {
              *       "maximum": [
              *         0.1,
@@ -3401,7 +3401,7 @@ export interface components {
         };
         /**
          * ReplayAnswer
-         * @description Where the replay is; all null = the live nodes are shown.
+         * @description Where the recording is that is shown; all null = a live camera is shown.
          */
         readonly ReplayAnswer: {
             /** Duration S */
@@ -3414,7 +3414,10 @@ export interface components {
             readonly position_s?: number | null;
             /** Rate */
             readonly rate?: number | null;
-            /** Recording */
+            /**
+             * Recording
+             * @description Null = what the node sends is shown, be it a recording too.
+             */
             readonly recording: string | null;
         };
         /**

@@ -26,7 +26,7 @@ export const isDrawerOpen = kept("drawer", false);
 export const drawerTab = kept<DrawerTab>("drawer-tab", "performance");
 export const isGuideDismissed = kept("guide-dismissed", false);
 
-export type GuideStep = "drag" | "drop" | "light" | "compare";
+export type GuideStep = "drag" | "drop" | "light" | "camera" | "compare";
 /** What of the guide was tried. */
 export const tried = kept<readonly GuideStep[]>("guide-tried", []);
 

@@ -5,7 +5,7 @@ import type { Recording, Replay, ReplayChange, Snapshot, Video, WantedPicture } 
 import { uploadRecording } from "../api/upload";
 import { frame } from "../live/picture";
 import { sendShown } from "./assets";
-import { openDrawer, recordsRelit } from "./preferences";
+import { noteTried, openDrawer, recordsRelit } from "./preferences";
 import { announce, attempt, toast } from "./toasts";
 
 const VIDEO_POLL_MS = 300;
@@ -14,6 +14,8 @@ export const recordings = signal<readonly Recording[]>([]);
 /** Share of each video that is being made, by recording. */
 export const videos = signal<ReadonlyMap<string, number>>(new Map());
 export const replay = signal<Replay | null>(null);
+/** Whether a recording is shown, which can be moved along. */
+export const isMovable = computed(() => replay.value?.position_s != null);
 export const snapshots = signal<readonly Snapshot[]>([]);
 export const isTakingSnapshot = signal(false);
 
@@ -105,11 +107,17 @@ export async function changeReplay(body: ReplayChange): Promise<void> {
   if (shown) replay.value = shown;
 }
 
+export function play(playing: boolean): Promise<void> {
+  noteTried("camera");
+  return changeReplay({ playing });
+}
+
 let wanted: { readonly position_s?: number; readonly step_frames?: number } | null = null;
 let isSeeking = false;
 
 /** Pause at a position; of those that come while one is being sought, only the newest counts. */
 export function scrub(position_s: number): void {
+  noteTried("camera");
   wanted = { position_s };
   if (replay.value) replay.value = { ...replay.value, position_s, playing: false };
   if (!isSeeking) void seekNewest();
@@ -117,6 +125,7 @@ export function scrub(position_s: number): void {
 
 /** Pause so many frames further on, or back. */
 export function step(frames: number): void {
+  noteTried("camera");
   wanted = { ...wanted, step_frames: (wanted?.step_frames ?? 0) + frames };
   if (!isSeeking) void seekNewest();
 }

@@ -3,6 +3,7 @@ import type { ComponentChildren } from "preact";
 import { isGuideDismissed, openDrawer, tried, type GuideStep } from "../../state/preferences";
 import { objects } from "../../state/scene";
 import { inspectorTab, selectedObjectId, selectObject } from "../../state/selection";
+import { isMovable } from "../../state/takes";
 import { IconButton } from "../ui/IconButton";
 
 interface StepProps {
@@ -49,6 +50,12 @@ export function Guide() {
           </button>
           <span>Colour, strength and position of each light. Or drag a shadow: its light follows.</span>
         </Step>
+        {isMovable.value && (
+          <Step of="camera">
+            <b>Move the camera</b>
+            <span>Drag the slider below the picture, or press Play.</span>
+          </Step>
+        )}
         <Step of="compare">
           <button type="button" onClick={() => openDrawer("compare")}>
             Compare methods

@@ -1,7 +1,7 @@
 import { lateMs, retryPicture } from "../../live/picture";
 import { changeMs, isSending, liveState } from "../../state/liveState";
 import { hasPoster } from "../../state/begin";
-import { hasFisheye, renderServer } from "../../state/processes";
+import { hasFisheye, processes, renderServer, renderServerName } from "../../state/processes";
 import { isSceneRead, lights, scene } from "../../state/scene";
 import { isTakingSnapshot } from "../../state/takes";
 import { Button } from "../ui/Button";
@@ -56,7 +56,9 @@ function isWorking(): boolean {
 
 function waitingText(): string {
   if (renderServer.value === null) return "Asking the server what is running.";
-  return isSending() ? PREPARING : NOTHING_SENDS;
+  if (!isSending()) return NOTHING_SENDS;
+  const { state, detail } = processes.value.get(renderServerName.value)?.report ?? {};
+  return state === "starting" && detail ? detail : PREPARING;
 }
 
 function workText(): string {

@@ -1,0 +1,45 @@
+"""Work on all cores: NumPy and OpenCV let other threads run while they compute."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from typing import TypeVar
+
+Result = TypeVar("Result")
+
+# Of a picture: few enough to stay in a core's cache, so many that threads seldom wait for each other.
+BAND_ROWS = 120
+
+
+def begun(call: Callable[[], Result]) -> "Future[Result]":
+    """Begins a call on another thread."""
+    return _threads().submit(call)
+
+
+def by_bands(work: Callable[[slice], None], rows: int) -> None:
+    """Calls `work` with each band of a picture's rows, on this thread and on others that are free.
+
+    Raises:
+        Exception: what `work` raises.
+    """
+    bands = iter([slice(first, min(first + BAND_ROWS, rows)) for first in range(0, rows, BAND_ROWS)])
+
+    def work_on() -> None:
+        for band in bands:
+            work(band)
+
+    helpers = [begun(work_on) for _ in range(_cores() - 1)]
+    work_on()
+    for each in helpers:
+        if not each.cancel():
+            each.result()
+
+
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_cores(), "scene")

@@ -1,0 +1,90 @@
+"""Work on all cores gives what one core gives, and the real scene is meshed coarsely only where that is asked for."""
+
+import numpy as np
+import pytest
+
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.scene_objects import RealScene
+from deltalight.render_server import real_geometry
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.real_geometry import COARSE_DIVISOR, RealGeometry
+from deltalight.render_server.scene import threads
+from deltalight.render_server.scene.depth_surface import depth_surface
+from deltalight.render_server.scene.threads import BAND_ROWS, by_bands
+from deltalight.render_server.view import CameraView, PosedFrame
+from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at
+
+BUDGET = 2000
+
+
+@pytest.mark.parametrize("rows", [0, 1, BAND_ROWS, 5 * BAND_ROWS + 3])
+def test_each_row_is_in_one_band(rows: int) -> None:
+    seen = np.zeros(rows, int)
+
+    def note(band: slice) -> None:
+        seen[band] += 1
+
+    by_bands(note, rows)
+    assert (seen == 1).all()
+
+
+def test_bands_within_bands_do_not_wait_for_each_other() -> None:
+    seen = np.zeros((4 * BAND_ROWS, 3 * BAND_ROWS), int)
+
+    def note(band: slice) -> None:
+        def note_columns(columns: slice) -> None:
+            seen[band, columns] += 1
+
+        by_bands(note_columns, seen.shape[1])
+
+    by_bands(note, len(seen))
+    assert (seen == 1).all()
+
+
+def test_what_a_band_raises_is_raised() -> None:
+    def fail(band: slice) -> None:
+        raise ValueError(str(band.start))
+
+    with pytest.raises(ValueError, match="0"):
+        by_bands(fail, BAND_ROWS)
+
+
+def test_normals_do_not_depend_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = CameraModel(160, 120, np.array([[150.0, 0, 80], [0, 150.0, 60], [0, 0, 1]]))
+    rng = np.random.default_rng(3)
+    depth_m = rng.normal(0.8, 0.004, (120, 160)).astype(np.float32)
+    depth_m[40:80, 50:90] -= 0.3
+    depth = DepthImage(depth_m, rng.random(depth_m.shape) > 0.05, camera, 0.003)
+    found = []
+    for rows in (len(depth_m), 7):
+        monkeypatch.setattr(threads, "BAND_ROWS", rows)
+        found.append(depth_surface(depth, camera))
+    assert np.isfinite(found[0].gradient).any()
+    assert np.array_equal(found[0].gradient, found[1].gradient, equal_nan=True)
+    assert np.array_equal(found[0].normals, found[1].normals)
+
+
+def test_the_coarse_mesh_is_made_once_and_when_asked_for(
+    gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    budgets: list[int] = []
+    mesh_depth = real_geometry.depth_mesh
+
+    def counted(*given: object, **named: object) -> object:
+        budgets.append(given[3])  # type: ignore[arg-type]
+        return mesh_depth(*given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(real_geometry, "depth_mesh", counted)
+    pose = look_at((0.25, -0.9, 0.65))
+    seen = frame(checkered(), pose=pose, depth=depth_image(floor_depth(pose)))
+    real = RealGeometry(gpu, RealScene(), BUDGET)
+    assert seen.pose is not None
+    assert real.update([PosedFrame(seen, CameraView(seen.camera, seen.pose.world_from_camera))])
+    assert real.state is not None
+    assert budgets == [BUDGET]
+    coarse = real.state.coarse_corners
+    assert budgets == [BUDGET, BUDGET // COARSE_DIVISOR]
+    assert real.state.coarse_corners is coarse
+    assert 0 < len(coarse) < len(real.state.corners)
+    real.release()
