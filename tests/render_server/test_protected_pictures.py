@@ -7,10 +7,12 @@ sheets (goldens/protected_*.png; a column a kind of scene, a row a kind of geome
 are committed.
 """
 
+import fcntl
 import hashlib
 import json
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -80,34 +82,60 @@ def kernels(trace: list[list[str]]) -> list[list[str]]:
     return [[line.split(" ")[0] for line in part] for part in trace]
 
 
+def recorded(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text())) if path.exists() else {}
+
+
+@contextmanager
+def folder_held() -> Iterator[None]:
+    """Other processes that record wait."""
+    folder = os.open(FOLDER, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
+
+
 class Recording:
     """What was recorded, and what this run adds when it records anew."""
 
     def __init__(self) -> None:
-        self.old: dict[str, Any] = json.loads(RECORD.read_text()) if RECORD.exists() else {}
-        self.new: dict[str, list[str]] = {}
-        self.counts: dict[str, list[int]] = json.loads(TRACE.read_text())["counts"] if TRACE.exists() else {}
-        self.traces: dict[str, list[list[str]]] = (
-            json.loads(TRACE.read_text())["traces"] if TRACE.exists() else {}
-        )
-        self.sheets: dict[str, np.ndarray] = {}
+        self.old, trace = recorded(RECORD), recorded(TRACE)
+        self.counts: dict[str, list[int]] = trace.get("counts", {})
+        self.traces: dict[str, list[list[str]]] = trace.get("traces", {})
+        self.pictures: dict[Case, list[np.ndarray]] = {}
+        self.made: dict[Case, list[list[str]]] = {}
 
     def add(self, case: Case, pictures: list[np.ndarray], trace: list[list[str]]) -> None:
-        self.new[str(case)] = [digest(picture) for picture in pictures]
-        self.counts[str(case)] = [len(part) for part in trace]
-        if case.kind == "plain" and case.geometry != "fused":
-            self.traces[str(case)] = trace[:2]
-        size = len(GEOMETRIES) * PICTURE["height"], len(KINDS) * PICTURE["width"], 3
-        sheet = self.sheets.setdefault(case.method, np.zeros(size, np.uint8))
-        sheet[tile(case)] = pictures[SHOWN]
+        self.pictures[case], self.made[case] = pictures, trace
 
     def store(self, gpu: GpuContext) -> None:
-        record = {"made_with": made_with(gpu), "pictures": {**self.old.get("pictures", {}), **self.new}}
-        RECORD.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n")
-        traces = {"counts": self.counts, "traces": self.traces}
-        TRACE.write_text(json.dumps(traces, indent=0, sort_keys=True) + "\n")
-        for method, sheet in self.sheets.items():
-            Image.fromarray(sheet).save(sheet_path(method), optimize=True)
+        """Adds to what is recorded by now; a run records some cases, or its workers each a part of them."""
+        with folder_held():
+            digests = {str(case): list(map(digest, shown)) for case, shown in self.pictures.items()}
+            pictures = {**recorded(RECORD).get("pictures", {}), **digests}
+            record = {"made_with": made_with(gpu), "pictures": pictures}
+            RECORD.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n")
+            self._store_traces()
+            for method in {case.method for case in self.pictures}:
+                self._store_sheet(method)
+
+    def _store_traces(self) -> None:
+        old, plain = recorded(TRACE), [c for c in self.made if c.kind == "plain" and c.geometry != "fused"]
+        counts = {str(case): [len(part) for part in trace] for case, trace in self.made.items()}
+        traces = {str(case): self.made[case][:2] for case in plain}
+        new = {"counts": old.get("counts", {}) | counts, "traces": old.get("traces", {}) | traces}
+        TRACE.write_text(json.dumps(new, indent=0, sort_keys=True) + "\n")
+
+    def _store_sheet(self, method: str) -> None:
+        path = sheet_path(method)
+        size = len(GEOMETRIES) * PICTURE["height"], len(KINDS) * PICTURE["width"], 3
+        sheet = np.array(Image.open(path).convert("RGB")) if path.exists() else np.zeros(size, np.uint8)
+        for case, pictures in self.pictures.items():
+            if case.method == method:
+                sheet[tile(case)] = pictures[SHOWN]
+        Image.fromarray(sheet).save(path, optimize=True)
 
 
 @pytest.fixture(scope="module")
