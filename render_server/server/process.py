@@ -277,6 +277,7 @@ def serve(
             epoch=settings.epoch,
             renderer_name=renderer_name,
             keep_scene=lambda kept: _keep(settings.session, kept),
+            endpoints=len(source.endpoints),
             use_source=use_source,
             count_objects=count_objects,
             mailbox_drops=drops,
