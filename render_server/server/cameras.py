@@ -151,10 +151,10 @@ class RoomCameras:
         return tuple(place.remark for place in self._places.values() if place.remark)
 
     def take(self, now_ns: int) -> tuple[Taken, ...]:
-        """Returns the newest frame of each camera that counts, if any of them is new, else none. Silent ones are last.
+        """Returns the newest frame of each camera that counts, if any of them is new, else none.
 
-        A new frame waits for those of other cameras that are due, for `together_ms` at most; after a pause of all
-        of them, for those of all nodes: what the GPU holds depends on how many cameras there are.
+        Silent ones come last. A new frame waits for those of other cameras that are due, for `together_ms` at most;
+        after a pause of all of them, for those of all nodes: what the GPU holds depends on how many cameras there are.
         """
         self._gathers |= self._are_paused(now_ns)
         for name, assembler in list(self._assemblers.items()):
