@@ -154,7 +154,7 @@ class RoomCameras:
         """Returns the newest frame of each camera that counts, if any of them is new, else none.
 
         Silent ones come last. A new frame waits for those of other cameras that are due, for `together_ms` at most;
-        after a pause of all of them, for those of all nodes: what the GPU holds depends on how many cameras there are.
+        after a pause of all of them, for those of all nodes: the GPU holds what so many cameras need.
         """
         self._gathers |= self._are_paused(now_ns)
         for name, assembler in list(self._assemblers.items()):
