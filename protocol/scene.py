@@ -121,7 +121,7 @@ def resolve_asset(asset: str, folder: Path) -> str:
     try:
         return str((folder / asset).resolve())
     except (ValueError, OSError, RuntimeError) as error:  # a null byte; a link to itself
-        raise DeltalightError(f"{asset!r:.200} is no name of a file ({error}); correct the path.") from error
+        raise DeltalightError(f"{asset!r:.200} is not a file name ({error}); correct the path.") from error
 
 
 def scene_json_schema() -> dict[str, Any]:

@@ -72,7 +72,7 @@ class NodeConfig(StrictModel):
         default=None, description="Control endpoint of the server whose clock to follow; null = none."
     )
     announce: bool = Field(
-        default=True, description="Announce the node on the network, if its endpoint leaves this host."
+        default=True, description="Announce the node on the network, if other hosts can reach its endpoint."
     )
     realtime: bool = Field(default=True, description="Obey the recorded times; else as fast as possible.")
     loop: bool = Field(default=True, description="Begin again at the end of the source.")

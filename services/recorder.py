@@ -149,7 +149,7 @@ class Recorder:
             raise self._explained(error) from error
         except OSError as error:
             raise DeltalightError(
-                f"The recording ended because {error.filename} is not there any more ({error.strerror});"
+                f"The recording ended because {error.filename} no longer exists ({error.strerror});"
                 " start it again."
             ) from error
         return self.status

@@ -128,8 +128,8 @@ class GpuContext:
         error = self.ctx.error
         if error == OUT_OF_MEMORY:
             raise GpuMemoryError(
-                "The GPU's memory is full, so nothing is rendered: end other programs that use it, or lower the size "
-                "of output, method.volume_size or method.memory_budget_mb."
+                "The GPU's memory is full, so nothing is rendered: stop other programs that use it, or lower the"
+                " size of output, method.volume_size or method.memory_budget_mb."
             )
         if error != NO_ERROR:
             self.errors[error] += 1

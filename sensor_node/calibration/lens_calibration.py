@@ -158,8 +158,8 @@ def require_good(result: LensResult) -> None:
     if not fit.focal_fraction <= MOST_FOCAL_FRACTION:
         raise DeltalightError(
             f"the views leave the focal length uncertain by {100 * fit.focal_fraction:.1f} % (at most "
-            f"{100 * MOST_FOCAL_FRACTION:.0f} % will do); take more views, with the target larger in the picture and "
-            "tilted by 20 to 45 degrees to the left, right, front and back."
+            f"{100 * MOST_FOCAL_FRACTION:.0f} % is acceptable); take more views, with the target larger in the"
+            " picture and tilted by 20 to 45 degrees to the left, right, front and back."
         )
     if not fit.rms_px <= MOST_RMS_FRACTION * width:
         raise DeltalightError(

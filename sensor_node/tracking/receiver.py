@@ -92,8 +92,8 @@ class TrackingReceiver:
             self._socket = _opened(self._settings)
         except OSError as fault:
             raise DeltalightError(
-                f"Tracking data cannot be received at UDP port {self._settings.port} ({fault.strerror}); end the"
-                " other program there or set another port or address in [node.tracking]."
+                f"Tracking data cannot be received at UDP port {self._settings.port} ({fault.strerror}); stop the"
+                " other program there, or set another port or address in [node.tracking]."
             ) from fault
         self._thread.start()
         return self

@@ -124,7 +124,7 @@ class AuthMiddleware:
             raise ProblemError(
                 403,
                 "origin",
-                "Pages of other sites are refused; open the page from this service's own address.",
+                "Requests from other sites are refused; open the page from this service's own address.",
             )
 
     def _check_rate(self, scope: Scope) -> None:
@@ -229,13 +229,13 @@ def _read_only_role(principal: Principal) -> ProblemError:
     return ProblemError(
         403,
         "role",
-        f"The token `{principal.name}` may only look; use one of role control to change something.",
+        f"The token `{principal.name}` is read-only; use one with role control to make changes.",
     )
 
 
 def _unknown_token(was_given: bool) -> ProblemError:
     sentence = (
-        "The token or ticket is not known; make a token with `deltalight api token NAME`."
+        "The token or ticket is unknown; make a token with `deltalight api token NAME`."
         if was_given
         else "A token is needed; send it as `Authorization: Bearer TOKEN`."
     )

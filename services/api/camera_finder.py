@@ -61,9 +61,9 @@ class CameraFinder:
         try:
             return search.result(TIMEOUT_S)
         except (FutureTimeoutError, subprocess.TimeoutExpired):
-            raise _failed("Looking for cameras takes too long; unplug what hangs") from None
+            raise _failed("Looking for cameras takes too long; unplug the device that hangs") from None
         except (OSError, subprocess.CalledProcessError, ValidationError):
-            raise _failed("Looking for cameras ended without an answer; look into the log") from None
+            raise _failed("Looking for cameras ended without an answer; check the log") from None
 
 
 def _find(search: "Future[CamerasAnswer]") -> None:

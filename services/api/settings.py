@@ -15,7 +15,7 @@ class ApiSettings(StrictModel):
 
     host: str = Field(
         default=LOOPBACK,
-        description="Address to listen on; one that leaves this host (0.0.0.0 for all) needs tokens.",
+        description="Address to listen on; one that other hosts can reach (0.0.0.0 for all) needs tokens.",
     )
     port: int = Field(default=PAGE_PORT, ge=1, le=65535, description="Port to listen on.")
     data: Path | None = Field(

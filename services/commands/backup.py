@@ -39,7 +39,7 @@ def restore(
     config_file: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Put scenes, tokens and assets of a backup in place; end the service first.
+    """Put scenes, tokens and assets of a backup in place; stop the service first.
 
     What was there before is moved aside within the data folder, never deleted. Recordings and snapshots stay.
     """

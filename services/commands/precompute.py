@@ -34,8 +34,8 @@ def precompute(
         _precompute_material(source, out)
     elif out is not None:
         raise DeltalightError(
-            f"{source} is taken for a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the folder "
-            "of a texture by the light; leave it out."
+            f"{source} is treated as a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the"
+            " folder of a texture by the light; leave it out."
         )
     else:
         _precompute_scene(source)

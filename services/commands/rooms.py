@@ -83,7 +83,7 @@ def claim(
     ],
     *,
     frames_per_s: Annotated[
-        float, typer.Option(min=0.1, max=240, help="Frames a second that each room shall reach.")
+        float, typer.Option(min=0.1, max=240, help="Frame rate that each room should reach.")
     ] = 30.0,
 ) -> None:
     """Print what this host offers to a cluster, by the figures of a room: the options of `ray start`."""

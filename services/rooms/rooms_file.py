@@ -90,7 +90,7 @@ class RoomsFile(StrictModel):
         description="report.json of `deltalight gpu-check --steps memory,speed` on a device like those of the slots.",
     )
     frames_per_s: Annotated[float, Field(gt=0, le=240)] = Field(
-        default=30.0, description="What each room shall reach, for `slots: auto`."
+        default=30.0, description="What each room should reach, for `slots: auto`."
     )
     nodes: dict[Name, NodeEntry] = Field(min_length=1, max_length=MAX_ROOMS)
     rooms: dict[Name, RoomEntry] = Field(min_length=1, max_length=MAX_ROOMS)
@@ -173,6 +173,6 @@ def _with_scene(name: str, room: RoomEntry, folder: Path) -> RoomEntry:
     scene = folder / room.scene
     if not scene.is_file():
         raise DeltalightError(
-            f"the scene {scene} of the room {name} is not there; name a scene document that is."
+            f"the scene {scene} of the room {name} does not exist; name a scene document that does."
         )
     return room.replaced(scene=scene)

@@ -44,7 +44,7 @@ def test_keys_are_never_written_over(tmp_path: Path) -> None:
     with pytest.raises(DeltalightError, match="has keys called `desk`"):
         create_keys("desk", tmp_path)
     assert secret.read_bytes() == before
-    with pytest.raises(DeltalightError, match="is no name"):
+    with pytest.raises(DeltalightError, match="is not a valid name"):
         create_keys("../desk", tmp_path)
 
 
@@ -64,7 +64,7 @@ def test_trusting_keeps_a_public_key_and_refuses_a_secret_one(tmp_path: Path) ->
     assert list(trusted_keys(here)) == ["desk", "desk2"]
     (here / "trusted" / "torn.key").write_text("no key")
     assert list(trusted_keys(here)) == ["desk", "desk2"]
-    with pytest.raises(DeltalightError, match="is no key file"):
+    with pytest.raises(DeltalightError, match="is not a key file"):
         trust(here / "trusted" / "torn.key", there)
 
 

@@ -88,7 +88,7 @@ def test_a_picture_without_exposure_is_a_sentence(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(DeltalightError, match=r"a\.png tells no exposure"):
         read_bracket(tmp_path, "rgb")
-    with pytest.raises(DeltalightError, match="is no folder"):
+    with pytest.raises(DeltalightError, match="is not a folder"):
         read_bracket(tmp_path / "nowhere", "rgb")
 
 

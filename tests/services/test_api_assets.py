@@ -213,7 +213,7 @@ def test_an_asset_in_use_is_not_deleted(api: RunningApi) -> None:
         (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 30000 +X 60000\n" + bytes(100), "bomb.hdr", "bomb.hdr"),
         (b"deltalight material 1 0000\nPK", "paint.dlmat", "paint.dlmat is damaged or cut short"),
         (b"deltalight material 9 0000\nPK", "paint.dlmat", "version 9, and this release reads version 1"),
-        (b"deltalight material \xff\xfe\n", "paint.dlmat", "paint.dlmat is no precomputed material"),
+        (b"deltalight material \xff\xfe\n", "paint.dlmat", "paint.dlmat is not a precomputed material"),
         (sealed(b"PK\x03\x04"), "paint.dlmat", "holds no material that can be drawn"),
         (b"deltalight material 1 0\n", "chair.glb", "is a DLMAT file and not GLB"),
         (b"", "empty.glb", "no file of a known format"),

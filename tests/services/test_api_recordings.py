@@ -249,7 +249,7 @@ def test_a_killed_recorder_leaves_a_recording_that_is_mended(api: RunningApi, cl
     assert mended.status_code == 200, mended.text
     assert (mended.json()["state"], mended.json()["frames"]) == ("finished", listed["frames"])
     assert not list((api.store.folder / "recordings").glob("torn*.active"))
-    assert "nothing to mend" in sentence(client.post("/recordings/torn/recover"), 409)
+    assert "nothing to recover" in sentence(client.post("/recordings/torn/recover"), 409)
 
 
 def test_a_service_that_ends_finishes_what_grows(tmp_path: Path) -> None:

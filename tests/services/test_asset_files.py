@@ -130,7 +130,7 @@ def test_a_store_that_refuses_is_a_sentence_and_nothing_is_half_stored(tmp_path:
 
 
 def test_wrong_addresses_are_sentences(tmp_path: Path) -> None:
-    with pytest.raises(DeltalightError, match="is no address of a store of assets"):
+    with pytest.raises(DeltalightError, match="is not the address of an asset store"):
         Store(tmp_path, assets="carrier-pigeon://loft")
 
 

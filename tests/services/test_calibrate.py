@@ -84,7 +84,7 @@ def test_json_has_the_figures_and_older_results_stay(shots: Path, tmp_path: Path
     assert report["views"] == len(report["per_view"])
     assert report["rms_px"] < 0.2
     before = (tmp_path / "calibration" / "rgb.yaml").read_bytes()
-    assert "write over it with --force" in sentence(calibrate(*arguments))
+    assert "overwrite it with --force" in sentence(calibrate(*arguments))
     assert (tmp_path / "calibration" / "rgb.yaml").read_bytes() == before
     assert calibrate(*arguments, "--force").exit_code == 0
 

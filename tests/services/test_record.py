@@ -332,7 +332,7 @@ def test_a_file_that_somebody_removes_is_a_sentence(tmp_path: Path) -> None:
     ):
         wait_for((tmp_path / "a.mcap.active").exists)
         (tmp_path / "a.mcap.active").unlink()
-        with pytest.raises(DeltalightError, match=r"a\.mcap\.active is not there any more") as caught:
+        with pytest.raises(DeltalightError, match=r"a\.mcap\.active no longer exists") as caught:
             end.result(PATIENCE_S)
     assert "\n" not in str(caught.value)
 

@@ -267,7 +267,7 @@ def test_tokens_and_tickets_let_in_and_revoking_ends(
         let_in = client.post(f"/whep?ticket={ticket}", content=offer, headers=SDP)
         assert let_in.status_code == 201
         again = client.post(f"/whep?ticket={ticket}", content=offer, headers=SDP)
-        assert "not known" in sentence(again, 401)
+        assert "is unknown" in sentence(again, 401)
         session = let_in.headers["location"].removeprefix("/api/v1")
         assert "token is needed" in sentence(client.delete(session), 401)
 
