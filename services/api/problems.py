@@ -143,7 +143,7 @@ class Problems:
         @app.exception_handler(OSError)
         async def _disk(_request: Request, fault: OSError) -> JSONResponse:
             log.error("the data folder cannot be used", fault=str(fault))
-            sentence = f"The data folder cannot be used ({fault.strerror}); free some space, or check its permissions."
+            sentence = f"The data folder cannot be used ({fault.strerror}); free some space or check its permissions."
             return self.response(503, "storage-fault", sentence)
 
         @app.exception_handler(Exception)

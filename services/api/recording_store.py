@@ -98,7 +98,7 @@ class RecordingStore:
         """
         if not NAME.fullmatch(name):
             raise DeltalightError(
-                f"{name!r:.80} is not a valid name for a recording; use up to 64 letters, digits, dashes and underscores."
+                f"{name!r:.80} is not a valid recording name; use up to 64 letters, digits, dashes and underscores."
             )
         path = self.folder / (name + SUFFIX)
         if path.exists() or path.with_name(path.name + ACTIVE_SUFFIX).exists():
