@@ -84,13 +84,13 @@ class KeySettings(StrictModel):
 
     name: str | None = Field(
         default=None,
-        description="Own key pair (`deltalight keys create NAME`); null = the only one there is.",
+        description="This host's key pair (`deltalight keys create NAME`); null = the only one there is.",
     )
     folder: Path | None = Field(
         default=None, description="Folder of the keys; null = `keys` in the user's configuration folder."
     )
     on_loopback: bool = Field(
-        default=False, description="Use keys also between processes of this host, and at the end of a tunnel."
+        default=False, description="Also use keys between processes of this host, and at the end of a tunnel."
     )
 
     def load(self, endpoints: Iterable[str]) -> Keys | None:

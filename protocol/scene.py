@@ -28,7 +28,7 @@ class SceneDocument(StrictModel):
     """
 
     name: str = Field(default="", max_length=200, description="Title for people.")
-    revision: int = Field(default=0, ge=0, description="Counts up with every change.")
+    revision: int = Field(default=0, ge=0, description="Increases with every change.")
     real: RealScene = Field(default_factory=RealScene)
     objects: tuple[SceneObject, ...] = Field(
         default=(), max_length=1024, fail_fast=True, description="Virtual objects."

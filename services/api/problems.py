@@ -53,16 +53,14 @@ _ADVICE = {
 class Problem(BaseModel):
     """What is wrong and what to do."""
 
-    type: str = Field(
-        description="Kind of the problem, for programs.", examples=[TYPE_PREFIX + "stale-revision"]
-    )
+    type: str = Field(description="Kind of problem, for programs.", examples=[TYPE_PREFIX + "stale-revision"])
     title: str = Field(description="The status in words.", examples=["Conflict"])
     status: int = Field(description="The HTTP status.", examples=[409])
     detail: str = Field(
-        description="One sentence for people.",
+        description="One sentence for the user.",
         examples=["the scene is at revision 7 and the change was made to 5; get it and change it again."],
     )
-    revision: int | None = Field(default=None, description="With stale-revision: the newest revision.")
+    revision: int | None = Field(default=None, description="The newest revision; only with `stale-revision`.")
 
 
 class ProblemError(HTTPException):

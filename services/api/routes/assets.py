@@ -29,7 +29,7 @@ PNG: dict[int | str, dict[str, Any]] = {
 }
 _KNOWN = ", ".join(each.name.upper() for each in FORMATS)
 KEPT_ANSWERS: dict[int | str, dict[str, Any]] = {
-    200: {"model": AssetAnswer, "description": "The same content was there already."}
+    200: {"model": AssetAnswer, "description": "The same content already exists."}
 }
 _UPLOAD_ANSWERS = {**KEPT_ANSWERS, **responses(400, 413, 415, 422)}
 _UPLOAD_BODY = {

@@ -29,9 +29,11 @@ RecordingId = Annotated[
     str,
     Path(pattern=f"^{NAME.pattern}$", description="The recording's name.", examples=["take-20261121-101500"]),
 ]
-Rate = Annotated[float, Field(ge=MIN_RATE, le=MAX_RATE, description="Recorded seconds a second.")]
+Rate = Annotated[
+    float, Field(ge=MIN_RATE, le=MAX_RATE, description="Playback speed: recorded seconds per second.")
+]
 MOST_STEPS = 1_000_000
-Seconds = Annotated[float, Field(ge=0, le=1e6, description="From the recording's first frame.")]
+Seconds = Annotated[float, Field(ge=0, le=1e6, description="Position from the recording's first frame.")]
 POSTER_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}
 }
@@ -51,16 +53,18 @@ class NewRecording(StrictModel):
     """What to record; every key has a default."""
 
     name: str | None = Field(
-        default=None, max_length=64, description="Letters, digits, dashes, underscores; null = the time."
+        default=None,
+        max_length=64,
+        description="Letters, digits, dashes and underscores; null = the current time.",
     )
     duration_s: float | None = Field(
-        default=None, ge=0.1, le=86_400, description="Ends so long after the first frame; null = by stop."
+        default=None, ge=0.1, le=86_400, description="Duration from the first frame; null = until stopped."
     )
     node: Name | None = Field(
-        default=None, description="Which node; null = the one whose picture comes first."
+        default=None, description="Node to record; null = the first one to send a picture."
     )
     composites: StrictBool = Field(
-        default=False, description="Keep the relit pictures too, beside the frames, for `video.mp4`."
+        default=False, description="Also keep the relit pictures, for `video.mp4`."
     )
 
 
@@ -76,7 +80,7 @@ class Check(StrictModel):
 
     what: Literal["depth", "pose", "light"]
     is_there: bool
-    text: str = Field(description="What there is, or what to do without.")
+    text: str = Field(description="What is available, or what to do if it is not.")
 
 
 def _checklist(facts: Facts) -> list[Check]:
@@ -112,22 +116,22 @@ def _checklist(facts: Facts) -> list[Check]:
 class RecordingAnswer(StrictModel):
     """A recording, finished or growing."""
 
-    id: str = Field(description="Its name, also in addresses.", examples=["take-20261121-101500"])
+    id: str = Field(description="Its name, also in URLs.", examples=["take-20261121-101500"])
     state: Literal["waiting", "recording", "finished", "interrupted"] = Field(
-        description="`waiting` = no frame has come yet; `interrupted` = its recorder was killed: recover it."
+        description="`waiting` = no frame has arrived yet; `interrupted` = its recorder was killed: recover it."
     )
-    detail: str = Field(description="What keeps it from growing, or from being read; else empty.")
-    changed: datetime = Field(description="When it was finished; while it grows: when it was begun.")
+    detail: str = Field(description="Why it cannot grow or be read; else empty.")
+    changed: datetime = Field(description="When it was finished; while recording, when it was started.")
     size_bytes: int
     duration_s: float | None
     frames: int | None
     frames_per_s: float | None
-    composites: int = Field(description="Relit pictures that were recorded along.")
-    lost: dict[str, int] = Field(description="What never came, by stream; known while it grows.")
+    composites: int = Field(description="Number of relit pictures in it.")
+    lost: dict[str, int] = Field(description="Missing messages, by stream; known while recording.")
     streams: dict[str, Stream]
-    scene: str | None = Field(description="Title of the attached scene, empty for one without; null = none.")
-    checklist: list[Check] = Field(description="What relighting needs; empty while it grows.")
-    notes: list[str] = Field(description="What else is to be known of it.")
+    scene: str | None = Field(description="Title of the attached scene, empty if untitled; null = no scene.")
+    checklist: list[Check] = Field(description="Requirements for relighting; empty while recording.")
+    notes: list[str] = Field(description="Further notes.")
 
     @classmethod
     def growing(cls, session: RecordingSession) -> Self:
@@ -184,7 +188,7 @@ class NewReplay(StrictModel):
     position_s: Seconds = 0.0
     playing: bool = True
     rate: Rate = 1.0
-    loop: bool = Field(default=True, description="Begin again at the end; else it stays there, paused.")
+    loop: bool = Field(default=True, description="Start again at the end; false = stay there, paused.")
 
 
 class ReplayChange(StrictModel):
@@ -192,7 +196,10 @@ class ReplayChange(StrictModel):
 
     position_s: Seconds | None = None
     step_frames: int | None = Field(
-        default=None, ge=-MOST_STEPS, le=MOST_STEPS, description="Frames on, or back: `1` is the next one."
+        default=None,
+        ge=-MOST_STEPS,
+        le=MOST_STEPS,
+        description="Frames to step forward, or back if negative.",
     )
     playing: bool | None = None
     rate: Rate | None = None
@@ -201,7 +208,9 @@ class ReplayChange(StrictModel):
 class ReplayAnswer(StrictModel):
     """Where the recording is that is shown; all null = a live camera is shown."""
 
-    recording: str | None = Field(description="Null = what the node sends is shown, be it a recording too.")
+    recording: str | None = Field(
+        description="null = the node's own frames are shown (which may come from a recording)."
+    )
     position_s: float | None = None
     duration_s: float | None = None
     playing: bool | None = None

@@ -60,7 +60,7 @@ SceneId = Annotated[str, Path(description="The scene's `id`.", examples=["4f0c2a
 RevisionNumber = Annotated[int, Path(ge=1, lt=1 << 63)]
 # `path`: an id may contain slashes.
 ObjectId = Annotated[str, Path(description="The object's `id`.", examples=["knot"])]
-Index = Annotated[int, Path(ge=0, le=63, description="Place among the manual lights, from 0.")]
+Index = Annotated[int, Path(ge=0, le=63, description="Index among the manual lights, from 0.")]
 CHANGE_PROBLEMS = responses(400, 404, 409, 422)
 MAX_ENTRIES = 200
 LONGEST_WHAT = 200  # characters of what a revision says of itself

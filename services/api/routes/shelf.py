@@ -19,9 +19,9 @@ class ShelfAnswer(BaseModel):
     """An object of the shelf."""
 
     name: str = Field(examples=["chrome-ball"])
-    label: str = Field(description="Its name for people.", examples=["Chrome ball"])
-    file_name: str = Field(description="Name of the asset that it becomes.", examples=["Chrome ball.glb"])
-    clip: str | None = Field(description="Clip that it should play; null where nothing moves.")
+    label: str = Field(description="Name to display.", examples=["Chrome ball"])
+    file_name: str = Field(description="Name of the resulting asset.", examples=["Chrome ball.glb"])
+    clip: str | None = Field(description="Clip to play; null if it has none.")
 
 
 @router.get("")

@@ -50,7 +50,9 @@ class WantedPicture(StrictModel):
 
     name: Name = Field(description="Its file is called NAME.png.")
     view: str = Field(default="composite", description=f"One of {', '.join(VIEWS)}.")
-    method: Method | None = Field(default=None, description="Relit by this one; null = as the scene says.")
+    method: Method | None = Field(
+        default=None, description="Method to relight with; null = as the scene says."
+    )
 
     @model_validator(mode="after")
     def _check(self) -> "WantedPicture":
@@ -67,10 +69,10 @@ class NewSnapshot(StrictModel):
         min_length=1,
         max_length=MAX_PICTURES,
         fail_fast=True,
-        description="All of one and the same frame.",
+        description="Pictures to take, all of the same frame.",
     )
     camera: Name | None = Field(
-        default=None, description="Whose frame, by its node's name; null = the first camera's."
+        default=None, description="Name of the camera's node; null = the first camera."
     )
     exr: StrictBool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
 

@@ -34,7 +34,7 @@ SessionId = Annotated[str, Path(pattern="^[A-Za-z0-9_-]{1,64}$", description="Fr
     status_code=201,
     response_class=Response,
     openapi_extra=SDP_BODY,
-    responses={**responses(404, 415), **unavailable("There is no WHEP here (extra `whep`)."), **SDP_ANSWER},
+    responses={**responses(404, 415), **unavailable("WHEP is not available (extra `whep`)."), **SDP_ANSWER},
 )
 async def open_whep(
     shared: Shared, request: Request, view: WantedView = None, camera: WantedCamera = None
