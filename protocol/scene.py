@@ -27,7 +27,7 @@ class SceneDocument(StrictModel):
     exposure).
     """
 
-    name: str = Field(default="", max_length=200, description="Title for people.")
+    name: str = Field(default="", max_length=200, description="Title to display.")
     revision: int = Field(default=0, ge=0, description="Increases with every change.")
     real: RealScene = Field(default_factory=RealScene)
     objects: tuple[SceneObject, ...] = Field(

@@ -17,7 +17,7 @@ class SceneSummary(BaseModel):
     """A scene in a list."""
 
     id: str = Field(description="Name in addresses.", examples=["4f0c2a9be1d37785"])
-    name: str = Field(description="Title for people.")
+    name: str = Field(description="Title to display.")
     revision: int = Field(description="The newest revision.")
     created: datetime
     changed: datetime

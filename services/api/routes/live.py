@@ -52,7 +52,7 @@ ROUTERS = (live_router, events_router)
 
 
 class TicketAnswer(BaseModel):
-    """A ticket for one address."""
+    """A ticket for one URL."""
 
     ticket: str = Field(description="Ticket to add to the URL as `?ticket=...`.")
     expires_s: float = Field(
@@ -93,7 +93,7 @@ class Pixel(BaseModel):
 
 
 class FisheyeAnswer(BaseModel):
-    """The fish-eye picture's size and the lights in it; a light that it does not show is left out."""
+    """The size of the fish-eye picture and the lights visible in it."""
 
     seen_ns: int = Field(description="Capture time, ns since 1970 by the node's clock.")
     node: str = Field(description="Node of the fish-eye camera.")
@@ -105,7 +105,7 @@ class FisheyeAnswer(BaseModel):
 
 @live_router.post("/tickets", status_code=201)
 def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
-    """Get a ticket with the caller's role, for addresses that cannot carry a token: WebSockets and pictures."""
+    """Get a ticket with the caller's role, for requests that cannot carry a token: WebSockets and pictures."""
     return TicketAnswer(ticket=shared.tickets.issue(principal_of(request.scope)), expires_s=TICKET_LIFE_S)
 
 
@@ -133,7 +133,7 @@ async def live(
 async def live_mjpeg(
     shared: Shared, view: WantedView = None, camera: WantedCamera = None
 ) -> StreamingResponse:
-    """The newest frames as one endless multipart answer, for pictures in pages."""
+    """Stream the newest frames as one endless multipart response, for pictures in web pages."""
     shared.live.require(camera)
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
     return StreamingResponse(
@@ -164,7 +164,7 @@ async def live_picture(shared: Shared, view: WantedView = None, camera: WantedCa
     "/poster.jpg", response_class=StoredFileResponse, responses={**responses(404), **JPEG_ANSWER}
 )
 def poster(shared: Shared) -> StoredFileResponse:
-    """Return the still that stands for the live picture until it comes; `/settings` says whether there is one."""
+    """Return the still that is shown until the first live picture; `/settings` says whether there is one."""
     return _still(shared.store.poster)
 
 
@@ -172,7 +172,7 @@ def poster(shared: Shared) -> StoredFileResponse:
     "/poster-before.jpg", response_class=StoredFileResponse, responses={**responses(404), **JPEG_ANSWER}
 )
 def poster_before(shared: Shared) -> StoredFileResponse:
-    """Return the camera's own picture of the poster's frame; `/settings` says whether there is one."""
+    """Return the camera's own picture of the still's frame; `/settings` says whether there is one."""
     return _still(shared.store.poster_before)
 
 
@@ -185,7 +185,7 @@ def _still(path: Path) -> StoredFileResponse:
 @live_router.post("/live/pick", responses={**responses(400, 404), **unavailable(NO_ANSWER)})
 @in_pool("render server")
 def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 200}])]) -> Pick:
-    """Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on."""
+    """Return what a pixel of the newest composite shows: where to put an object, or which object was clicked."""
     shared.live.require(pixel.camera)
     payload = pixel.model_dump(exclude_none=True)
     return Pick.model_validate(shared.link.command("pick", payload, PICK_TIMEOUT_S))
@@ -193,7 +193,7 @@ def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 
 
 @live_router.get("/fisheye", responses=responses(404))
 def fisheye(shared: Shared) -> FisheyeAnswer:
-    """Return what the fish-eye camera sees: the size of its picture, and the places of the lights in it."""
+    """Return what the fish-eye camera sees: the size of its picture and the positions of the lights in it."""
     message, _ = _newest_fisheye(shared)
     frame = shared.live.newest
     height, width = message.picture_shape[:2]

@@ -69,14 +69,14 @@ class NewRecording(StrictModel):
 
 
 class Stream(StrictModel):
-    """What one stream of a recording holds."""
+    """The contents of one stream of a recording."""
 
     messages: int
     size_bytes: int = Field(description="Before compression.")
 
 
 class Check(StrictModel):
-    """One thing that relighting needs."""
+    """One requirement for relighting."""
 
     what: Literal["depth", "pose", "light"]
     is_there: bool
@@ -114,7 +114,7 @@ def _checklist(facts: Facts) -> list[Check]:
 
 
 class RecordingAnswer(StrictModel):
-    """A recording, finished or growing."""
+    """A recording, finished or in progress."""
 
     id: str = Field(description="Its name, also in URLs.", examples=["take-20261121-101500"])
     state: Literal["waiting", "recording", "finished", "interrupted"] = Field(
@@ -192,7 +192,7 @@ class NewReplay(StrictModel):
 
 
 class ReplayChange(StrictModel):
-    """What is to be otherwise; the rest stays."""
+    """What to change; everything else stays as it is."""
 
     position_s: Seconds | None = None
     step_frames: int | None = Field(
@@ -206,7 +206,7 @@ class ReplayChange(StrictModel):
 
 
 class ReplayAnswer(StrictModel):
-    """Where the recording is that is shown; all null = a live camera is shown."""
+    """Position of the recording on display; all null = a live camera is shown."""
 
     recording: str | None = Field(
         description="null = the node's own frames are shown (which may come from a recording)."
@@ -221,7 +221,7 @@ class ReplayAnswer(StrictModel):
 @router.get("")
 @in_pool("recordings")
 def list_recordings(shared: Shared) -> list[RecordingAnswer]:
-    """List all recordings, those that grow first, then the newest first."""
+    """List all recordings: those in progress first, then newest first."""
     growing = shared.recording_sessions.running()
     names = {session.id for session in growing}
     stored = [RecordingAnswer.stored(recording) for recording in shared.recordings.all(growing=names)]
@@ -235,7 +235,7 @@ def start_recording(
     response: Response,
     wanted: Annotated[NewRecording, AS_SENT, Body(examples=[{"name": "two-lamps", "duration_s": 20}])],
 ) -> RecordingAnswer:
-    """Begin to record a node, with the active scene attached; events tell how far it is."""
+    """Start recording a node, with the active scene attached; events report the progress."""
     order = checked(NewRecording, wanted, "the recording")
     active = shared.store.scenes.active()
     scene = None if active is None else active.document
@@ -255,7 +255,7 @@ async def upload_recording(
     response: Response,
     name: Annotated[str, Query(max_length=1000, description="Name of the file.", examples=["desk.mcap"])],
 ) -> RecordingAnswer:
-    """Upload an .mcap recording, or a .zip of a dataset folder, as the body of the request.
+    """Upload an .mcap recording, or a .zip of a dataset folder, as the request body.
 
     It is recognised by its content and read once in a process of its own, with limits of memory, time and disk. It is
     kept under the name of the file, with a number where that is taken.
@@ -277,7 +277,7 @@ async def upload_recording(
 @router.get("/{recording_id}", responses=responses(404))
 @in_pool("recordings")
 def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
-    """Return what is known of a recording."""
+    """Return the facts of a recording."""
     growing = _growing(shared, recording_id)
     return (
         RecordingAnswer.stored(shared.recordings.get(recording_id))
@@ -289,7 +289,7 @@ def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
 @router.post("/{recording_id}/stop", responses=responses(404, 409, 422))
 @in_pool("recordings")
 def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
-    """End a recording; 409 where no frame had come, so that there is none."""
+    """Stop a recording; 409 if no frame had arrived, so that nothing was recorded."""
     shared.recording_sessions.stop(recording_id)
     return RecordingAnswer.stored(shared.recordings.get(recording_id))
 
@@ -297,7 +297,7 @@ def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer
 @router.post("/{recording_id}/recover", responses=responses(404, 409, 422))
 @in_pool("recordings")
 def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
-    """Mend an interrupted recording: all frames that can be read, finished."""
+    """Recover an interrupted recording: keep all frames that can be read, and finish the file."""
     require_at_rest(shared, recording_id)
     return RecordingAnswer.stored(shared.recordings.recover(recording_id))
 
@@ -309,7 +309,7 @@ def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAns
 )
 @in_pool("recordings")
 def download_recording(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
-    """Download the .mcap file; ranges of it too."""
+    """Download the .mcap file; ranges are supported."""
     require_at_rest(shared, recording_id)
     recording = shared.recordings.get(recording_id)
     if recording.state == "interrupted":
@@ -333,7 +333,7 @@ def recording_poster(shared: Shared, recording_id: RecordingId) -> StoredFileRes
 @router.delete("/{recording_id}", status_code=204, responses=responses(404, 409))
 @in_pool("recordings")
 def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
-    """Delete a recording for good; not one that grows or is shown."""
+    """Delete a recording permanently, unless it is in progress or on display."""
     require_at_rest(shared, recording_id)
     if shared.replay.recording == recording_id:
         raise ConflictError(f"{recording_id} is being replayed; go back to live, then delete it.")
@@ -344,7 +344,7 @@ def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
 @replay_router.get("", responses=responses(503))
 @in_pool("replay")
 def get_replay(shared: Shared) -> ReplayAnswer:
-    """Return which recording is shown and where it is; without one, where the node's own recording is."""
+    """Return which recording is shown and its position; without one, the position in the node's own recording."""
     return replay_answer(shared.replay.position())
 
 
@@ -356,7 +356,7 @@ def start_replay(
         NewReplay, AS_SENT, Body(examples=[{"recording": "two-lamps", "position_s": 2.5, "loop": True}])
     ],
 ) -> ReplayAnswer:
-    """Show a recording instead of the live nodes, or of the recording that is shown."""
+    """Show a recording instead of the live nodes or of the current recording."""
     new = checked(NewReplay, wanted, "the replay")
     require_at_rest(shared, new.recording)
     recording = shared.recordings.get(new.recording)
@@ -370,7 +370,7 @@ def change_replay(
     shared: Shared,
     change: Annotated[ReplayChange, AS_SENT, Body(examples=[{"position_s": 4.2, "playing": False}])],
 ) -> ReplayAnswer:
-    """Seek, step from frame to frame, pause, go on, play slower or faster: what `GET /replay` returns."""
+    """Seek, step frame by frame, pause, resume, or change the speed of the recording that `GET /replay` returns."""
     wanted = checked(ReplayChange, change, "the change")
     return replay_answer(shared.replay.change(**dict(wanted)))
 

@@ -41,7 +41,7 @@ class RoomScene(BaseModel):
 
 
 class RoomAnswer(BaseModel):
-    """A room: whose frames it shows, with which scene, and how it is doing."""
+    """A room: its nodes, its scene and its state."""
 
     name: str = Field(description="Name in URLs: every route also exists as `/rooms/NAME/...` for this room.")
     title: str = Field(description="For people.")
@@ -80,7 +80,7 @@ class HostAnswer(BaseModel):
 
 
 class MoveOrder(BaseModel):
-    """Where to move a room."""
+    """Slot to move a room to."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -116,7 +116,7 @@ def get_room(rooms: AllRooms, room: RoomName) -> RoomAnswer:
 @router.post("/rooms/{room}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def drain_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
-    """End the room's render server until it is started again; its slot is free for rooms that wait."""
+    """Stop the room's render server until it is started again; waiting rooms can use its slot."""
     del shared
     return _commanded(rooms, DRAIN, room)
 
@@ -124,7 +124,7 @@ def drain_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
 @router.post("/rooms/{room}/start", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def start_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
-    """Start a room that was drained or has failed."""
+    """Start a room that was drained or that failed."""
     del shared
     return _commanded(rooms, START, room)
 
@@ -137,21 +137,21 @@ def move_room(
     room: RoomName,
     order: Annotated[MoveOrder, Body(examples=[{"slot": "slot-2"}])],
 ) -> RoomAnswer:
-    """Move the room to another slot; it is shown from where it was until its pictures come from there."""
+    """Move the room to another slot; the old slot keeps rendering it until the new one sends pictures."""
     del shared
     return _commanded(rooms, MOVE, room, order.slot)
 
 
 @router.get("/hosts")
 def list_hosts(rooms: AllRooms) -> list[HostAnswer]:
-    """List the hosts whose slots rooms run in; empty for a single room."""
+    """List the hosts that provide slots; empty for a single room."""
     return _hosts(_answer(rooms).slots)
 
 
 @router.post("/hosts/{host}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def drain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
-    """Move the host's rooms to others, one after another; those without a slot there end and wait.
+    """Move the host's rooms to other hosts, one after another; rooms without a slot there stop and wait.
 
     It stays drained over restarts, until that is deleted.
     """
@@ -164,7 +164,7 @@ def drain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
 @router.delete("/hosts/{host}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def undrain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
-    """Let rooms start on the host again."""
+    """Allow rooms to start on the host again."""
     del shared
     return _host(_ordered(rooms, lambda directory: directory.host_command(UNDRAIN_HOST, host)), host)
 

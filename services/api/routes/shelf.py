@@ -16,7 +16,7 @@ ROUTERS = (router,)
 
 
 class ShelfAnswer(BaseModel):
-    """An object of the shelf."""
+    """A ready-made object."""
 
     name: str = Field(examples=["chrome-ball"])
     label: str = Field(description="Name to display.", examples=["Chrome ball"])
@@ -26,7 +26,7 @@ class ShelfAnswer(BaseModel):
 
 @router.get("")
 def list_shelf() -> list[ShelfAnswer]:
-    """List the objects that every service has: a few models, and shapes of plain materials."""
+    """List the ready-made objects that every service has: a few models, and simple shapes."""
     return [
         ShelfAnswer(name=each.name, label=each.label, file_name=each.file_name, clip=each.clip)
         for each in SHELF.values()
@@ -40,6 +40,6 @@ def take_from_shelf(
     response: Response,
     item: Annotated[str, Path(description="Its `name`.", examples=["chrome-ball"])],
 ) -> AssetAnswer:
-    """Make an asset of an object of the shelf, to be named by scenes; 200 where it is there already."""
+    """Create an asset from a ready-made object, for use in scenes; 200 if it already exists."""
     asset, is_new = shared.store.assets.take_from_shelf(item)
     return announced(shared, asset, response, is_new=is_new)

@@ -27,7 +27,7 @@ ROUTERS = (state_router, nodes_router)
 
 
 class StreamState(BaseModel):
-    """Whether pictures come."""
+    """Whether pictures arrive."""
 
     status: Literal["waiting", "ok", "stale"] = Field(
         description="`waiting` = no picture yet; `stale` = none for two seconds."
@@ -47,7 +47,7 @@ class Health(BaseModel):
 
 
 class CameraState(BaseModel):
-    """A camera whose pictures the render server makes, and its newest picture here."""
+    """A camera whose frames the render server renders, and its newest picture."""
 
     name: str = Field(description="Its node's.")
     status: CameraStatus = Field(
@@ -60,7 +60,7 @@ class CameraState(BaseModel):
 
 
 class State(BaseModel):
-    """How the render server and the nodes are doing."""
+    """State of the render server and the nodes."""
 
     render_server: Literal["answers", "silent"]
     picture: PictureState | None = Field(description="State of the active scene's newest revision.")
@@ -74,7 +74,7 @@ class State(BaseModel):
 
 
 class Settings(BaseModel):
-    """What a client needs to know of the service's settings."""
+    """Settings of the service that a client needs to know."""
 
     version: str
     needs_token: bool
@@ -116,7 +116,7 @@ def health(shared: Shared) -> Health:
 
 @state_router.get("/ready", responses=unavailable("The storage, the render server or a picture is missing."))
 def ready(shared: Shared, rooms: AllRooms) -> Health:
-    """Whether storage, render server and newest picture are there: for what chooses among web processes.
+    """Whether storage, render server and a recent picture are available: for load balancers.
 
     With a directory of rooms: whether storage and directory are, because rooms may wait.
     """
@@ -136,7 +136,7 @@ def ready(shared: Shared, rooms: AllRooms) -> Health:
 
 @state_router.get("/state")
 def state(shared: Shared) -> State:
-    """Rates, drops, delays and remarks of the processes."""
+    """State, rates, drops and delays of the processes."""
     delivery = shared.link.newest_delivery
     return State(
         render_server=_server(shared),
@@ -150,7 +150,7 @@ def state(shared: Shared) -> State:
 
 @state_router.get("/metrics", response_class=PlainTextResponse)
 def metrics(shared: Shared, rooms: AllRooms) -> Response:
-    """Measurements for Prometheus: of a room, and of what all rooms have in common."""
+    """Metrics for Prometheus: those of a room, and those that all rooms share."""
     return Response(shared.metrics.text() + rooms.metrics.text(), media_type=MEDIA_TYPE)
 
 
@@ -172,7 +172,7 @@ def settings(shared: Shared) -> Settings:
 
 @nodes_router.get("/nodes")
 def list_nodes(shared: Shared) -> list[NodeAnswer]:
-    """List the nodes and render servers that are heard: state, rates, losses, clock, delays."""
+    """List the nodes and render servers that report: state, rates, losses, clock, delays."""
     frame = shared.live.newest
     server = shared.server_name if frame is None else shared.live.server_of(frame.message)
     return [_node(report, frame, server) for report in shared.watch.reports()]
@@ -181,7 +181,7 @@ def list_nodes(shared: Shared) -> list[NodeAnswer]:
 @nodes_router.get("/cameras", responses=responses(503))
 @in_pool("cameras")
 def list_cameras(shared: Shared) -> CamerasAnswer:
-    """List the cameras that are attached to this host, and what keeps others from being found."""
+    """List the cameras attached to this host, and why others were not found."""
     return shared.cameras.find()
 
 

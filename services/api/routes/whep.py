@@ -57,13 +57,13 @@ async def open_whep(
 
 @router.options("/whep", status_code=204, include_in_schema=False)
 async def describe_whep() -> Response:
-    """Say what is taken here."""
+    """Say which methods this route accepts."""
     return Response(status_code=204, headers={"Allow": "OPTIONS, POST", "Accept-Post": SDP_TYPE})
 
 
 @router.delete("/whep/{session_id}", response_class=Response, responses=responses(404))
 async def end_whep(shared: Shared, session_id: SessionId) -> Response:
-    """End a session of WHEP."""
+    """End a WHEP session."""
     await shared.whep.end(session_id)
     return Response()
 
