@@ -70,7 +70,7 @@ def read_material(path: Path) -> PrecomputedMaterial:
         )
     if len(content) > _LARGEST_BYTES:
         raise DeltalightError(
-            f"{path} is larger than {_LARGEST_BYTES >> 20} MB, which no material is; {_ADVICE}."
+            f"{path} is larger than {_LARGEST_BYTES >> 20} MB, too large for a material; {_ADVICE}."
         )
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise DeltalightError(f"{path} is damaged or cut short; {_ADVICE} again.")

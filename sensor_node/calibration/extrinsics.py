@@ -93,8 +93,8 @@ def mean_placement(poses: Sequence[Pose], name: str) -> Placement:
     """
     if len(poses) < LEAST_POSES:
         raise DeltalightError(
-            f"the board gives {name} in {len(poses)} moments only and {LEAST_POSES} are needed; record it at rest in "
-            "more places, seen whole by every camera concerned at the same time."
+            f"the board gives {name} at only {len(poses)} moments, and {LEAST_POSES} are needed; record it at rest"
+            " in more places, where every camera involved sees all of it at the same time."
         )
     mean = mean_pose(poses)
     metres, degrees = pose_offsets(poses, mean)

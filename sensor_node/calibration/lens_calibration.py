@@ -152,8 +152,8 @@ def require_good(result: LensResult) -> None:
     if fit.tilt_spread_deg < LEAST_TILT_SPREAD_DEG:
         raise DeltalightError(
             f"the target has one tilt in all views (it varies by {fit.tilt_spread_deg:.1f} degrees in one direction),"
-            " which leaves the focal length open; take views with it tilted by 20 to 45 degrees to the left, right, "
-            "front and back."
+            " which leaves the focal length undetermined; take views with it tilted by 20 to 45 degrees to the"
+            " left, right, front and back."
         )
     if not fit.focal_fraction <= MOST_FOCAL_FRACTION:
         raise DeltalightError(

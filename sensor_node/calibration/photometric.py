@@ -83,7 +83,7 @@ def read_bracket(folder: Path, eye: Eye) -> Bracket:
     if lost or not exposures:
         name = lost[0] if lost else folder
         raise DeltalightError(
-            f"{name} tells no exposure; write it as third column of {eye}.txt, or give pictures with EXIF data."
+            f"{name} has no exposure; write it as the third column of {eye}.txt, or give pictures with EXIF data."
         )
     pictures = tuple(decode_rgb(read_bytes(path), str(path)) for path in exposures)
     return Bracket(pictures, tuple(float(exposure or 0) for exposure in exposures.values()))

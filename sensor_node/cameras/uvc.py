@@ -181,7 +181,7 @@ class UvcCamera(LiveCamera):
             picture = decode(self._grab(), self.source)
             if picture is not None:
                 return picture
-        raise CameraFailure(f"{self.source} gives broken pictures only; use a shorter cable or another port.")
+        raise CameraFailure(f"{self.source} sends only broken pictures; use a shorter cable or another port.")
 
 
 def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None] | None:

@@ -117,7 +117,7 @@ class AuthMiddleware:
         host = headers.get("host", "")
         if not self._rules.needs_token and _host_name(host) not in LOOPBACK_NAMES:
             raise ProblemError(
-                400, "host", "This service is on loopback; address it as 127.0.0.1 or localhost."
+                400, "host", "This service is only reachable on loopback; open it as 127.0.0.1 or localhost."
             )
         origin = headers.get("origin")
         if (origin is not None and (_host_of(origin) or " ") != host.lower()) or _is_embedded(headers):

@@ -45,8 +45,8 @@ _KINDS: tuple[tuple[type[DeltalightError], int, str], ...] = (
 
 # Advice for the two-word sentences of the framework.
 _ADVICE = {
-    "Not Found": ": nothing is at this address; /openapi.json lists what there is.",
-    "Method Not Allowed": ": this address does not take that method; /openapi.json lists those that it takes.",
+    "Not Found": ": there is nothing at this address; /openapi.json lists what there is.",
+    "Method Not Allowed": ": this address does not support that method; /openapi.json lists those that it does.",
 }
 
 

@@ -12,8 +12,8 @@ def precompute(
     source: Annotated[
         Path,
         typer.Argument(
-            help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf), or the folder of a "
-            "polynomial texture map or an ABTF (info.json)."
+            help="Scene document, with its assets where it refers to them; a measured BRDF (.brdf); or the folder of "
+            "a polynomial texture map or an ABTF (info.json)."
         ),
     ],
     out: Annotated[

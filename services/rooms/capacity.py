@@ -103,8 +103,8 @@ def slots_of(figures: RoomFigures, found: "FoundDevice", frames_per_s: float) ->
     """
     if figures.device != found.name:
         raise DeltalightError(
-            f"the figures in {figures.path} are of {figures.device}, and this host renders on {found.name}; make them"
-            " here with `deltalight gpu-check --steps memory,speed`."
+            f"the figures in {figures.path} are for {figures.device}, and this host renders on {found.name}; make"
+            " them here with `deltalight gpu-check --steps memory,speed`."
         )
     by_time = max(1, int(1000.0 / frames_per_s / figures.frame_ms))
     if found.memory_bytes is None:

@@ -162,8 +162,8 @@ def test_what_cannot_be_drawn_is_refused_in_a_sentence(
         (("--speed", speed, "--quality", quality), "same --methods"),
         (("--speed", speed, "--speed", other, "--quality", quality), "different machines"),
         (("--speed", other, "--quality", quality), "moving as in `camera`"),
-        (("--speed", speed, "--quality", speed), "no report of `bench quality`"),
-        (("--speed", quality, "--quality", quality), "no report of this version's `bench speed`"),
+        (("--speed", speed, "--quality", speed), "not a report of `bench quality`"),
+        (("--speed", quality, "--quality", quality), "not a report of this version's `bench speed`"),
     ):
         assert run(["bench", "plot", *map(str, options), "--out", str(tmp_path / "plot.svg")]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()

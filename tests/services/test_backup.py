@@ -145,7 +145,7 @@ def test_a_backup_writes_nothing_but_its_own_files(tmp_path: Path, name: str) ->
         archive.writestr(name, b"")
         files = [{"name": name, "size": 0, "sha256": "0" * 64}]
         archive.writestr(MANIFEST, json.dumps({"format": 1, "files": files}))
-    with pytest.raises(DeltalightError, match="no whole backup"):
+    with pytest.raises(DeltalightError, match="not a complete backup"):
         restore_backup(tmp_path / "evil.zip", tmp_path / "data")
 
 

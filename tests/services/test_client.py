@@ -250,7 +250,7 @@ def test_faults_are_sentences(service: Service, client: Client, tmp_path: Path) 
     with pytest.raises(DeltalightError, match="cannot be read"):
         client.upload(tmp_path / "absent.glb")
     (tmp_path / "wrong.glb").write_bytes(b"MZ")
-    with pytest.raises(ApiError, match="no file of a known format") as refused:
+    with pytest.raises(ApiError, match="not in a known format") as refused:
         client.upload(tmp_path / "wrong.glb")
     assert (refused.value.status, refused.value.kind) == (422, "rejected-asset")
 

@@ -61,7 +61,7 @@ def session_of(renderer: InvertingRenderer) -> RenderSession:
     [
         (GUILTY, "by work of this process"),
         (INNOCENT, "by work of another process"),
-        (UNKNOWN, "for a reason that the driver does not know"),
+        (UNKNOWN, "for a reason unknown to the driver"),
     ],
 )
 def test_each_kind_of_reset_is_a_sentence(status: int, words: str) -> None:
