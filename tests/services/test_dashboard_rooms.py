@@ -85,7 +85,7 @@ def test_rooms_are_chosen_by_their_pictures_and_drained_by_hand(page: Page, api:
     expect(host).to_contain_text("drained")
     photograph(page, "rooms_hosts")
     assert [each["drained"] for each in api.client.get("/hosts").json()] == [True, False, False]
-    host.get_by_role("button", name="Take rooms").click()
+    host.get_by_role("button", name="Accept rooms").click()
     expect(host.get_by_role("button", name="Drain")).to_be_visible()
 
 

@@ -30,7 +30,7 @@ export function ProcessCard({ seen }: { readonly seen: Seen }) {
         ))}
         <Row
           name="clock error"
-          value={report.clock_bound_ms == null ? "unknown" : `at most ${trimmed(report.clock_bound_ms, 2)} ms`}
+          value={report.clock_bound_ms == null ? "unknown" : `within ${trimmed(report.clock_bound_ms, 2)} ms`}
         />
       </dl>
     </article>
