@@ -27,7 +27,7 @@ class RelitPicture:
     With the camera's own linear picture b, `linear` = (1 - coverage) ratio b + additive, at every pixel.
 
     Attributes:
-        color: the picture as the camera would encode it, (h, w, 3) uint8; untouched pixels are the camera's, bit for bit.
+        color: as the camera would encode it, (h, w, 3) uint8; untouched pixels equal the camera's bit for bit.
         linear: the same before the camera's response, (h, w, 3) float32, camera units.
         delta: what the objects change, `linear` - b, (h, w, 3) float32, camera units.
         ratio: factor on the light of the real scene, (h, w, 3) float32; 1 where nothing changes, 0 in full shadow.
