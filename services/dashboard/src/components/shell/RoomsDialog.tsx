@@ -21,6 +21,7 @@ import { Dialog } from "../ui/Dialog";
 import { Icon } from "../ui/Icon";
 import { LiveThumbnail } from "../ui/LiveThumbnail";
 import { Menu, type MenuEntry } from "../ui/Menu";
+import { Sentence } from "../ui/Sentence";
 
 const PERIOD_MS = 2000; // of rates; changes of state come as events
 
@@ -86,7 +87,11 @@ function RoomCard({ room }: { readonly room: RoomAnswer }) {
         <span class={`badge ${room.state === "failed" ? "bad" : room.state}`}>{room.state}</span>
       </div>
       <p class="quiet small">{factsOf(room)}</p>
-      {room.why && <p class="small">{room.why}</p>}
+      {room.why && (
+        <p class="small">
+          <Sentence text={room.why} />
+        </p>
+      )}
       {entries.length > 0 && (
         <Menu label={`Where ${room.title} runs`} entries={entries}>
           <Icon name="node" /> {room.moving_to ? `moving to ${room.moving_to}` : (room.slot ?? "not running")}
