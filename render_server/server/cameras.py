@@ -255,7 +255,7 @@ class RoomCameras:
 def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraStatus, str]:
     """Returns whether a camera is rendered with the first one, and the sentence that says why not."""
     if is_silent:
-        return "silent", f"The camera {place.name} sends no frames; the others go on without it."
+        return "silent", f"The camera {place.name} sends no frames; the others continue without it."
     board, wanted = place.newest.view.board, first.newest.view.board
     if board is not None and wanted is not None and board != wanted:
         return (
@@ -265,7 +265,7 @@ def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraSta
     if _apart_ns(place, first) > max(place.patience_ns, first.patience_ns):
         return (
             "other_time",
-            f"The camera {place.name} is left out: its frames are of another time than those of {first.name}.",
+            f"The camera {place.name} is left out: its frames are from a different time than those of {first.name}.",
         )
     return "live", ""
 

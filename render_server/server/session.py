@@ -257,7 +257,7 @@ class RenderSession:
             node=self._name,
             capture_ns=self._clock_ns(),
             state="starting",
-            detail=f"Preparing shaders, which are compiled once on a machine: {shaders} of some {some}.",
+            detail=f"Compiling shaders, once per machine: {shaders} of about {some}.",
         )
 
     def _rates(self) -> dict[str, float]:

@@ -12,8 +12,8 @@ def precompute(
     source: Annotated[
         Path,
         typer.Argument(
-            help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf), or the folder of a "
-            "polynomial texture map or an ABTF (info.json)."
+            help="Scene document, with its assets where it refers to them; a measured BRDF (.brdf); or the folder of "
+            "a polynomial texture map or an ABTF (info.json)."
         ),
     ],
     out: Annotated[
@@ -34,8 +34,8 @@ def precompute(
         _precompute_material(source, out)
     elif out is not None:
         raise DeltalightError(
-            f"{source} is taken for a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the folder "
-            "of a texture by the light; leave it out."
+            f"{source} is treated as a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the"
+            " folder of a texture by the light; leave it out."
         )
     else:
         _precompute_scene(source)

@@ -248,7 +248,7 @@ def test_a_frame_that_is_not_shown_lights_the_room_and_one_left_out_does_not(
     assert picks[0] == picks[2] != picks[1]
     (second,) = pictures(renderer, CameraFrame("b", facing))
     assert renderer.pick(*middle).distance_m == picks[1]
-    with pytest.raises(DeltalightError, match="Nothing was rendered"):
+    with pytest.raises(DeltalightError, match="Nothing has been rendered"):
         renderer.pick(*middle, camera="a")
     assert psnr_db(second, facing.color) < 45, "the object is in it"
     again = pictures(renderer, CameraFrame("a", behind), CameraFrame("b", facing))

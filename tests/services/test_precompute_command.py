@@ -92,7 +92,7 @@ def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None
     before = out.read_bytes()
     source.write_text("1 2 3")
     for arguments, sentence in (
-        (("--out", str(out)), "paint.brdf is no whole .brdf file"),
+        (("--out", str(out)), "paint.brdf is not a complete .brdf file"),
         ((), "say where it goes: --out paint.dlmat"),
         (("--out", "paint.json"), "say where it goes: --out paint.dlmat"),
     ):
@@ -104,4 +104,4 @@ def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None
     refused = cli("precompute", str(tmp_path), "--out", str(out))
     assert "info.json cannot be read" in refused.stderr
     refused = cli("precompute", str(scene_with(tmp_path)), "--out", str(out))
-    assert "is taken for a scene document, and --out is for a measured BRDF" in refused.stderr
+    assert "is treated as a scene document, and --out is for a measured BRDF" in refused.stderr

@@ -183,7 +183,7 @@ def test_a_silent_camera_drops_out_with_one_notice_and_has_its_place_again(
     assert at_once  # the other is not waited for any more
     assert room.renderer.rooms[-1] == [("right", 29, True), ("left", 1, False)]  # lights the room for a while
     assert room.statuses() == {"left": "silent", "right": "live"}
-    assert "The camera left sends no frames; the others go on without it." in room.session.stats().detail
+    assert "The camera left sends no frames; the others continue without it." in room.session.stats().detail
     assert capsys.readouterr().out.count("a camera is left out") <= 1
     for number in range(30, 60):
         room.send("right", number)
