@@ -62,14 +62,14 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.slow(seconds=10)
+@pytest.mark.slow(seconds=8)
 def test_a_killed_process_leaves_what_is_done_and_the_next_goes_on(
     cli: RunCli, tmp_path: Path, kept: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")
-    trimesh.creation.icosphere(4).export(tmp_path / "ball.ply")
+    trimesh.creation.icosphere(3).export(tmp_path / "ball.ply")
     objects = [{"id": "box", "asset": "box.ply"}, {"id": "ball", "asset": "ball.ply"}]
-    method = {"name": "aroof", "shells": 5, "resolution": 28, "rays": 256}
+    method = {"name": "aroof", "shells": 3, "resolution": 16, "rays": 64}
     scene = str(scene_with(tmp_path, objects=objects, method=method))
     fields = kept.with_name("occlusion-fields")
     command = [sys.executable, "-m", "deltalight.services.cli", "precompute", scene]
@@ -79,14 +79,14 @@ def test_a_killed_process_leaves_what_is_done_and_the_next_goes_on(
         box = [process.stdout.readline() for _ in range(2)]
         assert "light transfer of" in process.stdout.readline()  # of the ball, whose field comes next
         deadline_s = time.monotonic() + PATIENCE_S
-        while not list(fields.glob("*-occlusion-1.npz")):
+        while not list(fields.glob("*-occlusion-0.npz")):
             assert time.monotonic() < deadline_s
             time.sleep(0.01)
         process.kill()
         assert process.stdout.read() == ""
     assert process.returncode == -signal.SIGKILL
     done = {path.name: path.stat().st_ino for path in (*kept.glob("*.npz"), *fields.glob("*.npz"))}
-    assert len(done) >= 5  # two transfers, the box's field, two shells of the ball's
+    assert len(done) >= 4  # two transfers, the box's field, a shell of the ball's
 
     again = cli("precompute", scene)
     assert again.returncode == 0, again.stderr
