@@ -23,6 +23,7 @@ from deltalight.services.rooms.placer import (
 )
 from deltalight.services.rooms.ray_cluster import SLOT_RESOURCE, ClusterHost, RayCluster
 from deltalight.services.rooms.render_actor import END_TIMEOUT_S, SESSION, News, RenderActor, RenderTask
+from deltalight.services.rooms.slot_holder import SlotHolder
 
 START_TIMEOUT_S = 60.0  # until an actor answers for the first time
 CALLS_AT_ONCE = 3  # of an actor: news, end and process_id
@@ -44,10 +45,6 @@ class _Placed:
 class _Spare:
     actor: Any
     waits: Any  # the answer that is awaited
-
-
-class SlotHolder:
-    """Holds a render slot for a spare that has become a room's actor; ends with its keeper."""
 
 
 class RayPlacer:
