@@ -23,7 +23,8 @@ def precompute(
 ) -> None:
     """Compute the light transfer and the occlusion fields of a scene's objects, so that no picture waits for them.
 
-    What is in the cache already is not computed again; Ctrl-C keeps the objects that are done.
+    What is in the cache already is not computed again. A run that was ended, by Ctrl-C too, leaves the objects that
+    are done, and of an occlusion field its shells: the next goes on there.
 
     A measured BRDF, a polynomial texture map or an ABTF becomes a file for `material: {precomputed: FILE}` of scene
     documents.
