@@ -29,6 +29,9 @@ METALLIC, REFLECTANCE, ROUGHNESS, BY_LIGHT = (
     14,
 )  # columns of the material table, as materials.glsl has them
 
+TEXEL_BYTES = 16
+BVH_ROW_BYTES = 1024 * TEXEL_BYTES  # as shaders/common/ray_mesh.glsl has it
+
 # Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
 # hierarchy may become half as expensive again before it is rebuilt.
 WORN = 1.5
@@ -204,9 +207,9 @@ class ObjectBvh:
     """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._ctx = gpu.ctx
-        self._nodes = gpu.ctx.buffer(reserve=4)
-        self._faces = gpu.ctx.buffer(reserve=4)
+        self._gpu = gpu
+        self._nodes: moderngl.Texture | None = None
+        self._faces: moderngl.Texture | None = None
         self._corners = self._built = np.zeros((0, 3, 3), np.float32)
         self._mesh: MeshBuffers | None = None
         self._bvh: Bvh | None = None
@@ -234,9 +237,15 @@ class ObjectBvh:
             positions = np.ascontiguousarray(self._corners[..., :3])
             bvh = self._renewed(positions)
             self.release()
-            self._nodes = self._ctx.buffer(bvh.packed())
-            self._faces = self._ctx.buffer(bvh.packed_triangles(positions, self._mesh.triangles))
-        return {"Nodes": self._nodes, "Faces": self._faces, **self._mesh.storage}
+            self._nodes = self._texture(bvh.packed())
+            self._faces = self._texture(bvh.packed_triangles(positions, self._mesh.triangles))
+        return {"bvh_nodes": self._nodes, "bvh_faces": self._faces, **self._mesh.storage}
+
+    def _texture(self, data: bytes) -> moderngl.Texture:
+        """Returns a texture whose rows hold the data one after the other."""
+        rows = max(-(-len(data) // BVH_ROW_BYTES), 1)
+        size = BVH_ROW_BYTES // TEXEL_BYTES, rows
+        return texture_2d(self._gpu, size, 4, "u4", data=data.ljust(rows * BVH_ROW_BYTES, b"\0"))
 
     def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
         """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
@@ -250,9 +259,8 @@ class ObjectBvh:
         return self._bvh
 
     def release(self) -> None:
-        """Frees the buffers."""
-        self._nodes.release()
-        self._faces.release()
+        """Frees the textures."""
+        release_all(self._nodes, self._faces)
 
 
 class MaterialTable:
