@@ -3,9 +3,11 @@
 import math
 from collections.abc import Sequence
 
+import moderngl
+
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
-from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid, reuse_define
 from deltalight.render_server.passes.gbuffer import MaterialTable, ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
@@ -20,8 +22,7 @@ WIDE_ALPHA = 1 / 32
 GREATEST_ALPHA = 0.174
 ROUNDED = 1.001  # of a square, as shaders may compute it
 SENT_BEAM_BYTES = 112
-BEAM_BYTES = 64
-PLACE_BYTES = 32
+BEAMS_A_ROW, BEAM_TEXELS, PLACE_TEXELS = 256, 4, 2  # of the images that hold them (shaders/common/beams.glsl)
 TILE = 8  # texels an edge, of what caustic_gather fills at once
 HEADER_BYTES = 16
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
@@ -109,9 +110,10 @@ class Caustics:
         self._sums = gpu.storage_buffer(size, lower)
         self._last_sums = gpu.storage_buffer(size, lower) if reuses else None
         self._reuse = Kernel(gpu, "reuse_light", CAUSTICS=1) if reuses else None
-        self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
+        self._count = gpu.ctx.buffer(reserve=4)
+        self._beams: moderngl.Texture | None = None
+        self._places: moderngl.Texture | None = None
         self._end = Kernel(gpu, "caustic_ends")
-        self._places = gpu.ctx.buffer(reserve=PLACE_BYTES)
         self._find_places = Kernel(gpu, "caustic_places")
         # Software renderers pass barriers slowly, and read a beam once for each of few threads.
         rows = 8 if gpu.is_software else 2
@@ -127,11 +129,23 @@ class Caustics:
 
     def end_beams(self, sent: CausticBeams, scene: Bindings, reach_m: float) -> None:
         """Ends beams where they meet something within `reach_m`, of the real scene what the `scene`'s camera sees."""
-        if self._places.size < PLACE_BYTES * sent.most:
-            self._beams.orphan(HEADER_BYTES + BEAM_BYTES * sent.most)
-            self._places.orphan(PLACE_BYTES * sent.most)
-        self._beams.write(bytes(HEADER_BYTES))
-        self._end.run((list_threads(self._gpu, sent.most),), sent.bindings, scene, Beams=self._beams, reach=reach_m)
+        self._make_room(sent.most)
+        self._count.write(bytes(4))
+        self._end.run(
+            (list_threads(self._gpu, sent.most),),
+            sent.bindings,
+            scene,
+            BeamCount=self._count,
+            beam_texels=self._beams,
+            reach=reach_m,
+        )
+
+    def _make_room(self, beams: int) -> None:
+        rows = -(-beams // BEAMS_A_ROW)
+        if self._beams is None or self._beams.height < rows:
+            release_all(self._beams, self._places)
+            self._beams = texture_2d(self._gpu, (BEAM_TEXELS * BEAMS_A_ROW, rows), 4, "f4")
+            self._places = texture_2d(self._gpu, (PLACE_TEXELS * BEAMS_A_ROW, rows), 4, "i2")
 
     def run(self, scene: Bindings) -> None:
         """Fills the sums with the light of the beams where they end."""
@@ -143,8 +157,9 @@ class Caustics:
             self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
         shared: Bindings = {
             **self.bindings,
-            "Beams": self._beams,
-            "BeamPlaces": self._places,
+            "BeamCount": self._count,
+            "beam_texels": self._beams,
+            "beam_places": self._places,
             "sample_pixels": grid.pixels,
             "picture_pixels": grid.picture_size,
             "scale": grid.scale,
@@ -160,6 +175,7 @@ class Caustics:
             self._sums,
             self._last_sums,
             self._reuse,
+            self._count,
             self._beams,
             self._places,
             self._end,

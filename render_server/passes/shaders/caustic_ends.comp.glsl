@@ -56,8 +56,7 @@ void end(SentBeam sent) {
     beam.flux = vec4(sent.flux.rgb, real < object ? 0.0 : 1.0);
     Drift x = Drift(sent.start_x.xyz, sent.turn_x.xyz), y = Drift(sent.start_y.xyz, sent.turn_y.xyz);
     set_footprint(beam, x, y, sent.direction.w * beam.from.w);
-    uint at = atomicAdd(beam_count, 1u);
-    if (at < uint(beams.length())) beams[at] = beam;
+    append_beam(beam);
 }
 
 void main() {
