@@ -259,9 +259,9 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
 #endif
 
 void main() {
-    LightView view = light_views[view_index];
+    LightView view = listed_view(view_index);
     ivec3 at = ivec3(gl_GlobalInvocationID);
-    Light light = lights[light_of_view(view_index)];
+    Light light = listed_light(light_of_view(view_index));
     if (any(greaterThanEqual(at.xy * block_edge, ivec2(view.tile.zz))) || is_image(light)) return;
     cast_ray(light, view, at.xy, at.z);
 }
