@@ -23,6 +23,7 @@ from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.measured_views import SURFEL_PICTURE_LOD
 from deltalight.render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones, TransmittedLight
 from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
 from deltalight.render_server.passes.volumes import (
@@ -35,7 +36,6 @@ from deltalight.render_server.view import CameraView, Rectangle
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
-SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
 
 
 def bounced_later(

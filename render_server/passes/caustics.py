@@ -49,7 +49,13 @@ class CausticBeams:
         return {"SentBeams": self._sent}
 
     def trace(
-        self, lights: LightBuffers, objects: ObjectBvh, materials: MaterialTable, scene: Bindings, *, bias_m: float
+        self,
+        lights: LightBuffers,
+        objects: ObjectBvh,
+        materials: MaterialTable,
+        scene: Bindings,
+        *,
+        bias_m: float,
     ) -> None:
         """Traces the beams that objects of these materials cast, through transparent ones too.
 

@@ -96,7 +96,9 @@ def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     shift = gradient[0] * moved[0] + gradient[1] * moved[1]
     # An outlier of the slope must not throw the node off the depths of its cell.
     at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
-    return _Nodes(pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3).take(flat, axis=0))
+    return _Nodes(
+        pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3).take(flat, axis=0)
+    )
 
 
 def _with_grazing(
