@@ -416,7 +416,7 @@ def shading_stages(
     )
     traced = g.shared("traced objects", lambda: TracedObjects(g.gpu))
     bvh = g.stage("object bvh", traced.set_objects, s.objects)
-    trace_beams = no_beams
+    trace_beams: Callable[..., SentBeams | None] = no_beams
     if shading.has_caustics:
         trace_beams = g.shared("caustic beams", lambda: CastBeams(g.gpu, lit.buffers, shading.tier)).trace
     with bounced_later(g, s, lit, shading.tier, bvh):
