@@ -17,7 +17,8 @@ VIEW_TEXELS = 6  # of a MeasuredView in shaders/common/measured_views.glsl
 class MeasuredViews:
     """Linear pictures (RGBA16F, camera units) and depth (R32F, m) of all cameras, a layer each.
 
-    Pictures have the mip levels that surfels read; those smaller than the largest fill the upper left corner of their layer.
+    Pictures have the mip levels that surfels read. Those smaller than the largest fill the upper left corner of their
+    layer.
     """
 
     def __init__(self, gpu: GpuContext, sizes: Sequence[tuple[int, int]]) -> None:
