@@ -76,10 +76,12 @@ def seen_room(pose: BoardPose, number: int = 0, **changes: Any) -> ViewFrame:  #
     return frame(picture, pose=pose, **{**given, **changes})
 
 
-def document(stage: Stage, geometry: str, **method: object) -> SceneDocument:
+def document(
+    stage: Stage, geometry: str, material: dict[str, float] | None = None, **method: object
+) -> SceneDocument:
     """A white cube before the wall, whose front is lit."""
     wall = shifted(trimesh.creation.box((FRONT - BACK, 2 * END, TOP)), (FRONT + BACK) / 2, 0, TOP / 2)
-    white = stage.virtual(cube(0.1, (-0.12, 0, 0)), (0.8, 0.8, 0.8))
+    white = stage.virtual(cube(0.1, (-0.12, 0, 0)), (0.8, 0.8, 0.8), material or {})
     model = trimesh.util.concatenate([floor(1.0), wall])
     own = {} if "name" in method else method
     given = stage.document([white], [directional((-0.9, 0.1, -0.5))], model, **{**FAST, **own})
@@ -173,6 +175,26 @@ def test_the_world_is_made_once_and_each_view_by_itself(
     assert not {f"{name} (view 2)" for name in of_world} & doubled
     again = counted(seen_room(FACING), small)
     assert set(again) == {"composite", "linearize"}, "nothing moved"
+
+
+def test_beams_of_smooth_objects_are_traced_once_and_end_in_each_view(
+    made: Callable[..., SceneRenderer], gpu: GpuContext
+) -> None:
+    kernels: Counter[str] = Counter()
+    renderer = made("model", material={"metallic": 1.0, "roughness": 0.3})
+    with watched(gpu, lambda run: kernels.update([run.kernel])):
+        renderer.render_views([seen_room(FACING), seen_room(BEHIND)])
+    assert [
+        kernels[name] for name in ("caustic_beams RAY_COUNT=4 WIDE", "caustic_ends", "caustic_places")
+    ] == [1, 2, 2]
+    assert not kernels["caustic_beams RAY_COUNT=4"], "nothing mirrors so sharply"
+
+
+def test_several_cameras_share_the_budget_of_triangles(made: Callable[..., SceneRenderer]) -> None:
+    renderer = made("depth", triangle_budget=2000)
+    views = [seen_room(FACING), seen_room(BEHIND)]
+    renderer.render_views(views)
+    assert 1000 < len(renderer.room().corners) <= 2000
 
 
 def test_a_camera_without_its_pose_leaves_to_the_room_what_it_saw(made: Callable[..., SceneRenderer]) -> None:
