@@ -50,6 +50,9 @@ WORLD_KERNELS = "voxelize", "reflective_shadow_map", "light_voxels", "filter_vox
 FRONT, BACK, TOP, END = -0.29, -0.31, 0.2, 0.6  # of a wall: x of both sides, height, half its length
 BEHIND = look_at((-0.75, -0.3, 0.9), (-0.12, 0, 0.05))  # looks over the wall, at its back
 FACING = look_at((0.7, -0.2, 0.6), (-0.3, 0, 0.2))  # sees its front
+EVERY_PIXEL = 160_000  # triangles: a node of the mesh for each, whoever shares the budget
+    700_000  # triangles: a node of the mesh for each, of the coarse mesh too, whoever shares the budget
+)
 GREY, RED = (120, 120, 120), (190, 30, 30)
 
 
@@ -133,8 +136,10 @@ def test_a_frame_that_comes_twice_counts_once(made: Callable[..., SceneRenderer]
     """Two cameras at one place know what one knows: light and obstacles must not add up."""
     settings, geometry = METHODS[method], "fused" if method == "dlpv" else "depth"
     view = seen_room(FACING)
-    one = made(geometry, **settings).render(view)
-    pair = made(geometry, **settings).render_views([view, replace(view, frame_id=1)])
+    one = made(geometry, **settings, triangle_budget=EVERY_PIXEL).render(view)
+    pair = made(geometry, **settings, triangle_budget=EVERY_PIXEL).render_views(
+        [view, replace(view, frame_id=1)]
+    )
     assert np.abs(one.color.astype(int) - view.color).max() > 40
     for each in pair:
         assert np.abs(each.color.astype(int) - one.color).max() <= 1
