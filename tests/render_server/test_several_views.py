@@ -51,8 +51,6 @@ FRONT, BACK, TOP, END = -0.29, -0.31, 0.2, 0.6  # of a wall: x of both sides, he
 BEHIND = look_at((-0.75, -0.3, 0.9), (-0.12, 0, 0.05))  # looks over the wall, at its back
 FACING = look_at((0.7, -0.2, 0.6), (-0.3, 0, 0.2))  # sees its front
 EVERY_PIXEL = 160_000  # triangles: a node of the mesh for each, whoever shares the budget
-    700_000  # triangles: a node of the mesh for each, of the coarse mesh too, whoever shares the budget
-)
 GREY, RED = (120, 120, 120), (190, 30, 30)
 
 
