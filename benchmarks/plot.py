@@ -112,7 +112,7 @@ def _read_means(path: Path) -> _Means:
     data = read_mapping(path)
     if data.get("kind") != REPORT_KIND:
         raise DeltalightError(
-            f"{path} is no report of `bench quality`; give the quality.json in the folder of its --out."
+            f"{path} is not a report of `bench quality`; give the quality.json in the folder of its --out."
         )
     return validate(_Means, data, str(path))
 

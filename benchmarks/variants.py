@@ -158,7 +158,7 @@ def _parse(text: str, known: Collection[str]) -> Variant:
         close, adjustable = nearest(name, known), " or ".join(f"{one}:KEY=VALUE" for one in ADJUSTABLE)
         hint = "" if close is None or changes else f"; the nearest is {close}"
         raise DeltalightError(
-            f"'{text}' is no method to compare{hint}; use {', '.join(known)}, or {adjustable}."
+            f"'{text}' is not a method to compare{hint}; use {', '.join(known)}, or {adjustable}."
         )
     kind, own = ADJUSTABLE[name]
     settings = dict(own)

@@ -27,14 +27,14 @@ class RelitPicture:
     With the camera's own linear picture b, `linear` = (1 - coverage) ratio b + additive, at every pixel.
 
     Attributes:
-        color: the picture as the camera would code it, (h, w, 3) uint8; untouched pixels are the camera's to the bit.
+        color: as the camera would encode it, (h, w, 3) uint8; untouched pixels equal the camera's bit for bit.
         linear: the same before the camera's response, (h, w, 3) float32, camera units.
         delta: what the objects change, `linear` - b, (h, w, 3) float32, camera units.
-        ratio: by what the real scene's light changes, (h, w, 3) float32; 1 where nothing does, 0 in full shadow.
-        additive: light on top of that: objects times coverage, new light where b is black, (h, w, 3) float32.
-        coverage: share of the pixel that objects cover, (h, w) float32, 0..1.
+        ratio: factor on the light of the real scene, (h, w, 3) float32; 1 where nothing changes, 0 in full shadow.
+        additive: light added on top: objects times coverage, new light where b is black, (h, w, 3) float32.
+        coverage: fraction of the pixel that objects cover, (h, w) float32, 0..1.
         depth: of the nearest surface, real or virtual, along the optical axis, (h, w) float32, m; 0 = unknown.
-        composite: what the renderer delivered with it: frame_id, timestamp_ns, pass times, lights, status.
+        composite: the renderer's other results: frame_id, timestamp_ns, pass times, lights, status.
     """
 
     color: UInt8[np.ndarray, "h w 3"]
@@ -67,8 +67,8 @@ class RelitPicture:
 class Renderer:
     """Relights frames: `with dl.Renderer(method="dvct") as r: picture = r.render(frame, scene)`.
 
-    It keeps what it learnt from earlier frames (the fused room, estimates of light), so give it the frames of one
-    take in their order; `forget` before those of another. One thread uses it.
+    It keeps what it learnt from earlier frames (the fused room, estimates of light), so pass the frames of one
+    take in order; call `forget` before starting another. Use it from one thread only.
 
     Args:
         method: `exact`, `paper`, `dlpv`, `dlpv-paper`, `aroof`, `differential`, `none` or a plugin's; None: as the
@@ -130,11 +130,11 @@ class Renderer:
         return self.render_views([frame], scene)[0]
 
     def render_views(self, frames: Sequence[ViewFrame], scene: Scene | SceneDocument) -> list[RelitPicture]:
-        """Relights a frame of each of several cameras in one room, taken at one moment; returns their pictures.
+        """Relights one frame of each of several cameras in one room, all of one moment; returns their pictures.
 
-        The cameras' poses must be of the same board. They share one real scene and its light: what one of them sees
-        lights what the others show, and a further picture costs what hangs on its pixels alone. Give the cameras in
-        the same order each time. Lights are estimated from the first one.
+        The cameras' poses must be of the same board. They share one real scene and its light: what one camera sees
+        lights the pictures of the others, and a further picture costs only the work that depends on its pixels.
+        Pass the cameras in the same order each time. Lights are estimated from the first one.
 
         Raises:
             DeltalightError: as `render`, or there are no frames.

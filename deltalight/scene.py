@@ -53,11 +53,11 @@ class Scene:
 
         Args:
             asset: a mesh (.glb, .gltf, .obj, .ply, .stl), relative to the working folder.
-            at: the place of its origin in the world, m.
-            name: its id; default: the asset's name, with a number where that is taken.
-            scale: a factor on the asset, which is taken to be in metres.
-            rotation_wxyz: its turn, as a quaternion.
-            material: in place of the asset's own.
+            at: position of its origin in the world, m.
+            name: its id; default: the asset's name, with a number if that is taken.
+            scale: a factor on the asset, which is assumed to be in metres.
+            rotation_wxyz: its rotation, as a quaternion.
+            material: replaces the asset's own.
 
         Raises:
             DeltalightError: there is no such file, or the name is taken.
@@ -84,7 +84,7 @@ class Scene:
         self.document = self.document.replaced(objects=tuple(objects))
 
     def move(self, name: str, to: tuple[float, float, float]) -> None:
-        """Moves an object's origin to a place in the world, m; its turn and size stay.
+        """Moves an object's origin to a position in the world, m; rotation and scale stay.
 
         Raises:
             DeltalightError: there is no such object.

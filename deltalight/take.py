@@ -17,16 +17,16 @@ FRESH_S = 0.2  # age from which on a live camera's frame is skipped for a newer 
 
 
 class Take(Sequence[ViewFrame]):
-    """The frames of a recording or dataset folder, read when they are asked for.
+    """The frames of a recording or dataset folder, read on demand.
 
     A sequence: `take[3]` is a frame, `take[::10]` a take of every tenth. Each frame has colour (h, w, 3; uint8, as
-    the camera coded it), camera, pose (None if the marker board is out of view), clean depth and the light that a
+    the camera encoded it), camera, pose (None if the marker board is out of view), clean depth and the light that a
     fish-eye camera saw, if there was one; see `deltalight.protocol.frames.ViewFrame`.
 
     Args:
         source: an opened recording or dataset folder.
         needs_depth: raise if there is no depth.
-        needs_light: read fish-eye pictures and look for lamps with markers; without, frames come faster.
+        needs_light: read fish-eye pictures and look for lamps with markers; without, frames are read faster.
 
     Raises:
         DeltalightError: the source cannot be read, or has no depth though it is needed.
@@ -39,7 +39,7 @@ class Take(Sequence[ViewFrame]):
 
     @property
     def scene(self) -> Scene | None:
-        """The scene that was recorded along, if any; a new copy each time."""
+        """The scene in the recording, if any; a new copy each time."""
         return None if self._source.scene is None else Scene(self._source.scene)
 
     @property
@@ -65,11 +65,11 @@ class Take(Sequence[ViewFrame]):
 
 
 class LiveTake:
-    """The frames of a camera, as they come: `with dl.open("uvc:0") as live: for frame in live: ...`.
+    """The frames of a camera, as they arrive: `with dl.open("uvc:0") as live: for frame in live: ...`.
 
     Args:
         camera: any camera; `with` opens it.
-        newest: skip frames that came while the one before was rendered.
+        newest: skip frames that arrived while the previous one was rendered.
     """
 
     def __init__(self, camera: Camera, *, newest: bool = False) -> None:
@@ -104,7 +104,7 @@ class LiveTake:
 
 
 def open_take(source: str | Path | Camera) -> Take | LiveTake:
-    """Opens what `deltalight.open` is given.
+    """Opens a take; this is `deltalight.open`.
 
     A recording (.mcap), a dataset folder, `synthetic`, or a live camera: `uvc:0`, `oak`, `openni2:0`, `orbbec:0`, a
     plugin's name, or a `Camera` object.

@@ -136,16 +136,21 @@ class CameraModel:
 
     def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Return the pixels (x, y) of points in the optical frame; NaN for points not in front (z <= 0)."""
-        pixels = np.full((len(points), 2), np.nan)
         in_front = points[:, 2] > 0
+        if len(points) and in_front.all():
+            return self._project_in_front(np.ascontiguousarray(points, np.float64))
+        pixels = np.full((len(points), 2), np.nan)
         if in_front.any():
             pixels[in_front] = self._project_in_front(np.ascontiguousarray(points[in_front], np.float64))
         return pixels
 
     def _project_in_front(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         if not self.has_distortion:
-            focal, centre = self.matrix[[0, 1], [0, 1]], self.matrix[:2, 2]
-            return np.asarray(points[:, :2] / points[:, 2:] * focal + centre)
+            pixels = np.empty((len(points), 2))
+            for axis in (0, 1):  # each by itself: NumPy is slow along rows of two
+                focal, centre = self.matrix[axis, axis], self.matrix[axis, 2]
+                pixels[:, axis] = points[:, axis] / points[:, 2] * focal + centre
+            return pixels
         zero = np.zeros(3)
         shaped = points.reshape(-1, 1, 3)
         if self.distortion_model == "equidistant":

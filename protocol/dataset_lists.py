@@ -161,7 +161,7 @@ def read_fisheye_list(path: Path) -> list[FisheyeEntry]:
     for group in groups.values():
         if len(group) > 1 and any(entry.exposure_s is None for entry in group):
             raise DeltalightError(
-                f"{path} has a bracket without exposures; write exposure_s as third column."
+                f"{path} has a bracket without exposures; write exposure_s as the third column."
             )
     return [
         FisheyeEntry(time, tuple(entry.path for entry in group), tuple(entry.exposure_s for entry in group))

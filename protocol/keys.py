@@ -84,13 +84,13 @@ class KeySettings(StrictModel):
 
     name: str | None = Field(
         default=None,
-        description="Own key pair (`deltalight keys create NAME`); null = the only one there is.",
+        description="This host's key pair (`deltalight keys create NAME`); null = the only one there is.",
     )
     folder: Path | None = Field(
         default=None, description="Folder of the keys; null = `keys` in the user's configuration folder."
     )
     on_loopback: bool = Field(
-        default=False, description="Use keys also between processes of this host, and at the end of a tunnel."
+        default=False, description="Also use keys between processes of this host, and at the end of a tunnel."
     )
 
     def load(self, endpoints: Iterable[str]) -> Keys | None:
@@ -175,7 +175,7 @@ def trust(file: Path, folder: Path, name: str | None = None) -> Path:
         DeltalightError: the file holds no public key or a secret one, or another key has the name.
     """
     if not file.is_file():
-        raise DeltalightError(f"{file} is no file: {TRUST_HINT}")
+        raise DeltalightError(f"{file} is not a file: {TRUST_HINT}")
     public, secret = _read(file)
     if secret is not None:
         raise DeltalightError(f"{file} holds a secret key, which stays on its host: give its {PUBLIC} file")
@@ -214,10 +214,10 @@ def _read(path: Path) -> tuple[bytes, bytes | None]:
         return zmq.auth.load_certificate(path)
     except (OSError, ValueError) as error:
         raise DeltalightError(
-            f"{path} is no key file: give one that `deltalight keys create` made"
+            f"{path} is not a key file: give one that `deltalight keys create` made"
         ) from error
 
 
 def _check_name(name: str) -> None:
     if not _NAME.fullmatch(name):
-        raise DeltalightError(f"`{name}` is no name for keys: use letters, digits, - and _")
+        raise DeltalightError(f"`{name}` is not a valid name for keys: use letters, digits, - and _")

@@ -27,7 +27,7 @@ def require_method(name: str) -> str:
     if fault is not None:
         raise DeltalightError(fault)
     nearest = get_close_matches(name, known, 1, cutoff=0)[0]
-    raise DeltalightError(f"'{name}' is no method; the nearest is {nearest}, of {', '.join(known)}.")
+    raise DeltalightError(f"'{name}' is not a method; the nearest is {nearest}, of {', '.join(known)}.")
 
 
 def with_method(scene: "SceneDocument", method: str) -> "SceneDocument":

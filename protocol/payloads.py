@@ -59,7 +59,7 @@ def _with_payload(message: Control, part: memoryview) -> Control:
     except ValidationError as error:
         reason = error.errors(include_url=False, include_context=False, include_input=False)[0]["msg"]
         raise EnvelopeError(
-            f"the payload of the {message.stream} is no plain data: {reason[:300]}"
+            f"the payload of the {message.stream} is not plain data: {reason[:300]}"
         ) from error
     except (ValueError, RecursionError) as error:
         raise EnvelopeError(

@@ -66,7 +66,7 @@ class Plugin:
         said = " ".join(reason.split()).rstrip(".")[:LONGEST_REASON]
         return DeltalightError(
             f"The plugin `{point.name}` of package {self.package} (entry point {point.value} in {point.group}) "
-            f"cannot be used ({said}); mend or uninstall the package."
+            f"cannot be used ({said}); fix or uninstall the package."
         )
 
 

@@ -253,7 +253,7 @@ class RequestClient:
         ):
             trust = "" if self._keys is None else f" and trusts {self._keys.name}.key"
             raise DeltalightError(
-                f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs{trust}"
+                f"no answer from {self.endpoint} within {timeout_s:g} s: check that the server is running{trust}"
             )
         return decode_control(socket.recv_multipart(), ControlReply)
 

@@ -113,4 +113,4 @@ def _require_known(word: str) -> None:
         return
     hint = nearest(stream, [*STREAMS, CONTROL])
     advice = f"the nearest is {hint}" if hint else f"use {', '.join([*STREAMS, CONTROL])}"
-    raise DeltalightError(f"`{word:.60}` is no stream, topic or `{CONTROL}`: {advice}")
+    raise DeltalightError(f"`{word:.60}` is not a stream, topic or `{CONTROL}`: {advice}")

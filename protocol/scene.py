@@ -27,8 +27,8 @@ class SceneDocument(StrictModel):
     exposure).
     """
 
-    name: str = Field(default="", max_length=200, description="Title for people.")
-    revision: int = Field(default=0, ge=0, description="Counts up with every change.")
+    name: str = Field(default="", max_length=200, description="Title to display.")
+    revision: int = Field(default=0, ge=0, description="Increases with every change.")
     real: RealScene = Field(default_factory=RealScene)
     objects: tuple[SceneObject, ...] = Field(
         default=(), max_length=1024, fail_fast=True, description="Virtual objects."
@@ -121,7 +121,7 @@ def resolve_asset(asset: str, folder: Path) -> str:
     try:
         return str((folder / asset).resolve())
     except (ValueError, OSError, RuntimeError) as error:  # a null byte; a link to itself
-        raise DeltalightError(f"{asset!r:.200} is no name of a file ({error}); correct the path.") from error
+        raise DeltalightError(f"{asset!r:.200} is not a file name ({error}); correct the path.") from error
 
 
 def scene_json_schema() -> dict[str, Any]:

@@ -29,7 +29,7 @@ Factor = Annotated[float, Field(gt=0, le=1e6)]
 
 class _Light(StrictModel):
     color_linear: Radiance = Field(
-        default=(1.0, 1.0, 1.0), description="Linear R G B that multiplies the strength."
+        default=(1.0, 1.0, 1.0), description="Linear RGB colour that multiplies the strength."
     )
 
 
@@ -40,9 +40,11 @@ class DirectionalLight(_Light):
 
     type: Literal["directional"] = "directional"
     direction: Direction = Field(
-        default=(0.0, 0.0, -1.0), description="The way the light travels, world; normalised."
+        default=(0.0, 0.0, -1.0), description="Direction in which the light travels, world axes; normalised."
     )
-    irradiance: NonNegative = Field(default=1.0, description="Irradiance across the beam, camera units.")
+    irradiance: NonNegative = Field(
+        default=1.0, description="Irradiance perpendicular to the beam, camera units."
+    )
     angular_radius_deg: float = Field(
         default=0.5, ge=0, le=90, description="Angular radius of the light, degrees (the sun's is 0.27)."
     )
@@ -56,7 +58,9 @@ class SphereLight(_Light):
     intensity: NonNegative = Field(
         default=1.0, description="Intensity, camera units times square metres: E = I cos/d^2."
     )
-    radius_m: float = Field(default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = point.")
+    radius_m: float = Field(
+        default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = a point light."
+    )
 
 
 class SpotLight(_Light):
@@ -69,16 +73,22 @@ class SpotLight(_Light):
     intensity: NonNegative = Field(
         default=1.0, description="Intensity on the axis, camera units times square metres."
     )
-    radius_m: float = Field(default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = point.")
+    radius_m: float = Field(
+        default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = a point light."
+    )
     direction: Direction = Field(
-        default=(0.0, 0.0, -1.0), description="The cone's axis as light travels; normalised."
+        default=(0.0, 0.0, -1.0),
+        description="Axis of the cone, in the direction in which the light travels; normalised.",
     )
     angle_deg: float = Field(
-        default=60.0, gt=0, lt=180, description="Full opening angle of the cone, degrees; no light beyond."
+        default=60.0,
+        gt=0,
+        lt=180,
+        description="Full opening angle of the cone, degrees; there is no light outside.",
     )
     blend: Fraction = Field(
         default=0.15,
-        description="Share of the half angle, at its outer end, over which the light falls to zero, 0..1.",
+        description="Fraction of the half angle, at its outer end, over which the light falls to zero, 0..1.",
     )
 
 
@@ -89,9 +99,13 @@ class RectangleLight(_Light):
 
     type: Literal["rectangle"] = "rectangle"
     position_m: Point = Field(default=(0.0, 0.0, 1.0), description="Centre, world, metres.")
-    axis_u_m: Point = Field(default=(0.5, 0.0, 0.0), description="First edge, whole length, world, metres.")
-    axis_v_m: Point = Field(default=(0.0, -0.5, 0.0), description="Second edge, whole length, world, metres.")
-    radiance: NonNegative = Field(default=1.0, description="Radiance of the shining side, camera units.")
+    axis_u_m: Point = Field(
+        default=(0.5, 0.0, 0.0), description="First edge at full length, world axes, metres."
+    )
+    axis_v_m: Point = Field(
+        default=(0.0, -0.5, 0.0), description="Second edge at full length, world axes, metres."
+    )
+    radiance: NonNegative = Field(default=1.0, description="Radiance of the emitting side, camera units.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -151,15 +165,16 @@ class LightCut(StrictModel):
     count: LightCount = Field(default=4, description="Number of lights.")
     split: SplitKind = Field(
         default="peaks",
-        description="Cut only what outshines its surroundings, or (as in the papers) the whole map.",
+        description="Extract only lights that outshine their surroundings, or (as in the papers) split the whole "
+        "map into lights.",
     )
     threshold: PeakThreshold = Field(
         default=4.0,
-        description="Luminance above which light is cut out, as a multiple of the map's mean (split peaks).",
+        description="Luminance above which a light is extracted, as a multiple of the map's mean (split peaks).",
     )
     smoothing_s: SmoothingTime = Field(
         default=0.5,
-        description="Time constant with which lights follow what the fish-eye camera sees, seconds; 0 = at once.",
+        description="Time constant with which lights follow the fish-eye picture, seconds; 0 = at once.",
     )
 
 
@@ -168,8 +183,8 @@ class FisheyeLights(LightCut):
 
     distance_m: Distance = Field(
         default="auto",
-        description="Distance of the lights from the fish-eye camera, metres; `far` = as the sun; `auto` = from how "
-        "light falls off over the board's paper, far where none is seen.",
+        description="Distance of the lights from the fish-eye camera, metres; `far` = distant like the sun; "
+        "`auto` = from the falloff of light over the board's paper, or far if no paper is visible.",
     )
 
     @property
@@ -181,15 +196,18 @@ class FisheyeLights(LightCut):
 class TrackedLamp(_Light):
     """A lamp with a marker on it: a sphere light that moves with the marker."""
 
-    marker: int = Field(ge=0, description="Id of the lamp's marker, one of board.yaml's `lamp_markers`.")
+    marker: int = Field(ge=0, description="Id of the lamp's marker, one of the `lamp_markers` in board.yaml.")
     offset_m: Point = Field(
         default=(0.0, 0.0, 0.0),
-        description="The bulb in the marker's frame, metres: +x right, +y up the marker, +z out of it.",
+        description="Position of the bulb in the marker's frame, metres: +x right, +y up the marker, +z out of "
+        "it.",
     )
     intensity: NonNegative = Field(
         default=1.0, description="Intensity, camera units times square metres: E = I cos/d^2."
     )
-    radius_m: float = Field(default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = point.")
+    radius_m: float = Field(
+        default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = a point light."
+    )
 
 
 class EnvironmentLights(StrictModel):
@@ -200,7 +218,7 @@ class EnvironmentLights(StrictModel):
     rotation_deg: float = Field(
         default=0.0, ge=-360, le=360, description="Rotation of the map about its up axis, degrees."
     )
-    intensity: NonNegative = Field(default=1.0, description="Factor on the map's radiance.")
+    intensity: NonNegative = Field(default=1.0, description="Factor that multiplies the map's radiance.")
 
 
 class Lights(StrictModel):
@@ -217,15 +235,16 @@ class Lights(StrictModel):
     environment: EnvironmentLights = Field(default_factory=EnvironmentLights)
     registration: Registration | None = Field(
         default=None,
-        description="Factor R G B on all lights, or `auto` = from the picture; null = auto for fisheye and "
-        "environment, 1 1 1 for manual and tracked.",
+        description="RGB factor on all lights, or `auto` = estimated from the picture; null = auto for fisheye "
+        "and environment, 1 1 1 for manual and tracked.",
     )
     surroundings: Literal["auto", "none"] = Field(
         default="auto",
-        description="Modes manual and tracked: light of what neither the camera nor the lights show. Walls, table "
-        "and floor go on beyond the picture; elsewhere it is the mean of the ground below the horizon and above it "
-        "more towards what is seen there, as strong as the board's paper tells where board.yaml gives its "
-        "white_albedo. Or none.",
+        description="Modes manual and tracked: light from surroundings that are neither in the picture nor set as "
+        "lights. `auto` continues walls, table and floor beyond the picture and fills the rest with "
+        "the mean of the visible ground and, above the horizon, of what is visible there; its "
+        "strength comes from the board's paper if board.yaml gives white_albedo. `none` = no such "
+        "light.",
     )
 
     @model_validator(mode="after")

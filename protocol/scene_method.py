@@ -13,17 +13,17 @@ T = TypeVar("T")
 
 VolumeEdge = Annotated[
     Annotated[float, Field(ge=0.01, le=20)] | None,
-    Field(description="Edge of the volume, metres; null = twice the objects' longest edge."),
+    Field(description="Edge length of the volume, metres; null = twice the longest edge of the objects."),
 ]
 ShadowMapSize = Annotated[
     Annotated[int, Field(ge=128, le=4096)] | None,
-    Field(description="Texels along each edge of a shadow map; null = 1024 GPU, 512 software."),
+    Field(description="Texels along each edge of a shadow map; null = 1024 on a GPU, 512 in software."),
 ]
 TriangleBudget = Annotated[
     Annotated[int, Field(ge=1000, le=4_000_000)] | None,
-    Field(description="Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software."),
+    Field(description="Maximum triangles of the depth mesh; null = 400000 on a GPU, 40000 in software."),
 ]
-ShadowSamples = Annotated[int, Field(ge=1, le=64, description="Samples of a light's area for soft shadows.")]
+ShadowSamples = Annotated[int, Field(ge=1, le=64, description="Samples per area light, for soft shadows.")]
 
 
 def _require_name(schema: dict[str, Any], model: type["MethodSettings"]) -> None:
@@ -39,7 +39,8 @@ class MethodSettings(StrictModel):
 
     quality: Quality = Field(
         default="best",
-        description="What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.",
+        description="Quality that a moving picture gives up for speed (docs/speed.md): `live` most, `balanced` "
+        "some, `best` none.",
     )
 
     @property
@@ -62,7 +63,7 @@ class MethodSettings(StrictModel):
 
     @property
     def resolved_composition(self) -> Literal["ratio", "additive"]:
-        """How the delta meets the picture."""
+        """How the change of light is applied to the picture."""
         return "ratio"
 
 
@@ -79,47 +80,49 @@ class VoxelConeSettings(MethodSettings):
     volume_edge_m: VolumeEdge = None
     cone_scale: Literal[1, 2, 4] | None = Field(
         default=None,
-        description="Cones are traced at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
+        description="Cones are traced at 1/scale of the picture's size; null = 2 on a GPU, 4 in software.",
     )
-    cone_count: int = Field(default=16, ge=4, le=64, description="Diffuse cones of the exact operator.")
+    cone_count: int = Field(default=16, ge=4, le=64, description="Diffuse cones per pixel (exact operator).")
     bounces: int = Field(
         default=1,
         ge=0,
         le=4,
-        description="Gathers of light from voxel to voxel, after the light that the camera measured and the lights' "
-        "own; 0 = direct and unoccluded ambient only (exact operator).",
+        description="Bounces of light from voxel to voxel, in addition to the light that the camera measured and "
+        "the direct light; 0 = direct and unoccluded ambient light only (exact operator).",
     )
     rsm_size: ShadowMapSize = None
     triangle_budget: TriangleBudget = None
     voxels: Literal["directional", "isotropic"] = Field(
         default="directional",
-        description="Of the exact operator: six one-sided directions per voxel, or one for all (as in the paper).",
+        description="Exact operator: six directional values per voxel, or one isotropic value (as in the paper).",
     )
     coverage: Literal["summed", "multiplied"] = Field(
         default="summed",
-        description="Of the exact operator: what a cone meets adds up to a wall, or blocks front to back.",
+        description="Exact operator: how a cone accumulates coverage: summed, or multiplied front to back.",
     )
     radiance: Literal["measured", "predicted"] = Field(
         default="measured",
-        description="Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.",
+        description="Exact operator: radiance of real surfaces, as the camera measures it or as the lights "
+        "predict it.",
     )
     far_volume: bool = Field(
-        default=True, description="Of the exact operator: cones meet the real scene beyond the volume too."
+        default=True, description="Exact operator: cones also see the real scene beyond the volume."
     )
     reflections: Literal["rays", "cones"] = Field(
         default="rays",
-        description="Of the exact operator: objects in smooth real surfaces by rays, or by cones.",
+        description="Exact operator: smooth real surfaces reflect objects by rays or by cones.",
     )
     screen_space: bool = Field(
         default=True,
-        description="Of the exact operator: smooth objects reflect what the picture shows; false = voxels alone.",
+        description="Exact operator: smooth objects reflect the camera's picture where it shows the spot; false = "
+        "voxels only.",
     )
     shadow_samples: ShadowSamples = 16
     memory_budget_mb: int = Field(
         default=4096,
         ge=16,
         le=65536,
-        description="Greatest memory of the volumes, MB; beyond it rendering is refused.",
+        description="Memory limit of the volumes, MB; beyond it, rendering is refused.",
     )
 
 
@@ -132,20 +135,21 @@ class DvctMethod(VoxelConeSettings):
     )
     shadow: Literal["map", "cone"] | None = Field(
         default=None,
-        description="Shadows from shadow maps, or from shadow cones; null = map for exact, cone for paper.",
+        description="Shadows from shadow maps or from shadow cones; null = map for exact, cone for paper.",
     )
     composition: Literal["ratio", "additive"] | None = Field(
         default=None,
-        description="How the delta meets the picture; null = ratio for exact, additive for paper.",
+        description="How the change of light is applied to the picture; null = ratio for exact, additive for "
+        "paper.",
     )
     mirrored_lights: bool = Field(
         default=True,
-        description="Of the exact operator: smooth declared planes throw the lights back at what stands before them.",
+        description="Exact operator: smooth declared planes reflect the lights onto what stands in front of them.",
     )
     caustics: bool = Field(
         default=True,
-        description="Of the exact operator: what smooth objects reflect of the lights falls on other surfaces as "
-        "beams; false = it is spread evenly, as if they were matt.",
+        description="Exact operator: smooth objects reflect the lights onto other surfaces as caustics; false = "
+        "diffusely, as if they were matte.",
     )
 
     @property
@@ -168,107 +172,109 @@ class DlpvMethod(MethodSettings):
     name: Literal["dlpv"] = "dlpv"
     operator: Literal["difference", "paper"] = Field(
         default="difference",
-        description="Two volumes, with and without objects, subtracted; or one volume of the change, as printed in "
-        "the paper. Settings that are null follow it.",
+        description="The difference of two volumes, with and without objects; or one volume of the change, as "
+        "printed in the paper. It sets the defaults of settings that are null.",
     )
     volume_size: int = Field(
         default=32,
         ge=16,
         le=64,
         multiple_of=8,
-        description="Cells along each edge; more make it costlier, not better.",
+        description="Cells along each edge; more cells cost more without improving the picture.",
     )
     volume_edge_m: VolumeEdge = None
     steps: int | None = Field(
         default=None,
         ge=1,
         le=256,
-        description="Steps of propagation, a cell each; null = cells per edge. The result depends on their number.",
+        description="Propagation steps, one cell each; null = as many as cells along an edge. The result depends "
+        "on their number.",
     )
     objects_volume_size: PrintedCells = Field(
         default=None,
-        description="Of operator paper: cells along each edge of the volume that lights the objects; "
-        "null = volume_size.",
+        description="Operator paper: cells along each edge of the volume that lights the objects; null = "
+        "volume_size.",
     )
     objects_steps: int | None = Field(
         default=None,
         ge=1,
         le=256,
-        description="Of operator paper: steps in the volume that lights the objects; null = as steps.",
+        description="Operator paper: propagation steps in the volume that lights the objects; null = as in "
+        "`steps`.",
     )
     direct_volume_size: PrintedCells = Field(
         default=None,
-        description="Of shadow lobe: cells along each edge of the volume of direct light; null = volume_size.",
+        description="Shadow lobe: cells along each edge of the volume of direct light; null = volume_size.",
     )
     direct_steps: int | None = Field(
         default=None,
         ge=0,
         le=256,
-        description="Of shadow lobe: steps of direct light after injection; they soften and "
-        "deepen shadows. null = 5 ([P2] fig. 7); 0 = none.",
+        description="Shadow lobe: propagation steps of direct light after injection, which soften and deepen "
+        "shadows; null = 5 ([P2] fig. 7), 0 = none.",
     )
     direct_filter: int | None = Field(
         default=None,
         ge=0,
         le=4,
-        description="Of shadow lobe: direct light is averaged over cubes that reach so many cells to each side, "
-        "which softens shadows and makes them lighter; null = 0.",
+        description="Shadow lobe: radius, in cells, of the cube over which direct light is averaged, which "
+        "softens and lightens shadows; null = 0.",
     )
     propagation: Literal["moments", "lobes"] | None = Field(
         default=None,
-        description="What a cell keeps of light that enters it: its direction, or lobes about the faces that it "
-        "reaches; null = moments, lobes for paper.",
+        description="How a cell stores the light that enters it: as moments of its direction, or as lobes about "
+        "the faces that it reaches; null = moments, lobes for paper.",
     )
     geometry_volume: bool | None = Field(
-        default=None, description="Surfaces block light between cells; null = yes, no for paper."
+        default=None, description="Whether surfaces block light between cells; null = yes, no for paper."
     )
     bounces: int | None = Field(
         default=None,
         ge=0,
         le=4,
-        description="How often surfaces reflect what the volume brought them; null = 2, 0 for paper.",
+        description="Bounces: how often surfaces reflect the light that reaches them through the volume; null = "
+        "2, 0 for paper.",
     )
     ambient: Literal["blocked", "open"] | None = Field(
         default=None,
-        description="Surfaces in the volume keep off light from the surroundings, or none does; "
-        "null = blocked, open for paper.",
+        description="Whether surfaces in the volume block light from the surroundings; null = blocked, open for "
+        "paper.",
     )
     damping: float | None = Field(
         default=None,
         ge=0,
         le=8,
-        description="How strongly light that grows towards the back of a surface is damped, "
-        "0 = not; null = 0, 1 for paper.",
+        description="How strongly light that increases behind a surface is damped; 0 = not at all; null = 0, 1 "
+        "for paper.",
     )
     shadow: Literal["map", "lobe"] | None = Field(
         default=None,
-        description="Shadows of lights from shadow maps, or as negative light in the volume; "
-        "null = map, lobe for paper.",
+        description="Shadows from shadow maps, or as negative light in the volume; null = map, lobe for paper.",
     )
     caustics: bool | None = Field(
         default=None,
-        description="What smooth objects reflect of the lights falls on other surfaces as beams, or is injected "
-        "into the volume; null = beams, the volume for paper.",
+        description="Smooth objects reflect the lights onto other surfaces as caustics, or their reflected light "
+        "is injected into the volume; null = caustics, the volume for paper.",
     )
     screen_space: bool | None = Field(
         default=None,
-        description="Smooth objects reflect what the picture shows, or the surroundings alone; "
-        "null = the picture, the surroundings for paper.",
+        description="Smooth objects reflect the camera's picture where it shows the spot, or only the "
+        "surroundings; null = the picture, the surroundings for paper.",
     )
     reflections: Literal["rays", "none"] | None = Field(
         default=None,
-        description="Objects in smooth real surfaces by rays, or not at all; null = rays, none for paper.",
+        description="Whether smooth real surfaces reflect objects, by rays; null = rays, none for paper.",
     )
     query_scale: Literal[1, 2, 4] | None = Field(
         default=None,
-        description="The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
+        description="The volume is sampled at 1/scale of the picture's size; null = 2 on a GPU, 4 in software.",
     )
     rsm_size: ShadowMapSize = None
     triangle_budget: TriangleBudget = None
     shadow_samples: ShadowSamples = 16
     composition: Literal["ratio", "additive"] | None = Field(
         default=None,
-        description="How the delta meets the picture; null = ratio, additive for paper.",
+        description="How the change of light is applied to the picture; null = ratio, additive for paper.",
     )
 
     @model_validator(mode="after")
@@ -359,10 +365,10 @@ class AroofMethod(MethodSettings):
         default=4,
         ge=3,
         le=5,
-        description="Bands of spherical harmonics of what an object hides: 9, 16 or 25 coefficients per sample.",
+        description="Bands of spherical harmonics for an object's occlusion: 9, 16 or 25 coefficients per sample.",
     )
     shells: int = Field(
-        default=4, ge=2, le=6, description="Grids of samples around an object, each within the next."
+        default=4, ge=2, le=6, description="Nested grids (shells) of samples around an object."
     )
     resolution: int = Field(
         default=32,
@@ -375,39 +381,41 @@ class AroofMethod(MethodSettings):
         default=8.0,
         ge=2,
         le=32,
-        description="How far the outermost shell reaches from the object's middle, in radii of the sphere around it.",
+        description="Extent of the outermost shell from the object's centre, in radii of its bounding sphere.",
     )
     rays: int = Field(
         default=256,
         ge=64,
         le=4096,
-        description="Rays from each sample over the whole sphere; more take longer once.",
+        description="Rays from each sample over the whole sphere; more make the precomputation longer.",
     )
     indirect: bool = Field(
         default=True,
-        description="Objects also reflect light onto what is around them (radiance transfer field).",
+        description="Objects also reflect light onto their surroundings (radiance transfer field).",
     )
     near_light: Literal["measured", "none"] = Field(
         default="measured",
-        description="What the camera sees around an object counts as light there, or the environment map alone.",
+        description="Light around an object comes from what the camera sees there, or only from the environment "
+        "map.",
     )
     caustics: bool = Field(
         default=True,
-        description="What smooth objects reflect of the lights falls on other surfaces as beams; false = nowhere.",
+        description="Smooth objects reflect the lights onto other surfaces as caustics; false = not at all.",
     )
     screen_space: bool = Field(
         default=True,
-        description="Smooth objects reflect what the picture shows; false = the surroundings alone.",
+        description="Smooth objects reflect the camera's picture where it shows the spot; false = only the "
+        "surroundings.",
     )
     shading_scale: Literal[1, 2, 4] | None = Field(
         default=None,
-        description="Fields are read at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
+        description="Fields are sampled at 1/scale of the picture's size; null = 2 on a GPU, 4 in software.",
     )
     rsm_size: ShadowMapSize = None
     triangle_budget: TriangleBudget = None
     shadow_samples: ShadowSamples = 16
     composition: Literal["ratio", "additive"] = Field(
-        default="ratio", description="How the delta meets the picture."
+        default="ratio", description="How the change of light is applied to the picture."
     )
 
     @property
@@ -421,7 +429,7 @@ class DifferentialMethod(VoxelConeSettings):
 
     name: Literal["differential"] = "differential"
     composition: Literal["ratio", "additive"] = Field(
-        default="ratio", description="How the difference meets the picture."
+        default="ratio", description="How the change of light is applied to the picture."
     )
 
     @property

@@ -32,7 +32,8 @@ class Pose(StrictModel):
         default=(0.0, 0.0, 0.0), description="Position of the object's origin, metres."
     )
     rotation_wxyz: Quaternion = Field(
-        default=(1.0, 0.0, 0.0, 0.0), description="Rotation as a quaternion w, x, y, z; it is normalised."
+        default=(1.0, 0.0, 0.0, 0.0),
+        description="Rotation as a quaternion w, x, y, z; normalised on loading.",
     )
     scale: float = Field(
         default=1.0, gt=0, le=1e4, description="Uniform scale, a factor (assets are in metres)."
@@ -46,7 +47,7 @@ class Pose(StrictModel):
 class Material(StrictModel):
     """Surface of a virtual object: metallic/roughness workflow of the Disney BRDF, GGX microfacets."""
 
-    base_color: Colour = Field(default=(0.8, 0.8, 0.8), description="Linear R G B reflectance, 0..1.")
+    base_color: Colour = Field(default=(0.8, 0.8, 0.8), description="Linear RGB reflectance, 0..1.")
     metallic: Fraction = Field(default=0.0, description="0 = dielectric, 1 = metal.")
     roughness: Fraction = Field(
         default=0.5, description="Perceptual roughness (alpha = roughness squared), 0..1."
@@ -58,26 +59,28 @@ class Material(StrictModel):
         default=None, ge=1, le=4, description="Index of refraction; overrides specular. null = from specular."
     )
     emission: Radiance = Field(
-        default=(0.0, 0.0, 0.0), description="Emitted radiance, linear R G B, camera units."
+        default=(0.0, 0.0, 0.0), description="Emitted radiance, linear RGB, camera units."
     )
     transmission: Fraction = Field(
         default=0.0,
-        description="Share of the light that enters the surface and passes through it, 0..1; the rest is diffuse. "
-        "Each surface that light passes multiplies it by base_color. Refraction is by ior, or as specular has it.",
+        description="Fraction of the light entering the surface that is transmitted, 0..1; the rest is diffuse. "
+        "Each surface that light passes through multiplies it by base_color. Refraction follows ior, "
+        "or else specular.",
     )
     thin_walled: bool = Field(
         default=False,
-        description="true = a sheet without thickness, which bends no light; false = a solid body.",
+        description="true = a sheet without thickness, which does not refract; false = a solid body.",
     )
     attenuation_color: Colour = Field(
         default=(1.0, 1.0, 1.0),
-        description="Colour that white light has after `attenuation_distance_m` inside, linear R G B, 0..1.",
+        description="Colour of white light after `attenuation_distance_m` inside the object, linear RGB, 0..1.",
     )
     attenuation_distance_m: float | None = Field(
         default=None,
         gt=0,
         le=1e4,
-        description="Path inside after which light has `attenuation_color`, metres. null = clear.",
+        description="Path length inside the object after which white light has `attenuation_color`, metres; null "
+        "= clear.",
     )
 
 
@@ -109,12 +112,15 @@ class Animation(StrictModel):
         default=1.0,
         ge=-100,
         le=100,
-        description="Clip seconds per second; 0 holds it at `offset_s`, below 0 plays it backwards.",
+        description="Playback speed, clip seconds per second; 0 holds the clip at `offset_s`, negative values "
+        "play it backwards.",
     )
     offset_s: float = Field(
         default=0.0, ge=-1e12, le=1e12, description="Clip time at capture time 0, seconds."
     )
-    loop: bool = Field(default=True, description="Begin again at the end; false = hold the ends.")
+    loop: bool = Field(
+        default=True, description="Start again at the end; false = hold the first and last pose."
+    )
 
     def time_s(self, capture_ns: int, duration_s: float) -> float:
         """Return the clip time, s, 0..duration, of a frame captured at `capture_ns`."""
@@ -142,13 +148,13 @@ class SceneObject(StrictModel):
     material: AnyMaterial | None = Field(default=None, description="null = from the asset.")
     rigid: bool = Field(
         default=True,
-        description="true = the asset as it rests (its transfer may be precomputed), unless `animation` is given; "
-        "false = it plays its first clip, if it has one.",
+        description="true = the asset in its rest pose (its transfer may be precomputed), unless `animation` is "
+        "given; false = it plays its first clip, if it has one.",
     )
     animation: Animation | None = Field(
-        default=None, description="How a glTF asset's clip is played; null = as `rigid` says."
+        default=None, description="How to play a glTF asset's clip; null = as `rigid` says."
     )
-    visible: bool = Field(default=True, description="Whether the object takes part at all.")
+    visible: bool = Field(default=True, description="Whether the object is rendered and affects the light.")
 
     @property
     def resolved_up_axis(self) -> Literal["y", "z"]:
@@ -200,12 +206,12 @@ Geometry = Annotated[
 class PlaneRegion(StrictModel):
     """Points near a plane."""
 
-    point_m: Point = Field(default=(0.0, 0.0, 0.0), description="A point of the plane, world, metres.")
+    point_m: Point = Field(default=(0.0, 0.0, 0.0), description="A point on the plane, world, metres.")
     normal: Direction = Field(
-        default=(0.0, 0.0, 1.0), description="The plane's normal, world; it is normalised."
+        default=(0.0, 0.0, 1.0), description="Normal of the plane, world axes; normalised on loading."
     )
     tolerance_m: float = Field(
-        default=0.01, gt=0, le=100, description="Greatest distance from the plane, metres."
+        default=0.01, gt=0, le=100, description="Maximum distance from the plane, metres."
     )
 
 
@@ -251,7 +257,7 @@ class Surface(StrictModel):
     metallic: Fraction = Field(default=0.0, description="0 = dielectric, 1 = metal.")
     specular: Fraction = Field(default=0.5, description="F0 = 0.08 specular.")
     albedo: Colour | None = Field(
-        default=None, description="Linear R G B, 0..1 (F0 where metallic); null = measured from the picture."
+        default=None, description="Linear RGB, 0..1 (F0 where metallic); null = measured from the picture."
     )
 
 
@@ -259,13 +265,18 @@ class RealScene(StrictModel):
     """The real scene: where its shape comes from, and which of its surfaces are not diffuse."""
 
     geometry: Geometry = Field(
-        default="depth", description="`depth` (of each frame), `fused`, or a given model."
+        default="depth",
+        description="`depth` (each frame's own), `fused` (over all frames), or a given model.",
     )
     surfaces: tuple[Surface, ...] = Field(
-        default=(), max_length=16, fail_fast=True, description="First match wins; the rest is diffuse."
+        default=(),
+        max_length=16,
+        fail_fast=True,
+        description="The first match wins; all other surfaces are diffuse.",
     )
     unseen_albedo: Annotated[float, Field(ge=0, le=0.95)] | None = Field(
         default=None,
-        description="Albedo of surfaces of a model or of fused depth that the camera does not see now; null = as it "
-        "saw them before, else as their surroundings. A number makes each picture independent of earlier ones.",
+        description="Albedo of surfaces, of a model or of fused depth, that the camera does not currently see; "
+        "null = as last seen, or else that of their surroundings. A number makes each picture "
+        "independent of earlier ones.",
     )

@@ -15,38 +15,40 @@ class Shading(StrictModel):
 
     name: Literal["auto", "volume", "image_based", "precomputed"] = Field(
         default="auto",
-        description="As the method does (auto, volume), or by a map of all light around the objects alone "
-        "(image_based, docs/method.md 6.6), where rigid objects may have their own shadows and bounced light "
-        "precomputed (precomputed, docs/method.md 6.5).",
+        description="By the method's own light transport (auto, volume), or only from a map of all the light "
+        "around the objects (image_based, docs/method.md 6.6), optionally with precomputed "
+        "self-shadowing and interreflection for rigid objects (precomputed, docs/method.md 6.5).",
     )
     samples: int = Field(
         default=40,
         ge=1,
         le=64,
-        description="Of image_based and precomputed: samples per pixel of what a surface mirrors.",
+        description="image_based and precomputed: specular samples per pixel.",
     )
     occlusion_radius_m: float | None = Field(
         default=None,
         ge=0,
         le=20,
-        description="Of image_based: objects keep light off themselves within this distance, metres, and less up to "
-        "twice of it; 0 = not at all, null = the longest edge of the largest object.",
+        description="image_based: distance within which objects occlude themselves, metres; the effect fades out "
+        "up to twice that distance. 0 = no self-occlusion, null = the longest edge of the largest "
+        "object.",
     )
     coefficients: Literal[9, 16] = Field(
         default=9,
-        description="Of precomputed: spherical harmonics of the light that objects keep off themselves.",
+        description="precomputed: coefficients of spherical harmonics for self-occlusion.",
     )
     bounces: int = Field(
         default=2,
         ge=0,
         le=8,
-        description="Of precomputed: times that light goes on from an object to itself.",
+        description="precomputed: bounces of light between parts of the same object.",
     )
     rays: int = Field(
         default=1024,
         ge=64,
         le=16384,
-        description="Of precomputed: rays over the sphere around each vertex; more = less noise, longer, once.",
+        description="precomputed: rays over the sphere around each vertex; more give less noise and a longer "
+        "precomputation.",
     )
 
     @property
@@ -66,35 +68,37 @@ class Output(StrictModel):
     width: PictureSize | None = Field(default=None, description="Width, pixels; null = the camera's.")
     height: PictureSize | None = Field(default=None, description="Height, pixels; null = the camera's.")
     tone: Literal["camera", "aces"] = Field(
-        default="camera", description="The camera's own response, or ACES."
+        default="camera", description="The camera's own response, or the ACES tone curve."
     )
     frame_budget_ms: float | None = Field(
         default=None,
         ge=5,
         le=5000,
-        description="What a frame may take while something moves, ms: quality, then the size at which it is rendered "
-        "give way (docs/speed.md); null = no limit.",
+        description="Time limit for a frame while something moves, ms: first the quality is lowered, then the "
+        "rendered size (docs/speed.md); null = no limit.",
     )
-    antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
+    antialiasing: bool = Field(default=False, description="Antialias the edges of virtual objects.")
     matting_px: int = Field(
         default=0,
         ge=0,
         le=16,
-        description="Pixels from real things in front of objects within which hair and fingers that depth does not "
-        "show are found by colour; 0 = edges alone.",
+        description="Width, in pixels, of the band along real objects in front of virtual ones in which colour "
+        "recovers hair and fingers that depth misses; 0 = only edges are refined.",
     )
     camera_artifacts: bool = Field(
         default=False,
-        description="Put the camera's noise, sharpness, vignetting, JPEG compression and motion blur on the virtual "
-        "part, as its frames show them.",
+        description="Add the camera's noise, blur, vignetting, JPEG artefacts and motion blur, measured from its "
+        "frames, to the virtual part of the picture.",
     )
     bloom: float = Field(
         default=0.0,
         ge=0,
         le=0.5,
-        description="Share of the light of what changes that the lens scatters around it; 0 = none.",
+        description="Bloom: fraction of the changed light that the lens scatters around it; 0 = none.",
     )
-    view: View = Field(default="composite", description="The picture, or a look inside.")
+    view: View = Field(
+        default="composite", description="What the picture shows: the finished picture, or an inside view."
+    )
 
     @property
     def has_bloom(self) -> bool:

@@ -46,7 +46,7 @@ def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
     parts = parse_endpoint(endpoint)
     if parts.needs_keys and keys is None:
         raise DeltalightError(
-            f"{endpoint} leaves this host, and without keys it may not: {CREATE_HINT}, or use 127.0.0.1"
+            f"{endpoint} is reachable from other hosts, which requires keys: {CREATE_HINT}, or use 127.0.0.1"
         )
     return parts
 

@@ -180,8 +180,6 @@ class LiveScene:
         except BaseException:
             self._budget = before
             raise
-        if scene.method != old.method and self._gpu.is_software:
-            give_back_freed_memory()
         self._precomputed.stop_waiting()
 
     def _new_budget(self, scene: SceneDocument) -> FrameBudget:
@@ -217,8 +215,14 @@ class LiveScene:
         self._plan = plan
 
     def _drop_graph(self) -> None:
-        release_all(*self._graphs[:1], *self._best[:1], *self._spare[:1])
+        self._free(self._graphs, self._best, self._spare)
         self._graphs, self._best, self._spare = [], [], []
+
+    def _free(self, *graphs: list[FrameGraph]) -> None:
+        """Frees the graphs of a room's cameras, whose first one owns what they share."""
+        release_all(*(each for room in graphs for each in room[:1]))
+        if self._gpu.is_software and any(graphs):
+            give_back_freed_memory()
 
     def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""
@@ -445,7 +449,7 @@ class LiveScene:
         """
         if _fit(graphs, views):
             return graphs
-        release_all(*graphs[:1])
+        self._free(graphs)
         wanted = method, [view.size for view in views]
         if self._refused is not None and self._refused[0] == wanted:
             raise DeltalightError(self._refused[1])

@@ -2,25 +2,25 @@
 
 import hashlib
 from dataclasses import astuple
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
-from deltalight.protocol.cached_files import cache_limit_bytes, prune, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.gpu_scene import PlacedObject
-from deltalight.render_server.precomputation import Job, Precomputations, load_arrays
+from deltalight.render_server.precomputation import Job, KeptParts, Precomputations, load_arrays, store_arrays
 from deltalight.render_server.scene.occlusion_field import (
     FieldSettings,
     ObjectRays,
     OcclusionField,
+    PartKeeper,
     ProgressCallback,
     ShellGrid,
     compute_occlusion,
+    compute_part,
     place_shells,
 )
 from deltalight.render_server.scene.occlusion_transfer import (
@@ -59,9 +59,12 @@ def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings)
 
 
 def compute_field(
-    surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings, progress: ProgressCallback
+    surface: Float32[np.ndarray, "m 3 6"],
+    settings: FieldSettings,
+    progress: ProgressCallback,
+    keep: PartKeeper = compute_part,
 ) -> OcclusionField:
-    """Computes the field of an object (`object_surface`, asset's frame); takes seconds.
+    """Computes the field of an object (`object_surface`, asset's frame), shell by shell; takes seconds to minutes.
 
     Raises:
         DeltalightError: no package that traces rays is installed.
@@ -69,14 +72,14 @@ def compute_field(
     rays = ObjectRays(np.ascontiguousarray(surface[..., :3]))
     grid = place_shells(rays, settings)
     occlusion = compute_occlusion(
-        rays, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION * fraction)
+        rays, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION * fraction), keep
     )
     transfer = None
     if settings.indirect:
         pieces = surface_pieces(surface, rays.radius)
         later = 1 - OCCLUSION_FRACTION
         transfer = compute_transfer(
-            pieces, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION + later * fraction)
+            pieces, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION + later * fraction), keep
         )
     return OcclusionField(grid, rays.radius, occlusion, transfer)
 
@@ -91,10 +94,7 @@ def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
     arrays |= {"radius": np.array(field.radius), "occlusion": field.occlusion}
     if field.transfer is not None:
         arrays["transfer"] = field.transfer
-    stream, path = BytesIO(), folder / f"{digest}.npz"
-    np.savez(stream, allow_pickle=False, **arrays)
-    write_cached(path, stream.getvalue())
-    prune(folder, cache_limit_bytes(), keep=path)
+    store_arrays(folder / f"{digest}.npz", **arrays)
 
 
 def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionField | None:
@@ -130,10 +130,12 @@ class OcclusionFields(Precomputations[FieldSettings, OcclusionField]):
     def _job(self, item: PlacedObject, settings: FieldSettings) -> Job[OcclusionField]:
         surface = object_surface(item.meshes, plain=item.material is not None)
         digest = field_digest(surface, settings)
+        parts = KeptParts(self._folder, digest)
         return Job(
             lambda: load_field(self._folder, digest, settings),
-            lambda step: compute_field(surface, settings, step),
+            lambda step: compute_field(surface, settings, step, parts.part),
             lambda made: store_field(self._folder, digest, made),
+            parts,
         )
 
 

@@ -3,6 +3,7 @@
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -14,7 +15,14 @@ import structlog
 from rich.console import Console
 from rich.progress import Progress
 
-from deltalight.protocol.cached_files import cache_folder, mark_used, read_cached
+from deltalight.protocol.cached_files import (
+    cache_folder,
+    cache_limit_bytes,
+    mark_used,
+    prune,
+    read_cached,
+    write_cached,
+)
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.scene.occlusion_field import ProgressCallback
@@ -42,13 +50,59 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
         return None
 
 
+def store_arrays(path: Path, **arrays: np.ndarray) -> None:
+    """Writes a cached .npz file, and removes those that were not used for longest beyond the limit of its folder.
+
+    Raises:
+        DeltalightError: the folder cannot be written.
+    """
+    stream = BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    write_cached(path, stream.getvalue())
+    prune(path.parent, cache_limit_bytes(), keep=path)
+
+
+class KeptParts:
+    """Finished parts of a computation, in the cache of what it makes: one that was killed goes on there.
+
+    They count to the limit of the cache. What the disk refuses is computed again.
+    """
+
+    def __init__(self, folder: Path, digest: str) -> None:
+        self._folder, self._digest = folder, digest
+
+    def count(self) -> int:
+        """Returns how many there are."""
+        return len(list(self._folder.glob(f"{self._digest}-*.npz")))
+
+    def part(self, name: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+        """Returns a part, computed or as it was kept (a `PartKeeper`)."""
+        path = self._folder / f"{self._digest}-{name}.npz"
+        found = load_arrays(path)
+        if found is not None and "part" in found:
+            return found["part"]
+        made = compute()
+        with suppress(DeltalightError):
+            store_arrays(path, part=made)
+        return made
+
+    def remove(self) -> None:
+        """Removes all: what they are parts of is complete."""
+        for path in self._folder.glob(f"{self._digest}-*"):
+            path.unlink(missing_ok=True)
+
+
 @dataclass(frozen=True)
 class Job(Generic[Data]):
-    """How the data of one object come about: read from the cache (None: not there), or computed and stored."""
+    """How the data of one object come about: read from the cache (None: not there), or computed and stored.
+
+    `parts` are those that `compute` keeps meanwhile.
+    """
 
     load: Callable[[], Data | None]
     compute: Callable[[ProgressCallback], Data]
     store: Callable[[Data], None]
+    parts: KeptParts | None = None
 
 
 @dataclass(eq=False)
@@ -124,11 +178,18 @@ class Precomputations(ABC, Generic[Settings, Data]):
             made = job.compute(step)
             try:
                 job.store(made)
+                if job.parts is not None:
+                    job.parts.remove()
             except DeltalightError as error:
                 entry.fault = f"object `{entry.name}`: its {self.kind} is not kept: {error}"
             entry.data = made
 
         if self.waits:
+            parts = 0 if job.parts is None else job.parts.count()
+            if parts:
+                self._notify(
+                    f"object `{entry.name}`: {parts} parts of its {self.kind} are from a run that was cut off."
+                )
             with Progress(console=Console(stderr=True), transient=True) as progress:
                 task = progress.add_task(f"{self.kind} of `{entry.name}`", total=1.0)
                 make(lambda fraction: progress.update(task, completed=fraction))

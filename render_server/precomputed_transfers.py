@@ -3,17 +3,15 @@
 import hashlib
 from collections.abc import Hashable
 from dataclasses import astuple
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
-from deltalight.protocol.cached_files import cache_limit_bytes, prune, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.gpu_scene import PlacedObject
-from deltalight.render_server.precomputation import Job, Precomputations, load_arrays
+from deltalight.render_server.precomputation import Job, Precomputations, load_arrays, store_arrays
 from deltalight.render_server.scene.precomputed_transfer import (
     ObjectTransfer,
     TransferSettings,
@@ -53,10 +51,7 @@ def store_transfer(folder: Path, digest: str, made: ObjectTransfer) -> None:
     Raises:
         DeltalightError: the folder cannot be written.
     """
-    stream, path = BytesIO(), folder / f"{digest}.npz"
-    np.savez(stream, allow_pickle=False, digest=np.array(digest), transfer=made.transfer)
-    write_cached(path, stream.getvalue())
-    prune(folder, cache_limit_bytes(), keep=path)
+    store_arrays(folder / f"{digest}.npz", digest=np.array(digest), transfer=made.transfer)
 
 
 def load_transfer(

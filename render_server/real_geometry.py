@@ -161,7 +161,8 @@ class RealGeometry:
         def meshes(budget: int) -> list[TriangleMesh]:
             return shown.without_copies([_depth_mesh(*each, budget) for each in known], budget)
 
-        fine, coarse_budget = meshes(self.budget), self.budget // COARSE_DIVISOR
+        budget = self.budget // len(seen)  # of the room, however many cameras see it
+        fine, coarse_budget = meshes(budget), budget // COARSE_DIVISOR
         if not any(len(mesh.triangles) for mesh in fine):
             self.state = None
             return

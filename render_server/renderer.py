@@ -347,7 +347,7 @@ class SceneRenderer:
         first = self._newest[0] if self._newest else None
         state = first if camera is None else self._cameras.get(camera)
         if state is None or state.shown is None:
-            raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
+            raise DeltalightError("Nothing has been rendered yet; ask again when there is a picture.")
         return state.shown.pick(x, y, ignore)
 
     def room(self) -> RoomMesh:
@@ -358,7 +358,9 @@ class SceneRenderer:
         """
         shown = self._newest[0].shown if self._newest else None
         if shown is None or shown.frame.pose is None:
-            raise DeltalightError("The camera's place is not known yet; ask again when the board is in view.")
+            raise DeltalightError(
+                "The camera's position is not known yet; ask again when the board is in view."
+            )
         view = CameraView(shown.frame.camera, shown.frame.pose.world_from_camera)
         corners = self._live.room_corners
         if corners is None and shown.frame.depth is not None:
@@ -376,7 +378,7 @@ class SceneRenderer:
         """
         camera = self._newest[number] if number < len(self._newest) else CameraState()
         if camera.shown is None:
-            raise DeltalightError("Nothing was rendered yet; render a frame first.")
+            raise DeltalightError("Nothing has been rendered yet; render a frame first.")
         frame = camera.shown.frame
         if camera.relit is None:
             nothing = np.zeros(frame.color.shape, np.float32)

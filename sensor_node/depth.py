@@ -32,7 +32,7 @@ class DepthSettings(StrictModel):
     """Strength of the depth clean-up; lengths in the picture are in pixels of the colour image."""
 
     filter_radius_px: int = Field(
-        default=4, ge=0, le=16, description="Half the filter window's edge; 0 = no filter."
+        default=4, ge=0, le=16, description="Half the edge of the filter window; 0 = no filter."
     )
     edge_sigmas: float = Field(
         default=3.0,
@@ -47,14 +47,14 @@ class DepthSettings(StrictModel):
         description="Colour contrast (0..1) below which colour does not guide depth.",
     )
     fill_area_px: int = Field(
-        default=64, ge=0, le=10000, description="Holes up to this area are filled; 0 = none is."
+        default=64, ge=0, le=10000, description="Largest area of holes to fill; 0 = fill none."
     )
     edge_reach_px: int = Field(
         default=8,
         ge=0,
         le=32,
-        description="Unknown pixels at depth edges, up to this far from known ones, get a surface beside them "
-        "by colour; 0 = none does (nor without filter and filling).",
+        description="Greatest distance, from known depth, of unknown pixels at depth edges that colour assigns to "
+        "a neighbouring surface; 0 = none (as without filter and filling).",
     )
     noise_sigma_m: float | None = Field(
         default=None,

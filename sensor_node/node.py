@@ -72,31 +72,40 @@ class NodeConfig(StrictModel):
         default=None, description="Control endpoint of the server whose clock to follow; null = none."
     )
     announce: bool = Field(
-        default=True, description="Announce the node on the network, if its endpoint leaves this host."
+        default=True, description="Announce the node on the network, if other hosts can reach its endpoint."
     )
-    realtime: bool = Field(default=True, description="Obey the recorded times; else as fast as possible.")
-    loop: bool = Field(default=True, description="Begin again at the end of the source.")
-    camera: CameraSettings = Field(default=CameraSettings(), description="How a live camera is opened.")
+    realtime: bool = Field(
+        default=True, description="Send frames at their recorded times; false = as fast as possible."
+    )
+    loop: bool = Field(default=True, description="Start again at the end of the source.")
+    camera: CameraSettings = Field(default=CameraSettings(), description="Settings of a live camera.")
     fisheye: FisheyeSettings | None = Field(
-        default=None, description="Camera that sees the light; null = what the source itself brings."
+        default=None, description="Camera that sees the light; null = the source's own, if any."
     )
     tracking: TrackingSettings | None = Field(
-        default=None, description="Tracking system that gives the camera's pose; null = the marker board."
+        default=None, description="Tracking system that provides the camera's pose; null = the marker board."
     )
     color_encoding: Literal["jpeg", "raw"] = Field(
-        default="jpeg", description="Code of colour pictures; JPEGs of the source go out as they are."
+        default="jpeg", description="Encoding of colour pictures; JPEGs from the source are sent unchanged."
     )
-    jpeg_quality: int = Field(default=90, ge=1, le=100, description="Quality of JPEGs that are made here.")
+    jpeg_quality: int = Field(default=90, ge=1, le=100, description="Quality of JPEGs encoded here.")
     stale_after_s: float = Field(
-        default=0.5, gt=0, le=60, description="Age of the newest frame from which the stream is stale, s."
+        default=0.5,
+        gt=0,
+        le=60,
+        description="Age of the newest frame at which the stream counts as stale, s.",
     )
     lost_after_s: float = Field(
-        default=5.0, gt=0, le=600, description="Age of the newest frame from which the camera is lost, s."
+        default=5.0,
+        gt=0,
+        le=600,
+        description="Age of the newest frame at which the camera counts as lost, s.",
     )
     depth: DepthSettings = Field(default=DepthSettings(), description="Depth clean-up.")
     lights: LightCut = Field(
         default=LightCut(),
-        description="How the fish-eye picture is cut into lights, which servers take whose scene asks for the same.",
+        description="How to split the fish-eye picture into lights; servers whose scene asks for the same use "
+        "them.",
     )
     pose_filter: PoseFilterSettings | None = Field(
         default=None, description="Smooth the poses that the board gives; null = publish them as found."

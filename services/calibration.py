@@ -30,7 +30,7 @@ def result_path(folder: Path, name: str, *, force: bool) -> Path:
     """
     path = folder / "calibration" / name
     if path.exists() and not force:
-        raise DeltalightError(f"{path} exists already; write over it with --force or name another --out.")
+        raise DeltalightError(f"{path} already exists; overwrite it with --force or name another --out.")
     make_output_folder(path.parent)
     return path
 
@@ -54,8 +54,8 @@ class Watch:
 
         if self.total is None:
             self.console.print(
-                f"Show the target from all sides and hold it still each time; {enough} views are wanted,"
-                " Ctrl-C ends earlier."
+                f"Show the target from all sides and hold it still each time; {enough} views are needed,"
+                " or press Ctrl-C to stop early."
             )
             return collect_views(series, target, enough=enough, tell=self._tell_live)
         columns = (TextColumn("looking for the target"), BarColumn(), MofNCompleteColumn())

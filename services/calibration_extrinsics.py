@@ -38,7 +38,7 @@ def find_transform(job: ExtrinsicsJob, *, force: bool) -> dict[str, Any]:
     path = result_path(job.out, "extrinsics.yaml", force=True)
     known = load_extrinsics_yaml(path) if path.exists() else Extrinsics()
     if getattr(known, job.what) is not None and not force:
-        raise DeltalightError(f"{path} has {job.what} already; write over it with --force.")
+        raise DeltalightError(f"{path} has {job.what} already; overwrite it with --force.")
     board = None if job.board is None else load_board_yaml(job.board)
     source = open_source(job.source, board)
     transform, figures = _find(job.what, source, board_of(source, job.source))

@@ -46,7 +46,7 @@ def _require_free(path: Path, eye: str, *, force: bool) -> None:
         raise DeltalightError(f"{path} does not exist; run `deltalight calibrate fisheye` first.")
     has_one = path.exists() and (eye == "rgb" or load_fisheye_yaml(path).response is not None)
     if has_one and not force:
-        raise DeltalightError(f"{path} holds a response already; write over it with --force.")
+        raise DeltalightError(f"{path} holds a response already; overwrite it with --force.")
 
 
 def _write_into_fisheye(path: Path, table: Float32[np.ndarray, "256 3"]) -> None:
@@ -72,7 +72,7 @@ def find_paper_albedo(
     spec = load_board_yaml(path) if path.exists() and board is None else board_of(frames, source)
     if spec.white_albedo is not None and not force:
         raise DeltalightError(
-            f"{path} has white_albedo {spec.white_albedo} already; write over it with --force."
+            f"{path} has white_albedo {spec.white_albedo} already; overwrite it with --force."
         )
     found = paper_albedo(frames, spec, grey)
     result = spec.replaced(white_albedo=round(found.albedo, 4))

@@ -108,7 +108,7 @@ class Child:
         """Kill it if it hangs, and say so."""
         fault = None if self.watch is None else self.watch.fault()
         if fault is not None and self.process is not None:
-            self.forward(f"{self.spec.name}: {fault}; it is killed.")
+            self.forward(f"{self.spec.name}: {fault}; killing it.")
             self.process.kill()
             self.process.wait()
 

@@ -71,7 +71,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    help="Mixed-reality relighting: virtual objects in a camera picture, with light that acts both ways.",
+    help="Mixed-reality relighting: virtual objects in a camera picture, with light acting both ways.",
 )
 for command in (
     render,
@@ -174,7 +174,7 @@ def _report(fault: Exception) -> int:
         return fault.exit_code
     kind = type(fault).__name__
     print(
-        f"deltalight: internal fault, {kind}: {fault}; run it again with --debug and report the traceback.",
+        f"deltalight: internal error, {kind}: {fault}; run it again with --debug and report the traceback.",
         file=sys.stderr,
     )
     return 1

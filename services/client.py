@@ -221,7 +221,9 @@ class Client:
                 base_url=self._address + "/api/v1", headers=self._headers, timeout=timeout_s
             )
         except httpx.InvalidURL as fault:
-            raise DeltalightError(f"{address!r} is no address ({fault}); use http://HOST:PORT.") from fault
+            raise DeltalightError(
+                f"{address!r} is not an address ({fault}); use http://HOST:PORT."
+            ) from fault
 
     def __enter__(self) -> Self:
         return self
@@ -375,7 +377,7 @@ class Client:
             return response.json() if response.content else None
         except ValueError as fault:
             raise DeltalightError(
-                f"What answers at {self._address} is no Deltalight; correct the address."
+                f"What answers at {self._address} is not a Deltalight service; correct the address."
             ) from fault
 
     def _sent(self, method: str, path: str, **options: Any) -> httpx.Response:  # noqa: ANN401 - as httpx takes them
@@ -408,7 +410,7 @@ class Client:
                 yield socket
         except (OSError, WebSocketException) as fault:
             raise DeltalightError(
-                f"The stream {path} of {self._address} ended ({fault}); see whether the service runs."
+                f"The stream {path} of {self._address} ended ({fault}); check that the service is running."
             ) from fault
 
 

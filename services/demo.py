@@ -58,7 +58,7 @@ def run_live(
         plan.require_free_ports()
         address = f"http://{ports.LOOPBACK}:{port}"
         with Supervisor(plan.specs(), spares=spares) as supervisor:
-            print(f"The dashboard is at {address} (Ctrl-C ends the demo).", flush=True)
+            print(f"The dashboard is at {address} (press Ctrl-C to stop).", flush=True)
             supervisor.run(until=lambda: ports.answers(port))
             if with_browser and _has_display():
                 webbrowser.open(address)

@@ -132,8 +132,8 @@ def choose(nodes: Sequence[FoundNode], name: str) -> FoundNode:
     names = ", ".join(node.name for node in nodes)
     if not nodes:
         raise DeltalightError(
-            "no node announces itself on this network; see that it runs with an endpoint that leaves its host, or"
-            " name that endpoint with --subscribe."
+            "no node announces itself on this network; check that it runs with an endpoint that other hosts can"
+            " reach, or name that endpoint with --subscribe."
         )
     if name == ONLY_NODE and len(nodes) == 1:
         return nodes[0]

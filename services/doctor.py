@@ -155,4 +155,4 @@ def _ports() -> Iterator[Check]:
         if ports.is_free(port):
             yield Check(f"port {port}", "ok", f"free ({use})")
         else:
-            yield Check(f"port {port}", "note", f"in use ({use})", "end that program or choose another port")
+            yield Check(f"port {port}", "note", f"in use ({use})", "stop that program or choose another port")

@@ -71,7 +71,7 @@ def appearing(path: Path) -> Iterator[Path]:
     Move it into place at the end, remove it on an error. A killed process leaves it behind, hidden. The suffix stays.
 
     Raises:
-        DeltalightError: `path` exists already, or the disk refuses.
+        DeltalightError: `path` already exists, or the disk refuses.
     """
     require_absent(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")

@@ -145,7 +145,7 @@ class FoxgloveBridge:
             self._publish(self._newest())
         except DeltalightError as error:
             if not self._is_broken:
-                self._notice(f"A message is left out: {error}")
+                self._notice(f"Skipping a message: {error}")
             self._is_broken = True
 
     def _add(self, message: Message, parts: Sequence[memoryview]) -> None:

@@ -138,9 +138,7 @@ class H264Decoder:
         except av.FFmpegError as fault:
             raise DeltalightError(f"An H.264 picture cannot be decoded: {fault.strerror}.") from fault
         if len(frames) != 1 or frames[0].height < height or frames[0].width < width:
-            raise DeltalightError(
-                "An H.264 picture cannot be decoded: it has not the size that its header says."
-            )
+            raise DeltalightError("An H.264 picture cannot be decoded: its size differs from its header.")
         return rgb_picture(frames[0])[:height, :width]
 
 

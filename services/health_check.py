@@ -77,7 +77,7 @@ def _await_report(endpoint: str, keys: "Keys | None", timeout_s: float) -> str |
         message, _ = decode(multipart)
         if isinstance(message, StatsMessage):
             return None
-    return f"No report came from {endpoint} within {timeout_s:g} s; start its process, or look into its log."
+    return f"No report came from {endpoint} within {timeout_s:g} s; start its process, or check its log."
 
 
 def main(words: list[str]) -> int:

@@ -165,7 +165,7 @@ def choose_scene(source: Source | None, path: Path | None) -> SceneDocument:
     if path is not None:
         return load_scene(path)
     if source is None or source.scene is None:
-        raise DeltalightError("The source carries no scene document; name one with --scene.")
+        raise DeltalightError("The source has no scene document; name one with --scene.")
     return source.scene
 
 

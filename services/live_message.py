@@ -35,7 +35,7 @@ class LiveCamera(BaseModel):
 
     width: int
     height: int
-    matrix: list[float] = Field(min_length=9, max_length=9, description="Intrinsics, row by row.")
+    matrix: list[float] = Field(min_length=9, max_length=9, description="Intrinsic matrix, row by row.")
     distortion_model: DistortionModel
     distortion: list[float]
 
@@ -43,42 +43,41 @@ class LiveCamera(BaseModel):
 class PictureHeader(BaseModel):
     """What a header says of the picture, the same for all viewers."""
 
-    number: int = Field(description="Counts the pictures that came.")
+    number: int = Field(description="Number of pictures so far.")
     frame_id: int = Field(description="The camera's frame.")
-    capture_ns: int = Field(description="When it was captured, ns since 1970 by the node's clock.")
-    frames_per_s: float | None = Field(description="Rate at which pictures come; null before the second.")
-    status: Literal["ok", "no_pose"] = Field(description="`no_pose`: the camera's picture as it is.")
+    capture_ns: int = Field(description="Capture time, ns since 1970 by the node's clock.")
+    frames_per_s: float | None = Field(description="Rate of pictures; null before the second one.")
+    status: Literal["ok", "no_pose"] = Field(description="`no_pose` = the camera's picture, unchanged.")
     render_ms: float = Field(
-        description="From the frame's arrival at the renderer to its picture, waiting included."
+        description="Time from the frame's arrival at the renderer to its picture, including waiting."
     )
-    drops: dict[str, int] = Field(description="What was lost before, by cause.")
-    pass_times_ms: dict[str, float] = Field(description="Where its time went.")
+    drops: dict[str, int] = Field(description="Frames lost so far, by cause.")
+    pass_times_ms: dict[str, float] = Field(description="Time of each pass.")
     reused_pass_times_ms: dict[str, float] = Field(
-        description="Passes whose results it uses again, with the times of their last run."
+        description="Passes whose results were reused, with the times of their last run."
     )
-    lights: list[dict[str, Any]] = Field(description="What it was lit with.")
-    camera: LiveCamera = Field(description="What projects points of the camera's space onto this picture.")
-    world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null without a pose.")
-    node: str | None = Field(
-        None, description="The node whose camera it is of, where the room has several; else null."
-    )
+    lights: list[dict[str, Any]] = Field(description="Lights used for the picture.")
+    camera: LiveCamera = Field(description="Matrix that projects points in camera space onto this picture.")
+    world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null if there is no pose.")
+    node: str | None = Field(None, description="Node of the camera, if the room has several; else null.")
     view: ShownView = Field(
-        description="What it shows: the view that was asked for, or until there is a picture of it the scene's own."
+        description="View in the picture: the requested one, or the scene's own until the first picture of that "
+        "view."
     )
-    scene: ShownScene | None = Field(description="null where another program set the server's scene.")
+    scene: ShownScene | None = Field(description="null if another program set the server's scene.")
     renderer: str
     quality: Quality | None = Field(
-        description="The quality that it was rendered in; null: nothing was rendered."
+        description="Quality at which it was rendered; null = nothing was rendered."
     )
-    scale: float = Field(description="Fraction of its width and height that was rendered, and then enlarged.")
+    scale: float = Field(description="Fraction of the width and height that was rendered, then upscaled.")
     codec: str = Field(
         "jpeg",
-        description="What the picture is coded as: `jpeg`, or H.264 by its name in RFC 6381, such as `avc1.64001e`.",
+        description="Codec of the picture: `jpeg`, or H.264 as in RFC 6381, such as `avc1.64001e`.",
     )
     keyframe: bool = Field(
         default=True,
-        description="Whether it is decoded without those before it. The header of one that is not leaves out what is "
-        "as in the message before.",
+        description="Whether it decodes without the pictures before it (a keyframe). The header of any other "
+        "picture omits what has not changed since the previous message.",
     )
 
     @classmethod
@@ -111,8 +110,8 @@ class PictureHeader(BaseModel):
 class ViewerHeader(BaseModel):
     """What a header says to one viewer at the moment of sending."""
 
-    age_ms: float = Field(description="Time since the picture's capture.")
-    skipped: int = Field(description="Pictures that this viewer was too slow for.")
+    age_ms: float = Field(description="Time since the frame was captured.")
+    skipped: int = Field(description="Pictures skipped because this viewer was too slow.")
 
 
 class LiveHeader(PictureHeader, ViewerHeader):

@@ -20,7 +20,7 @@ def configure_logging(level: str) -> None:
     """
     number = logging.getLevelNamesMapping().get(level.upper())
     if number is None:
-        raise DeltalightError(f"'{level}' is no log level; use debug, info, warning or error.")
+        raise DeltalightError(f"'{level}' is not a log level; use debug, info, warning or error.")
     structlog.configure(
         processors=[structlog.processors.add_log_level, *_renderers(os.environ.get(FORMAT_VARIABLE, "text"))],
         wrapper_class=structlog.make_filtering_bound_logger(number),

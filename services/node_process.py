@@ -91,7 +91,7 @@ def _execute(camera: PlaybackCamera, request: ControlRequest) -> dict[str, objec
             camera.set_rate(_number(request.payload, "rate"))
         case unknown:
             hint = nearest(unknown, OPS) or ", ".join(OPS)
-            raise DeltalightError(f"a replay knows no command '{unknown}'; did you mean {hint}?")
+            raise DeltalightError(f"a replay has no command '{unknown}'; did you mean {hint}?")
     return asdict(camera.playback)
 
 

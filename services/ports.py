@@ -50,8 +50,7 @@ def require_free(port: int, purpose: str, option: str) -> None:
     """
     if not is_free(port):
         raise DeltalightError(
-            f"Port {port} ({purpose}) is in use by another program;"
-            f" end that one or choose another with {option}."
+            f"Port {port} ({purpose}) is in use by another program; stop it, or choose another with {option}."
         )
 
 

@@ -149,7 +149,7 @@ class Recorder:
             raise self._explained(error) from error
         except OSError as error:
             raise DeltalightError(
-                f"The recording ended because {error.filename} is not there any more ({error.strerror});"
+                f"The recording ended because {error.filename} no longer exists ({error.strerror});"
                 " start it again."
             ) from error
         return self.status
@@ -202,7 +202,7 @@ class Recorder:
 
     def _count_broken(self, error: DeltalightError) -> None:
         if not self.status.dropped["broken"]:
-            self._notice(f"A message is left out: {error}")
+            self._notice(f"Skipping a message: {error}")
         self.status.dropped["broken"] += 1
 
     def _write(self, frame: SensorFrame) -> None:
@@ -276,7 +276,7 @@ class Recorder:
         where = " and ".join(self._job.endpoints)
         others = ", ".join(sorted(self._assembler.foreign))
         if self.status.frames:
-            return f"No frame came from {where} for {SILENCE_S:g} s; what was recorded is kept. Waiting for more."
+            return f"No frame came from {where} for {SILENCE_S:g} s; the frames so far are kept. Waiting for more."
         if others:
             return f"No frame of node {self._assembler.node} comes from {where}, only of {others}. Waiting."
         return f"No frame came from {where} for {SILENCE_S:g} s; start a node there or name its endpoint. Waiting."

@@ -76,7 +76,7 @@ def _writer_like(out: Path, reader: RecordingReader, scan: RecordingScan) -> Rec
 def _losses(scan: RecordingScan, lost: int) -> list[str]:
     notes = [f"{lost} damaged frames were left out."] if lost else []
     if scan.unread_bytes:
-        notes.append(f"The last {scan.unread_bytes} bytes are no whole record.")
+        notes.append(f"The last {scan.unread_bytes} bytes are not a complete record.")
     return notes
 
 

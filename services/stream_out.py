@@ -137,7 +137,9 @@ class StreamOut:
     def _note_connection(self, picture: Picture) -> None:
         if not self.status.is_connected:
             height, width = picture.shape[:2]
-            self._say(f"{self._target.shown} takes the relit picture, {width}x{height}; Ctrl-C ends it.")
+            self._say(
+                f"{self._target.shown} is receiving the relit picture, {width}x{height}; press Ctrl-C to stop."
+            )
         self.status.is_connected, self._wait_s = True, FIRST_WAIT_S
 
     def _note_end(self, fault: StreamEndedError) -> None:

@@ -107,7 +107,7 @@ class Supervisor:
                 f"The {child.spec.name} died {len(child.deaths_s)} times within a minute (exit code"
                 f" {exit_code}) and is not started again; its last line was: {child.last_sentence()}"
             )
-        child.forward(f"{child.spec.name}: died with exit code {exit_code}; it is started again.")
+        child.forward(f"{child.spec.name}: died with exit code {exit_code}; restarting it.")
         if now_s - child.started_s < STEADY_AFTER_S:
             time.sleep(RESTART_DELAY_S)
         child.start()

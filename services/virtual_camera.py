@@ -90,7 +90,7 @@ class VirtualCamera:
         if PIX_FORMAT.unpack_from(data, PIX_OFFSET)[:3] != wanted[:3]:  # drivers answer with what they take
             raise DeltalightError(
                 f"{self.path} refuses {width}x{height} pixels (YUYV), because a program reads it in another format;"
-                " end that program or choose its size with --size."
+                " stop that program or choose its size with --size."
             )
 
     def show(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -105,7 +105,7 @@ class VirtualCamera:
         except OSError as fault:
             raise DeltalightError(f"{self.path} takes no more pictures ({fault.strerror}).") from fault
         if written != len(data):
-            raise DeltalightError(f"{self.path} took {written} of {len(data)} bytes; load v4l2loopback anew.")
+            raise DeltalightError(f"{self.path} took {written} of {len(data)} bytes; reload v4l2loopback.")
 
     def _require_output(self) -> None:
         answer = bytearray(CAPABILITY.size)
@@ -123,9 +123,9 @@ class VirtualCamera:
             fcntl.ioctl(self._file, request, data)
         except OSError as fault:
             if fault.errno == errno.EBUSY:
-                raise DeltalightError(f"Another program writes to {self.path}; end it.") from fault
+                raise DeltalightError(f"Another program writes to {self.path}; stop it.") from fault
             raise DeltalightError(
-                f"{self.path} is no virtual camera ({fault.strerror}); {ADVICE}."
+                f"{self.path} is not a virtual camera ({fault.strerror}); {ADVICE}."
             ) from fault
 
 

@@ -271,7 +271,7 @@ def test_a_broken_plugin_is_a_sentence_and_the_others_work(install: Install, nam
     assert [camera.source for camera in found.cameras if camera.kind == "bars"] == ["bars:8"]
     (missing,) = (each for each in found.missing if each.kind == name)
     assert said in missing.details
-    assert missing.hint == "mend or uninstall the package"
+    assert missing.hint == "fix or uninstall the package"
 
 
 GROUPS = ("deltalight.methods", "deltalight.cameras")
@@ -286,7 +286,7 @@ def test_doctor_tells_of_methods(install: Install, monkeypatch: pytest.MonkeyPat
         "ok",
         "of package direct-light 1.0",
     )
-    assert (fog.name, fog.state, fog.hint) == ("method fog", "note", "mend or uninstall the package")
+    assert (fog.name, fog.state, fog.hint) == ("method fog", "note", "fix or uninstall the package")
     assert "No module named 'fog_method'" in fog.detail
 
 

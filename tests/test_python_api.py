@@ -177,7 +177,7 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         "no object `cup`; it has: ": lambda: scene.move("cup", to=(0, 0, 0)),
         "does not exist; correct the path": lambda: scene.add(tmp_path / "cup.glb"),
         "has an object `knot` already": lambda: scene.add(cube, name="knot"),
-        "is no method; the nearest is dlpv": lambda: dl.Renderer("dlvp"),
+        "is not a method; the nearest is dlpv": lambda: dl.Renderer("dlvp"),
         "cannot be read|does not exist|no such": lambda: dl.open(tmp_path / "none.mcap"),
     }
     for sentence, call in cases.items():

@@ -46,6 +46,6 @@ def choose_steps(text: str | None) -> list[Step]:
         if name not in BUDGETS_S:
             nearest = get_close_matches(name, BUDGETS_S, 1, cutoff=0)[0]
             raise DeltalightError(
-                f"'{name}' is no step of gpu-check; the nearest is {nearest}, of {', '.join(BUDGETS_S)}."
+                f"'{name}' is not a step of gpu-check; the nearest is {nearest}, of {', '.join(BUDGETS_S)}."
             )
     return [step for step in STEPS if step.name in names]

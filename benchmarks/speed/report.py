@@ -116,6 +116,6 @@ def read_report(path: Path) -> SpeedReport:
     data = read_mapping(path)
     if data.get("report") != REPORT:
         raise DeltalightError(
-            f"{path} is no report of this version's `bench speed`; write one with `bench speed --out FILE`."
+            f"{path} is not a report of this version's `bench speed`; write one with `bench speed --out FILE`."
         )
     return validate(SpeedReport, data, str(path))

@@ -131,8 +131,8 @@ def registration_from_albedo_percentile(
 
 
 _POOR_FIT = (
-    "The lights explain the board's paper only within {:.0f} %: see whether the lights' positions are right, and "
-    "whether something shadows the board."
+    "The lights explain the board's paper only to within {:.0f} %: check the lights' positions, and that nothing "
+    "shadows the board."
 )
 _NO_PATCH = (
     "No white paper of the marker board was usable, so the lights' scale comes from the brightest real "

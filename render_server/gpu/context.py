@@ -22,7 +22,7 @@ HINTS = {
     "libGL.so not loaded": "OpenGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
     "libEGL.so not loaded": "EGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
     "eglInitialize failed": "EGL found no driver: install libgl1-mesa-dri, or the NVIDIA driver's EGL library",
-    "XOpenDisplay": "a display was asked for where none is: the EGL backend must be used",
+    "XOpenDisplay": "a display was requested, but there is none: use the EGL backend",
     "eglCreateContext failed": "the driver offers less than OpenGL 4.3: update the graphics driver",
     "found 0 devices": "EGL sees no device: in a container, pass the GPU with its graphics capability",
     "requested device": "there is no such GPU: leave --device out, or see `deltalight doctor` for the list",
@@ -128,8 +128,8 @@ class GpuContext:
         error = self.ctx.error
         if error == OUT_OF_MEMORY:
             raise GpuMemoryError(
-                "The GPU's memory is full, so nothing is rendered: end other programs that use it, or lower the size "
-                "of output, method.volume_size or method.memory_budget_mb."
+                "The GPU's memory is full, so nothing is rendered: stop other programs that use it, or lower the"
+                " size of output, method.volume_size or method.memory_budget_mb."
             )
         if error != NO_ERROR:
             self.errors[error] += 1

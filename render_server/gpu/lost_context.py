@@ -25,7 +25,7 @@ RESETS: Final = {  # by what glGetGraphicsResetStatus returns
     0x8253: "by work of this process",  # GL_GUILTY_CONTEXT_RESET
     0x8254: "by work of another process",  # GL_INNOCENT_CONTEXT_RESET
 }
-UNKNOWN = "for a reason that the driver does not know"  # GL_UNKNOWN_CONTEXT_RESET
+UNKNOWN = "for a reason unknown to the driver"  # GL_UNKNOWN_CONTEXT_RESET
 
 
 class GpuResetError(DeltalightError):

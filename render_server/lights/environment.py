@@ -185,6 +185,6 @@ def _check_shape(radiance: Float32[np.ndarray, "h w 3"], path: Path) -> None:
     rows, columns = radiance.shape[:2]
     if columns != 2 * rows or columns > MAX_EDGE or rows < 2:
         raise DeltalightError(
-            f"{path} has {columns}x{rows} pixels; a latitude-longitude map is twice as wide as high "
-            f"(and at most {MAX_EDGE} wide)."
+            f"{path} has {columns}x{rows} pixels; a latitude-longitude map must be twice as wide as "
+            f"it is high (and at most {MAX_EDGE} wide)."
         )

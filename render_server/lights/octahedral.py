@@ -23,6 +23,7 @@ SUMMED_SIZE = 64
 SUMMED_FROM_RAD = 0.4
 CONE_SAMPLES = 64
 CACHED_LEVELS = 16
+AXES_AT_ONCE = 32  # so that their data stays in the processor's cache
 MAX_ORDER = 5
 
 
@@ -107,10 +108,14 @@ def _cone_sum(
 
 @lru_cache(maxsize=CACHED_LEVELS)
 def _cone_weights(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k"]:
-    axis, source = octahedral_grid(size).reshape(-1, 3), octahedral_grid(source_size).reshape(-1, 3)
-    cosine = (axis @ source.T).astype(np.float32)
-    weight = np.where(cosine > np.cos(half_angle), cosine, 0) * texel_solid_angles(source_size).ravel()
-    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+    axes, source = octahedral_grid(size).reshape(-1, 3), octahedral_grid(source_size).reshape(-1, 3)
+    solid_angles, least = texel_solid_angles(source_size).ravel(), np.cos(half_angle)
+    weights = np.empty((len(axes), len(source)), np.float32)
+    for first in range(0, len(axes), AXES_AT_ONCE):
+        cosine = (axes[first : first + AXES_AT_ONCE] @ source.T).astype(np.float32)
+        weight = np.where(cosine > least, cosine, 0) * solid_angles
+        weights[first : first + AXES_AT_ONCE] = weight / weight.sum(axis=1, keepdims=True)
+    return weights
 
 
 def _spiral(sin_half_angle: float) -> Float64[np.ndarray, "n 3"]:

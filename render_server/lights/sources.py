@@ -100,8 +100,8 @@ class TrackedSource:
         sentences = []
         if never_seen:
             sentences.append(
-                f"No picture has shown the marker of {_lamps(never_seen)} yet, so no light comes from there: turn it "
-                "to the camera, and see that board.yaml has it in lamp_markers."
+                f"No picture has shown the marker of {_lamps(never_seen)} yet, so it gives no light: turn it to "
+                "the camera, and check that board.yaml lists it in lamp_markers."
             )
         if lost:
             sentences.append(

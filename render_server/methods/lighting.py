@@ -18,11 +18,12 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import LitScene, Points, object_extent
 from deltalight.render_server.methods.method import ResolvedSettings
-from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeams, Caustics
 from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.measured_views import SURFEL_PICTURE_LOD
 from deltalight.render_server.passes.reflections import (
     RAY_ROUGHNESS,
     ROUGHEST,
@@ -41,7 +42,6 @@ from deltalight.render_server.view import CameraView, Rectangle
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
-SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
 
 
 def bounced_later(
@@ -144,6 +144,50 @@ class TracedObjects:
         self._bvh.release()
 
 
+@dataclass(frozen=True, eq=False)
+class SentBeams:
+    """Beams that objects cast, and how far they reach (m)."""
+
+    beams: CausticBeams
+    reach_m: float
+
+
+class CastBeams:
+    """Beams that smooth objects cast, for all views."""
+
+    def __init__(self, gpu: GpuContext, lights: LightBuffers, tier: QualityTier) -> None:
+        self._lights = lights
+        self._beams = CausticBeams(gpu, blocks=tier.caustic_blocks)
+
+    def trace(
+        self,
+        objects: GeometryState,
+        bvh: ObjectBvh,
+        seen: Observation,
+        volume: PlacedVolume,
+        _lights: LightSet,
+        *_maps: object,
+    ) -> SentBeams | None:
+        """Traces the beams that smooth objects cast; None if none is smooth enough."""
+        if not casts_caustics(objects):
+            return None
+        low, high = objects.bounds
+        offset = SELF_SHADOW_TEXELS * self._lights.virtual_texel_m((low + high) / 2)
+        materials = objects.materials
+        scene = {**seen.bindings, **materials.bindings, **self._lights.bindings, "normal_offset": offset}
+        self._beams.trace(self._lights, bvh, materials, scene, bias_m=seen.scan.bias_m)
+        reach = max(each.size * each.voxel_edge for each in volume.placements)
+        return SentBeams(self._beams, reach)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._beams.release()
+
+
+def no_beams(*_: object) -> None:
+    """Of a method without caustics."""
+
+
 class Shading:
     """Shades the visible surfaces: cones at reduced resolution, direct light and objects at full resolution.
 
@@ -172,8 +216,8 @@ class Shading:
         self._change = ChangeRatio(gpu, self.grid.size)
         self._caustics: Caustics | None = None
         if options.caustics:
-            blocks = options.tier.caustic_blocks
-            self._caustics = Caustics(gpu, self.grid, blocks=blocks, reuses=self.reuses_light)
+            self._caustics = Caustics(gpu, self.grid, reuses=self.reuses_light)
+        self.has_caustics = options.caustics
         self._screen: ScreenCones | None = None
         if options.screen_space:
             self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
@@ -232,25 +276,11 @@ class Shading:
         is_diffuse = not scene["specular_surfaces"]
         return {**scene, **self._history.run(scene, light if is_diffuse else None, view)}, self._direct
 
-    def trace_beams(
-        self,
-        objects: GeometryState,
-        bvh: ObjectBvh,
-        seen: Observation,
-        volume: PlacedVolume,
-        _lights: LightSet,
-        *_maps: object,
-    ) -> Caustics | None:
-        """Traces the beams that smooth objects cast; None if none is smooth enough."""
-        if self._caustics is None or not casts_caustics(objects):
+    def end_beams(self, sent: SentBeams | None, seen: Observation) -> Caustics | None:
+        """Ends beams where the camera sees a surface; None if there are none."""
+        if self._caustics is None or sent is None:
             return None
-        reach = max(each.size * each.voxel_edge for each in volume.placements)
-        own = {"normal_offset": self._normal_offset(objects)}
-        scene = {**seen.bindings, **objects.materials.bindings, **self._lights.bindings, **own}
-        transmits = objects.materials.transmits
-        self._caustics.trace(
-            self._lights, bvh, scene, bias_m=seen.scan.bias_m, reach_m=reach, transmits=transmits
-        )
+        self._caustics.end_beams(sent.beams, seen.bindings, sent.reach_m)
         return self._caustics
 
     def cast_caustics(self, scene: Bindings, _grid: LowResGrid, beams: Caustics | None) -> Caustics | None:
@@ -416,10 +446,12 @@ def shading_stages(
     )
     traced = g.shared("traced objects", lambda: TracedObjects(g.gpu))
     bvh = g.stage("object bvh", traced.set_objects, s.objects)
+    trace_beams: Callable[..., SentBeams | None] = no_beams
+    if shading.has_caustics:
+        trace_beams = g.shared("caustic beams", lambda: CastBeams(g.gpu, lit.buffers, shading.tier)).trace
     with bounced_later(g, s, lit, shading.tier, bvh):
-        beams = g.stage(
-            "caustic beams", shading.trace_beams, s.objects, bvh, s.own_measured, volume, s.lights, *lit.all
-        )
+        sent = g.stage("caustic beams", trace_beams, s.objects, bvh, s.measured, volume, s.lights, *lit.all)
+    beams = g.stage("caustic ends", shading.end_beams, sent, s.own_measured)
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     kept: list[Resource[Any]] = []
     if shading.reuses_light:

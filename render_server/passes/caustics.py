@@ -3,11 +3,13 @@
 import math
 from collections.abc import Sequence
 
+import moderngl
+
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
-from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid, reuse_define
-from deltalight.render_server.passes.gbuffer import ObjectBvh
+from deltalight.render_server.passes.gbuffer import MaterialTable, ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
 
 RAYS = 4  # of each block of a light's object map
@@ -18,33 +20,106 @@ PATHS = 2
 WIDE_ALPHA = 1 / 32
 # A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: voxels carry its light.
 GREATEST_ALPHA = 0.174
-BEAM_BYTES = 64
-PLACE_BYTES = 32
+ROUNDED = 1.001  # of a square, as shaders may compute it
+SENT_BEAM_BYTES = 112
+BEAMS_A_ROW, BEAM_TEXELS, PLACE_TEXELS = 256, 4, 2  # of the images that hold them (shaders/common/beams.glsl)
 TILE = 8  # texels an edge, of what caustic_gather fills at once
 HEADER_BYTES = 16
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
 
-class Caustics:
-    """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl).
+class CausticBeams:
+    """Traces beams from the lights' object maps to the objects that they meet, which are the same for all cameras.
 
     `blocks` per edge of a light's object map each send a beam of rays. With 64 these start a 128th of the objects'
     extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.
     """
 
-    def __init__(self, gpu: GpuContext, grid: LowResGrid, *, blocks: int, reuses: bool = False) -> None:
+    def __init__(self, gpu: GpuContext, *, blocks: int) -> None:
+        self._gpu, self._blocks = gpu, blocks
+        self.most = 1  # of beams
+        self._sent = gpu.ctx.buffer(reserve=HEADER_BYTES + SENT_BEAM_BYTES)
+        self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
+        self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
+        self._refracted_beams: Kernel | None = None
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The beams."""
+        return {"SentBeams": self._sent}
+
+    def trace(
+        self,
+        lights: LightBuffers,
+        objects: ObjectBvh,
+        materials: MaterialTable,
+        scene: Bindings,
+        *,
+        bias_m: float,
+    ) -> None:
+        """Traces the beams that objects of these materials cast, through transparent ones too.
+
+        `bias_m` offsets receivers of real shadows towards the light.
+        """
+        kernels = [(self._lobe_beams, WIDE_ALPHA, GREATEST_ALPHA)]
+        if materials.smoothest**2 < ROUNDED * WIDE_ALPHA:
+            kernels.insert(0, (self._mirror_beams, 0.0, WIDE_ALPHA))
+        if materials.transmits:
+            if self._refracted_beams is None:
+                self._refracted_beams = Kernel(
+                    self._gpu, "caustic_beams", RAY_COUNT=RAYS, REFRACTED=1, PATHS=PATHS
+                )
+            kernels.append((self._refracted_beams, 0.0, GREATEST_ALPHA))
+        self._empty_beams(len(lights.virtual_views) * (1 + PATHS if materials.transmits else 1))
+        own: Bindings = {**scene, **objects.bindings, "bias_real": bias_m}
+        for view in range(len(lights.virtual_views)):
+            self._trace_beams(lights, lights.first_virtual_view + view, own, kernels)
+
+    def _empty_beams(self, views: int) -> None:
+        """Allocates and clears the beams of that many views, each with one beam a ray."""
+        self.most = max(views * self._blocks**2 * RAYS, 1)
+        needed = HEADER_BYTES + SENT_BEAM_BYTES * self.most
+        if self._sent.size < needed:
+            self._sent.orphan(needed)
+        self._sent.write(bytes(HEADER_BYTES))
+
+    def _trace_beams(
+        self,
+        lights: LightBuffers,
+        view_index: int,
+        scene: Bindings,
+        kernels: Sequence[tuple[Kernel, float, float]],
+    ) -> None:
+        """Adds the beams of one view, by each kernel those of materials from its least to its greatest alpha."""
+        shared: dict[str, Binding] = {
+            "view_index": view_index,
+            "block_edge": max(lights.tile_size // self._blocks, 1),
+            "SentBeams": self._sent,
+        }
+        for kernel, least, greatest in kernels:
+            kernel.run(
+                (self._blocks, self._blocks, RAYS), shared, scene, least_alpha=least, greatest_alpha=greatest
+            )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._sent, self._mirror_beams, self._lobe_beams, self._refracted_beams)
+
+
+class Caustics:
+    """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
+
+    def __init__(self, gpu: GpuContext, grid: LowResGrid, *, reuses: bool = False) -> None:
         self._gpu, self._threads, self._grid = gpu, list_threads(gpu), grid
-        self._blocks = blocks
         size = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
         lower = "output.width and output.height"
         self._sums = gpu.storage_buffer(size, lower)
         self._last_sums = gpu.storage_buffer(size, lower) if reuses else None
         self._reuse = Kernel(gpu, "reuse_light", CAUSTICS=1) if reuses else None
-        self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
-        self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
-        self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
-        self._refracted_beams: Kernel | None = None
-        self._places = gpu.ctx.buffer(reserve=PLACE_BYTES)
+        self._count = gpu.ctx.buffer(reserve=4)
+        self._beams: moderngl.Texture | None = None
+        self._places: moderngl.Texture | None = None
+        self._end = Kernel(gpu, "caustic_ends")
         self._find_places = Kernel(gpu, "caustic_places")
         # Software renderers pass barriers slowly, and read a beam once for each of few threads.
         rows = 8 if gpu.is_software else 2
@@ -58,31 +133,25 @@ class Caustics:
         """The sums, for passes that shade."""
         return {"CausticSums": self._sums}
 
-    def trace(
-        self,
-        lights: LightBuffers,
-        objects: ObjectBvh,
-        scene: Bindings,
-        *,
-        bias_m: float,
-        reach_m: float,
-        transmits: bool,
-    ) -> None:
-        """Traces the beams that the objects cast, through transparent ones too if any of them `transmits`.
+    def end_beams(self, sent: CausticBeams, scene: Bindings, reach_m: float) -> None:
+        """Ends beams where they meet something within `reach_m`, of the real scene what the `scene`'s camera sees."""
+        self._make_room(sent.most)
+        self._count.write(bytes(4))
+        self._end.run(
+            (list_threads(self._gpu, sent.most),),
+            sent.bindings,
+            scene,
+            BeamCount=self._count,
+            beam_texels=self._beams,
+            reach=reach_m,
+        )
 
-        `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
-        """
-        kernels = [(self._mirror_beams, 0.0, WIDE_ALPHA), (self._lobe_beams, WIDE_ALPHA, GREATEST_ALPHA)]
-        if transmits:
-            if self._refracted_beams is None:
-                self._refracted_beams = Kernel(
-                    self._gpu, "caustic_beams", RAY_COUNT=RAYS, REFRACTED=1, PATHS=PATHS
-                )
-            kernels.append((self._refracted_beams, 0.0, GREATEST_ALPHA))
-        self._empty_beams(len(lights.virtual_views) * (1 + PATHS if transmits else 1))
-        own: Bindings = {**scene, **objects.bindings, "bias_real": bias_m, "reach": reach_m}
-        for view in range(len(lights.virtual_views)):
-            self._trace_beams(lights, lights.first_virtual_view + view, own, kernels)
+    def _make_room(self, beams: int) -> None:
+        rows = -(-beams // BEAMS_A_ROW)
+        if self._beams is None or self._beams.height < rows:
+            release_all(self._beams, self._places)
+            self._beams = texture_2d(self._gpu, (BEAM_TEXELS * BEAMS_A_ROW, rows), 4, "f4")
+            self._places = texture_2d(self._gpu, (PLACE_TEXELS * BEAMS_A_ROW, rows), 4, "i2")
 
     def run(self, scene: Bindings) -> None:
         """Fills the sums with the light of the beams where they end."""
@@ -94,8 +163,9 @@ class Caustics:
             self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
         shared: Bindings = {
             **self.bindings,
-            "Beams": self._beams,
-            "BeamPlaces": self._places,
+            "BeamCount": self._count,
+            "beam_texels": self._beams,
+            "beam_places": self._places,
             "sample_pixels": grid.pixels,
             "picture_pixels": grid.picture_size,
             "scale": grid.scale,
@@ -105,43 +175,16 @@ class Caustics:
         self._gather.run((TILE * tiles[0], self._gather.local_size[1] * tiles[1]), shared, scene)
         self._splat.run((self._threads,), shared, scene)
 
-    def _empty_beams(self, views: int) -> None:
-        """Allocates and clears the beams of that many views, each with one beam a ray."""
-        most = max(views * self._blocks**2 * RAYS, 1)
-        if self._places.size < PLACE_BYTES * most:
-            self._beams.orphan(HEADER_BYTES + BEAM_BYTES * most)
-            self._places.orphan(PLACE_BYTES * most)
-        self._beams.write(bytes(HEADER_BYTES))
-
-    def _trace_beams(
-        self,
-        lights: LightBuffers,
-        view_index: int,
-        scene: Bindings,
-        kernels: Sequence[tuple[Kernel, float, float]],
-    ) -> None:
-        """Adds the beams of one view, by each kernel those of materials from its least to its greatest alpha."""
-        shared: dict[str, Binding] = {
-            "view_index": view_index,
-            "block_edge": max(lights.tile_size // self._blocks, 1),
-            "Beams": self._beams,
-        }
-        for kernel, least, greatest in kernels:
-            kernel.run(
-                (self._blocks, self._blocks, RAYS), shared, scene, least_alpha=least, greatest_alpha=greatest
-            )
-
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(
             self._sums,
             self._last_sums,
             self._reuse,
+            self._count,
             self._beams,
             self._places,
-            self._mirror_beams,
-            self._lobe_beams,
-            self._refracted_beams,
+            self._end,
             self._find_places,
             self._gather,
             self._splat,

@@ -29,6 +29,9 @@ METALLIC, REFLECTANCE, ROUGHNESS, BY_LIGHT = (
     14,
 )  # columns of the material table, as materials.glsl has them
 
+TEXEL_BYTES = 16
+BVH_ROW_BYTES = 1024 * TEXEL_BYTES
+
 # Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
 # hierarchy may become half as expensive again before it is rebuilt.
 WORN = 1.5
@@ -43,6 +46,7 @@ class CameraImage:
         self.size = size
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2", linear=True)
+        self._has_levels = False  # of the picture that `linear` shows
         self.build_levels()
         self.code_radiance = texture_2d(gpu, (256, 1), 4, "f2")
         self.inverse_response = texture_2d(gpu, (INVERSE_SIZE, 1), 4, "f4")
@@ -72,7 +76,7 @@ class CameraImage:
         """Computes the linear radiance of the picture that was uploaded last, once."""
         if self.is_linear:
             return
-        self.is_linear = True
+        self.is_linear, self._has_levels = True, False
         self._linearize.run(
             self.size, picture=self.code, code_radiance=self.code_radiance, linear_out=self.linear
         )
@@ -90,7 +94,10 @@ class CameraImage:
             self.inverse_response.write(inverse_response(decode).tobytes(), alignment=1)
 
     def build_levels(self) -> None:
-        """Builds the mip levels of the linear picture (for samples that cover several pixels)."""
+        """Builds the mip levels of the linear picture (for samples that cover several pixels), once."""
+        if self._has_levels:
+            return
+        self._has_levels = True
         self.linear.build_mipmaps()
         self.linear.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
 
@@ -200,13 +207,20 @@ def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
     return np.asarray(np.concatenate(columns, axis=1)[mesh.triangles], np.float32)
 
 
+def bvh_texture(gpu: GpuContext, data: bytes) -> moderngl.Texture:
+    """Returns packed nodes or triangles in rows one after the other, as shaders/common/ray_mesh.glsl reads them."""
+    rows = max(-(-len(data) // BVH_ROW_BYTES), 1)
+    size = BVH_ROW_BYTES // TEXEL_BYTES, rows
+    return texture_2d(gpu, size, 4, "u4", data=data.ljust(rows * BVH_ROW_BYTES, b"\0"))
+
+
 class ObjectBvh:
     """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._ctx = gpu.ctx
-        self._nodes = gpu.ctx.buffer(reserve=4)
-        self._faces = gpu.ctx.buffer(reserve=4)
+        self._gpu = gpu
+        self._nodes: moderngl.Texture | None = None
+        self._faces: moderngl.Texture | None = None
         self._corners = self._built = np.zeros((0, 3, 3), np.float32)
         self._mesh: MeshBuffers | None = None
         self._bvh: Bvh | None = None
@@ -234,9 +248,9 @@ class ObjectBvh:
             positions = np.ascontiguousarray(self._corners[..., :3])
             bvh = self._renewed(positions)
             self.release()
-            self._nodes = self._ctx.buffer(bvh.packed())
-            self._faces = self._ctx.buffer(bvh.packed_triangles(positions, self._mesh.triangles))
-        return {"Nodes": self._nodes, "Faces": self._faces, **self._mesh.storage}
+            self._nodes = bvh_texture(self._gpu, bvh.packed())
+            self._faces = bvh_texture(self._gpu, bvh.packed_triangles(positions, self._mesh.triangles))
+        return {"bvh_nodes": self._nodes, "bvh_faces": self._faces, **self._mesh.storage}
 
     def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
         """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
@@ -250,9 +264,8 @@ class ObjectBvh:
         return self._bvh
 
     def release(self) -> None:
-        """Frees the buffers."""
-        self._nodes.release()
-        self._faces.release()
+        """Frees the textures."""
+        release_all(self._nodes, self._faces)
 
 
 class MaterialTable:

@@ -11,7 +11,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
 from deltalight.render_server.lights.lights import DirectionalLight, Light, RectangleLight
 from deltalight.render_server.lights.mirror_lights import MirrorLight
@@ -29,8 +29,7 @@ from deltalight.render_server.passes.shadow_maps import (
 )
 
 LIGHT_BYTES = 160  # of a std430 Light (shaders/common/light_shapes.glsl)
-TEXEL_BYTES = 16  # of four floats
-EMPTY = b"\0" * 256
+TEXEL_BYTES, LIGHT_TEXELS, VIEW_TEXELS = 16, 10, 7  # of a Light and a LightView (shaders/common/lights.glsl)
 BRIGHTEST = float(np.finfo(np.float16).max)
 GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up has to fit, too
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
@@ -67,9 +66,10 @@ class LightBuffers:
         self.real_records = self.virtual_records = b""
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
-        self._light_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
-        self._record_texture = texture_2d(gpu, (LIGHT_BYTES // TEXEL_BYTES, 1), 4, "f4")
-        self._view_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
+        self._light_rows, self._view_rows = (
+            texture_2d(gpu, (texels, 1), 4, "u4", data=bytes(TEXEL_BYTES * texels))
+            for texels in (LIGHT_TEXELS, VIEW_TEXELS)
+        )
         self._environment: moderngl.TextureArray | None = None
         self._environment_half_angle = 0.0
         self._block = UniformBlock(gpu, LightingBlock())
@@ -78,9 +78,8 @@ class LightBuffers:
     def bindings(self) -> dict[str, Binding]:
         """All bindings of the lights, by GLSL name."""
         return {
-            "Lights": self._light_buffer,
-            "light_records": self._record_texture,
-            "LightViews": self._view_buffer,
+            "light_rows": self._light_rows,
+            "light_view_rows": self._view_rows,
             "Lighting": self._block,
             "real_light_depth": self.real_atlas.depth,
             "virtual_light_depth": self.virtual_atlas.depth,
@@ -175,20 +174,18 @@ class LightBuffers:
         self.real_records = self._packed(self.real_views)
         self.virtual_records = self._packed(self.virtual_views)
         packed = self.real_records + self.virtual_records
-        self._light_buffer.orphan(max(len(records), 16))
-        self._view_buffer.orphan(max(len(packed), 16))
-        self._light_buffer.write(records or EMPTY[:16])
-        self._write_record_texture(records)
-        self._view_buffer.write(packed or EMPTY[:16])
+        self._light_rows = self._with_rows(self._light_rows, records)
+        self._view_rows = self._with_rows(self._view_rows, packed)
 
-    def _write_record_texture(self, records: bytes) -> None:
-        """Writes the same records a row each, for shaders that have no storage block left."""
-        size = LIGHT_BYTES // TEXEL_BYTES, max(len(self.lights), 1)
-        if self._record_texture.size != size:
-            self._record_texture.release()
-            self._record_texture = texture_2d(self._gpu, size, 4, "f4")
-        if records:
-            self._record_texture.write(records)
+    def _with_rows(self, texture: moderngl.Texture, records: bytes) -> moderngl.Texture:
+        """Writes records to a texture, a row each; to a new one if their number has changed."""
+        row_bytes = TEXEL_BYTES * texture.width
+        data = records or bytes(row_bytes)
+        if len(data) == row_bytes * texture.height:
+            texture.write(data)
+            return texture
+        texture.release()
+        return texture_2d(self._gpu, (texture.width, len(data) // row_bytes), 4, "u4", data=data)
 
     def _packed(self, views: list[LightView]) -> bytes:
         columns = tile_columns(len(views))
@@ -223,8 +220,7 @@ class LightBuffers:
         """Frees the GL objects."""
         for item in (self.real_atlas, self.virtual_atlas, self.mirror_visibility, self._block):
             item.release()
-        for held in (self._light_buffer, self._view_buffer, self._record_texture):
-            held.release()
+        release_all(self._light_rows, self._view_rows)
         if self._environment is not None:
             self._environment.release()
 

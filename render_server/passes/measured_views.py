@@ -10,20 +10,22 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.view import CameraView
 
+SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
 VIEW_TEXELS = 6  # of a MeasuredView in shaders/common/measured_views.glsl
 
 
 class MeasuredViews:
-    """Linear pictures (RGBA16F, camera units, with mip levels) and depth (R32F, m) of all cameras, a layer each.
+    """Linear pictures (RGBA16F, camera units) and depth (R32F, m) of all cameras, a layer each.
 
-    Pictures smaller than the largest fill the upper left corner of their layer.
+    Pictures have the mip levels that surfels read. Those smaller than the largest fill the upper left corner of their
+    layer.
     """
 
     def __init__(self, gpu: GpuContext, sizes: Sequence[tuple[int, int]]) -> None:
         width, height = (max(size[axis] for size in sizes) for axis in (0, 1))
         shape = width, height, len(sizes)
         self._radiance = gpu.ctx.texture_array(shape, 4, dtype="f2")
-        self._radiance.build_mipmaps()
+        self._radiance.build_mipmaps(max_level=int(SURFEL_PICTURE_LOD))
         self._radiance.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         self._depth = gpu.ctx.texture_array(shape, 1, dtype="f4")
         self._depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
@@ -45,7 +47,7 @@ class MeasuredViews:
         self._cameras.write(b"".join(_packed(view) for view in views), alignment=1)
         for layer, (view, scene) in enumerate(zip(views, scenes, strict=True)):
             self._copy.run(view.size, scene, radiance_out=self._radiance, depth_out=self._depth, layer=layer)
-        self._radiance.build_mipmaps()
+        self._radiance.build_mipmaps(max_level=int(SURFEL_PICTURE_LOD))
         self._radiance.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
 
     def release(self) -> None:

@@ -58,8 +58,8 @@ def read_brdf(path: Path) -> BrdfMeasurements:
     wavelengths, rows = numbers[1 : 1 + count], numbers[1 + count :]
     if count == 0 or len(wavelengths) < count or len(rows) % (4 + count) or (np.diff(wavelengths) <= 0).any():
         raise DeltalightError(
-            f"{path.name} is no whole .brdf file (wavelengths in nm, then rows of four angles and a value for each "
-            "wavelength); get it again."
+            f"{path.name} is not a complete .brdf file (wavelengths in nm, then rows of four angles and a value"
+            " for each wavelength); get it again."
         )
     if wavelengths[0] > 450 or wavelengths[-1] < 650:
         raise DeltalightError(
@@ -81,7 +81,7 @@ def _numbers(path: Path) -> Float64[np.ndarray, " n"]:
     try:
         if path.stat().st_size > _LARGEST_BYTES:
             raise DeltalightError(
-                f"{path.name} is larger than {_LARGEST_BYTES >> 20} MB; that is no .brdf file."
+                f"{path.name} is larger than {_LARGEST_BYTES >> 20} MB; that is not a .brdf file."
             )
         lines = path.read_text(encoding="latin-1").splitlines()
     except OSError as error:
@@ -91,7 +91,7 @@ def _numbers(path: Path) -> Float64[np.ndarray, " n"]:
         numbers = np.array(words, np.float64)
     except ValueError as error:
         raise DeltalightError(
-            f"{path.name} holds something else than numbers; it is no .brdf file."
+            f"{path.name} holds something else than numbers; it is not a .brdf file."
         ) from error
     if not (np.abs(numbers) < _LARGEST).all():  # nor a number
         raise DeltalightError(

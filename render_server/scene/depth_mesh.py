@@ -91,11 +91,14 @@ def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     flat = _median_pixels(inverse, stride)
     chosen = inverse.ravel()[flat]
     gradient = surface.gradient.reshape(2, -1)[:, flat]
-    moved = rays - camera.rays().reshape(-1, 2)[flat]
-    shift = gradient[0] * moved[..., 0] + gradient[1] * moved[..., 1]
+    along = camera.rays().reshape(-1, 2).take(flat, axis=0)
+    moved = [rays[..., axis] - along[..., axis] for axis in (0, 1)]
+    shift = gradient[0] * moved[0] + gradient[1] * moved[1]
     # An outlier of the slope must not throw the node off the depths of its cell.
     at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
-    return _Nodes(pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3)[flat])
+    return _Nodes(
+        pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3).take(flat, axis=0)
+    )
 
 
 def _with_grazing(
@@ -226,23 +229,28 @@ def _world_mesh(
     nodes: _Nodes, triangles: Int32[np.ndarray, "m 3"], world_from_camera: Float64[np.ndarray, "4 4"]
 ) -> TriangleMesh:
     """Keeps the nodes that triangles use and transforms them to the world."""
-    used = np.zeros(nodes.inverse_depth.size, bool)
-    used[triangles.ravel()] = True
-    numbers = np.cumsum(used, dtype=np.int32) - 1
+    is_used = np.zeros(nodes.inverse_depth.size, bool)
+    is_used[triangles.ravel()] = True
+    used, numbers = np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32) - 1
     depth = 1 / nodes.inverse_depth.ravel()[used].astype(np.float64)
-    rays = nodes.rays.reshape(-1, 2)[used]
-    points = np.stack([rays[:, 0] * depth, rays[:, 1] * depth, depth], axis=1)
+    rays = nodes.rays.reshape(-1, 2).take(used, axis=0).T
     rotation = world_from_camera[:3, :3]
-    # einsum, because the BLAS behind `@` spins on every core for such slim matrices.
-    world = np.einsum("ni,ji->nj", points, rotation) + world_from_camera[:3, 3]
-    normals = np.einsum("ni,ji->nj", nodes.normals.reshape(-1, 3)[used], rotation)
     return TriangleMesh(
-        world.astype(np.float32),
-        normals.astype(np.float32),
-        numbers[triangles],
-        nodes.pixels.reshape(-1, 2)[used],
+        _turned(np.stack([rays[0] * depth, rays[1] * depth, depth]), rotation, world_from_camera[:3, 3:]),
+        _turned(nodes.normals.reshape(-1, 3).take(used, axis=0).T.astype(np.float64), rotation),
+        numbers.take(triangles),
+        nodes.pixels.reshape(-1, 2).take(used, axis=0),
         REAL_MATERIAL,
     )
+
+
+def _turned(
+    columns: Float64[np.ndarray, "3 n"], rotation: Float64[np.ndarray, "3 3"], shift: float | np.ndarray = 0.0
+) -> Float32[np.ndarray, "n 3"]:
+    """Returns turned vectors, which are shifted then. Given by columns: NumPy is slow along short rows."""
+    # einsum, because the BLAS behind `@` spins on every core for such slim matrices.
+    turned = np.einsum("ij,jn->in", rotation, columns) + shift
+    return np.ascontiguousarray(turned.T, np.float32)
 
 
 def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:

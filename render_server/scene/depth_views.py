@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
-from deltalight.protocol import short_axis
 from deltalight.render_server.scene.depth_mesh import stride_for_budget
 from deltalight.render_server.scene.depth_surface import DepthSurface, jump_terms_of
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
@@ -17,6 +16,7 @@ from deltalight.render_server.view import NEAR_M, CameraView
 SAME_DEPTH = 0.02
 
 Points = Float64[np.ndarray, "n 3"]
+Columns = Float64[np.ndarray, "3 n"]  # of points: NumPy is slow along short rows
 Mask = Bool[np.ndarray, " n"]
 
 
@@ -42,22 +42,35 @@ class PosedSurface:
         whole = cv2.erode(known.astype(np.uint8), kernel) > 0
         return np.asarray(whole & (step <= inverse * np.float32(slope * 2 * stride) + np.float32(least)))
 
-    def find(self, points: Points) -> tuple[Points, Int64[np.ndarray, " n"]]:
-        """Returns world points in the optical frame, and the pixel (flat index) that shows each; -1: none does."""
+    def find(self, points: Columns) -> tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+        """Returns the depth of world points along the optical axis, m, and the pixel (flat index) that shows each;
+        -1: none does.
+        """
         matrix, camera = self.view.camera_from_world, self.view.camera
-        local = np.einsum("ni,ji->nj", points, matrix[:3, :3]) + matrix[:3, 3]
-        ahead = local[:, 2] > NEAR_M
-        pixel = np.full(len(points), -1)
-        column, row = np.floor(np.nan_to_num(camera.project(local[ahead]), nan=-1.0) + 0.5).astype(int).T
+        local = np.einsum("ij,jn->in", matrix[:3, :3], points) + matrix[:3, 3:]
+        ahead = local[2] > NEAR_M
+        pixel = np.full(points.shape[1], -1)
+        found = np.nan_to_num(camera.project(local[:, ahead].T), nan=-1.0)
+        column, row = (np.floor(axis + 0.5).astype(int) for axis in found.T)
         inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
         pixel[ahead] = np.where(inside, row * camera.width + column, -1)
-        return local, pixel
+        return local[2], pixel
 
-    def pixels_per_area(self, local: Points, normals: Points) -> Float64[np.ndarray, " n"]:
-        """Returns on how many pixels (1/m^2) a surface is shown: fx fy |n.c| / z^3; 0 from behind."""
+    def pixels_per_area(self, points: Columns, normals: Columns) -> Float64[np.ndarray, " n"]:
+        """Returns on how many pixels (1/m^2) surfaces are shown: fx fy |n.c| / z^3; 0 from behind."""
         fx, fy = self.view.camera.matrix[[0, 1], [0, 1]]
-        facing = -np.einsum("ni,ij,nj->n", normals, self.view.world_from_camera[:3, :3], local)
-        return np.asarray(fx * fy * np.maximum(facing, 0) / np.maximum(local[:, 2], NEAR_M) ** 3)
+        to_eye = self.view.position[:, None] - points
+        along = np.einsum("i,in->n", -self.view.world_from_camera[:3, 2], to_eye)
+        z = np.maximum(along, NEAR_M)
+        facing = np.einsum("in,in->n", normals, to_eye)
+        return np.asarray(fx * fy * np.maximum(facing, 0) / (z * z * z))
+
+    def shows(
+        self, depth_m: Float64[np.ndarray, " n"], pixel: Int64[np.ndarray, " n"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Returns whether a surface is shown at the depth of each point; arguments are what `find` returns."""
+        inverse = self.surface.inverse_depth.ravel()[pixel]
+        return np.asarray((pixel >= 0) & (inverse > 0) & (np.abs(inverse * depth_m - 1) < SAME_DEPTH))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,33 +95,33 @@ class DepthViews:
     def _without_copies(
         self, index: int, mesh: TriangleMesh, covered: Sequence[Bool[np.ndarray, " p"]]
     ) -> TriangleMesh:
-        points, normals = mesh.positions.astype(np.float64), mesh.normals.astype(np.float64)
-        own = self.frames[index].pixels_per_area(self.frames[index].find(points)[0], normals)
-        copied = np.zeros(len(points), bool)
+        points, normals = _columns(mesh.positions), _columns(mesh.normals)
+        own = self.frames[index].pixels_per_area(points, normals)
+        copied = np.zeros(len(own), bool)
         for number, other in enumerate(self.frames):
             if number == index:
                 continue
-            local, pixel = other.find(points)
-            shown = other.pixels_per_area(local, normals)
+            depth_m, pixel = other.find(points)
+            shown = other.pixels_per_area(points, normals)
             larger = shown >= own if number < index else shown > own
-            copied |= larger & covered[number][pixel] & _is_there(other, local, pixel)
-        return replace(mesh, triangles=mesh.triangles[~short_axis.all_of(copied[mesh.triangles])])
+            copied |= larger & covered[number][pixel] & other.shows(depth_m, pixel)
+        kept = ~np.logical_and.reduce([copied[corner] for corner in mesh.triangles.T])
+        return replace(mesh, triangles=mesh.triangles[np.flatnonzero(kept)])
 
     def count_showing(self, points: Points) -> Int64[np.ndarray, " n"]:
         """Returns how many frames show a surface at each point."""
-        return np.asarray(sum(_is_there(each, *each.find(points)).astype(np.int64) for each in self.frames))
+        columns = _columns(points)
+        return np.asarray(sum(each.shows(*each.find(columns)).astype(np.int64) for each in self.frames))
 
     def in_free_space(self, points: Points) -> Mask:
         """Returns which points lie before what a camera sees: nothing is there."""
-        free = np.zeros(len(points), bool)
+        free, columns = np.zeros(len(points), bool), _columns(points)
         for frame in self.frames:
-            local, pixel = frame.find(points)
+            depth_m, pixel = frame.find(columns)
             inverse = frame.surface.inverse_depth.ravel()[pixel]
-            free |= (pixel >= 0) & (inverse > 0) & (inverse * local[:, 2] < 1 - SAME_DEPTH)
+            free |= (pixel >= 0) & (inverse > 0) & (inverse * depth_m < 1 - SAME_DEPTH)
         return free
 
 
-def _is_there(frame: PosedSurface, local: Points, pixel: Int64[np.ndarray, " n"]) -> Mask:
-    """Returns whether the frame shows a surface at the points."""
-    inverse = frame.surface.inverse_depth.ravel()[pixel]
-    return np.asarray((pixel >= 0) & (inverse > 0) & (np.abs(inverse * local[:, 2] - 1) < SAME_DEPTH))
+def _columns(points: Float64[np.ndarray, "n 3"] | Float32[np.ndarray, "n 3"]) -> Columns:
+    return np.ascontiguousarray(points.T, np.float64)

@@ -189,7 +189,7 @@ def _triangles(
     indices = np.arange(count) if given is None else given
     if mode == _TRIANGLES:
         if len(indices) % 3:
-            raise GltfFaultError(f"{len(indices)} indices are no whole number of triangles")
+            raise GltfFaultError(f"{len(indices)} indices are not a whole number of triangles")
         return indices.reshape(-1, 3)
     if len(indices) < 3:
         return np.zeros((0, 3), np.int64)

@@ -61,7 +61,7 @@ def read_material(path: Path) -> PrecomputedMaterial:
     except OSError as error:
         raise DeltalightError(f"{path} cannot be read ({error.strerror}); {_ADVICE}.") from error
     if not head.startswith(_MAGIC) or len(head.split()) != 4:
-        raise DeltalightError(f"{path} is no precomputed material; {_ADVICE}.")
+        raise DeltalightError(f"{path} is not a precomputed material; {_ADVICE}.")
     version, digest = head.split()[2:]
     if version != str(VERSION).encode():
         raise DeltalightError(
@@ -70,7 +70,7 @@ def read_material(path: Path) -> PrecomputedMaterial:
         )
     if len(content) > _LARGEST_BYTES:
         raise DeltalightError(
-            f"{path} is larger than {_LARGEST_BYTES >> 20} MB, which no material is; {_ADVICE}."
+            f"{path} is larger than {_LARGEST_BYTES >> 20} MB, too large for a material; {_ADVICE}."
         )
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise DeltalightError(f"{path} is damaged or cut short; {_ADVICE} again.")

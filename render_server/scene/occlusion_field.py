@@ -8,7 +8,7 @@ faded out. Rays are traced by embree, only towards what encloses the object.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Float64, Int32, Int64
@@ -28,6 +28,14 @@ BLEND_CELLS = 2  # over which a shell blends into the next at its border; the ob
 
 ProgressCallback = Callable[[float], None]
 """Takes the fraction of the work that is done (0..1); may raise to cancel the rest."""
+
+PartKeeper = Callable[[str, Callable[[], np.ndarray]], np.ndarray]
+"""Returns the part of this name, computed, or as an earlier computation of the same kept it."""
+
+
+def compute_part(_name: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+    """Keeps nothing (a `PartKeeper`)."""
+    return compute()
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,22 +195,31 @@ class OcclusionField:
 
 
 def compute_occlusion(
-    rays: ObjectRays, grid: ShellGrid, settings: FieldSettings, progress: ProgressCallback
+    rays: ObjectRays,
+    grid: ShellGrid,
+    settings: FieldSettings,
+    progress: ProgressCallback,
+    keep: PartKeeper = compute_part,
 ) -> Float16[np.ndarray, "shells n n n k"]:
-    """Samples the occlusion on all shells."""
-    n, count = settings.resolution, settings.order**2
-    found = np.empty((settings.shells, n, n, n, count), np.float16)
+    """Samples the occlusion on all shells, each of which is a part of its own."""
+    found = []
     for shell in range(settings.shells):
-        points = grid.points(shell, n)
 
         def report(fraction: float, shell: int = shell) -> None:
             progress((shell + fraction) / settings.shells)
 
-        values, inside = _occlusion_at(rays, points, settings, report)
-        cells = values.reshape(n, n, n, count)
-        spacing = 2 * grid.halves[shell][::-1] / (n - 1)
-        found[shell] = fill_inside(cells, inside.reshape(n, n, n), spacing)
-    return found
+        compute = partial(_shell_occlusion, rays, grid, shell, settings, report)
+        found.append(keep(f"occlusion-{shell}", compute))
+    return np.stack(found)
+
+
+def _shell_occlusion(
+    rays: ObjectRays, grid: ShellGrid, shell: int, settings: FieldSettings, report: ProgressCallback
+) -> Float16[np.ndarray, "n n n k"]:
+    n = settings.resolution
+    values, inside = _occlusion_at(rays, grid.points(shell, n), settings, report)
+    spacing = 2 * grid.halves[shell][::-1] / (n - 1)
+    return fill_inside(values.reshape(n, n, n, -1), inside.reshape(n, n, n), spacing).astype(np.float16)
 
 
 def _occlusion_at(

@@ -7,6 +7,7 @@ coefficients. A sample of the field sums the pieces that it sees.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,9 +18,11 @@ from deltalight.render_server.scene.occlusion_field import (
     CHUNK,
     FieldSettings,
     ObjectRays,
+    PartKeeper,
     ProgressCallback,
     RayHits,
     ShellGrid,
+    compute_part,
     direction_set,
     fill_inside,
 )
@@ -90,19 +93,38 @@ def _texels(texture: Float16[np.ndarray, "h w 3"], uv: Float32[np.ndarray, "m 3 
 
 
 def compute_transfer(
-    pieces: SurfacePieces, grid: ShellGrid, settings: FieldSettings, progress: ProgressCallback
+    pieces: SurfacePieces,
+    grid: ShellGrid,
+    settings: FieldSettings,
+    progress: ProgressCallback,
+    keep: PartKeeper = compute_part,
 ) -> Float16[np.ndarray, "shells h h h 9 9 3"]:
-    """Samples the radiance reflected by the object on all shells, at half the resolution of the occlusion."""
-    n = settings.resolution // 2
+    """Samples the radiance reflected by the object on all shells, at half the resolution of the occlusion.
+
+    Each shell is a part of its own.
+    """
     rays = ObjectRays(pieces.corners)
     reflected = _reflected_light(pieces, rays, settings.rays)
-    found = np.empty((settings.shells, n, n, n, LENGTH, LENGTH, 3), np.float16)
+    found = []
     for shell in range(settings.shells):
-        values, inside = _received_light(rays, grid.points(shell, n), reflected, settings.rays)
-        cells = values.reshape(n, n, n, LENGTH, LENGTH, 3)
-        found[shell] = fill_inside(cells, inside.reshape(n, n, n), 2 * grid.halves[shell][::-1] / (n - 1))
+        compute = partial(_shell_transfer, rays, grid, shell, reflected, settings)
+        found.append(keep(f"transfer-{shell}", compute))
         progress((shell + 1) / settings.shells)
-    return found
+    return np.stack(found)
+
+
+def _shell_transfer(
+    rays: ObjectRays,
+    grid: ShellGrid,
+    shell: int,
+    reflected: Float32[np.ndarray, "m 9 3"],
+    settings: FieldSettings,
+) -> Float16[np.ndarray, "h h h 9 9 3"]:
+    n = settings.resolution // 2
+    values, inside = _received_light(rays, grid.points(shell, n), reflected, settings.rays)
+    cells = values.reshape(n, n, n, LENGTH, LENGTH, 3)
+    spacing = 2 * grid.halves[shell][::-1] / (n - 1)
+    return fill_inside(cells, inside.reshape(n, n, n), spacing).astype(np.float16)
 
 
 def _reflected_light(pieces: SurfacePieces, rays: ObjectRays, count: int) -> Float32[np.ndarray, "2m 9 3"]:

@@ -33,7 +33,7 @@ def read_info(folder: Path, what: str) -> dict[str, Any]:
             f"{path} cannot be read ({error.strerror}); {what} is a folder with it."
         ) from error
     except (ValueError, RecursionError) as error:
-        raise DeltalightError(f"{path} is no JSON document; {what} is a folder with one.") from error
+        raise DeltalightError(f"{path} is not a JSON document; {what} is a folder with one.") from error
     if not isinstance(info, dict):
         raise DeltalightError(f"{path} holds no JSON object; {what} is a folder with one.")
     return info

@@ -1,7 +1,8 @@
 """The cameras of a room: each node's streams are paired for themselves, their newest frames are rendered together.
 
 A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: it is
-silent, sees another board than the first one, or its frames are of another time.
+silent, sees another board than the first one, or its frames are of another time. What a silent one saw last lights
+the room for half a minute.
 """
 
 from collections import Counter, deque
@@ -18,6 +19,8 @@ from deltalight.render_server.started_frame import CameraFrame
 
 SILENT_NS = 2 * 10**9  # without a frame; or this many of the camera's periods, if they are longer
 SILENT_PERIODS = 5
+REMEMBERED_NS = 30 * 10**9  # how long a silent camera's last frame lights the room
+GATHER_NS = 300 * 10**6  # how long the first frames, and those after a pause, wait for all cameras
 KEPT_ARRIVALS = 5
 MAX_NODES = 2 * MAX_CAMERAS  # those that send light without frames included
 
@@ -82,17 +85,25 @@ class RoomCameras:
 
     `on_fault` is called with the fault of a frame whose data is broken, which is dropped. `counts` are those of
     `FrameAssembler`, and `unplaced`: messages of nodes beyond `MAX_NODES` and frames of cameras beyond `MAX_CAMERAS`,
-    while none of those that have a place is silent.
+    while none of those that have a place is silent. `endpoints`: how many are read, so how many nodes to expect.
     """
 
     def __init__(
-        self, settings: PairingSettings | None, on_fault: Callable[[Exception], None], *, needs_depth: bool
+        self,
+        settings: PairingSettings | None,
+        on_fault: Callable[[Exception], None],
+        *,
+        needs_depth: bool,
+        endpoints: int = 1,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.is_waiting = False  # for a camera's frame, to render others with it
         self._settings = settings or PairingSettings()
         self._on_fault = on_fault
         self._needs_depth = needs_depth
+        self._endpoints = endpoints
+        self._taken_ns = 0  # when frames were last returned
+        self._gathers = True  # waits for all nodes, for the first time or after a pause
         self._assemblers: dict[str, FrameAssembler] = {}
         self._places: dict[str, _Place] = {}
 
@@ -102,9 +113,10 @@ class RoomCameras:
         for assembler in self._assemblers.values():
             assembler.needs_depth = needs_depth
 
-    def restart(self) -> None:
-        """Forgets all nodes, for another source; counts continue."""
+    def restart(self, endpoints: int) -> None:
+        """Forgets all nodes, for another source of so many endpoints; counts continue."""
         self._assemblers, self._places, self.is_waiting = {}, {}, False
+        self._endpoints, self._gathers = endpoints, True
 
     def add(self, message: Message, parts: Sequence[memoryview], multipart: ReceivedMultipart) -> None:
         """Stores a message until its partners arrive."""
@@ -141,8 +153,10 @@ class RoomCameras:
     def take(self, now_ns: int) -> tuple[Taken, ...]:
         """Returns the newest frame of each camera that counts, if any of them is new, else none.
 
-        A new frame waits for those of other cameras that are due, for `together_ms` at most.
+        Silent ones come last. A new frame waits for those of other cameras that are due, for `together_ms` at most;
+        after a pause of all of them, for those of all nodes: the GPU holds what so many cameras need.
         """
+        self._gathers |= self._are_paused(now_ns)
         for name, assembler in list(self._assemblers.items()):
             try:
                 frame = assembler.take(now_ns)
@@ -151,11 +165,16 @@ class RoomCameras:
                 continue
             if frame is not None:
                 self._note(name, frame, now_ns)
+        self.is_waiting = self._gathers and self._must_gather(now_ns)
+        if self.is_waiting:
+            return ()
         members = self._members()
         self.is_waiting = self._must_wait(members, now_ns)
         if self.is_waiting or not any(place.is_new for place in members):
             return ()
-        taken = tuple(Taken(place.name, place.newest, place.is_new) for place in members)
+        self._taken_ns, self._gathers = now_ns, False
+        room = [*members, *self._remembered(members)]
+        taken = tuple(Taken(place.name, place.newest, place.is_new) for place in room)
         for place in self._places.values():
             place.is_new = False
         return taken
@@ -177,6 +196,17 @@ class RoomCameras:
         longest = min(silent, key=lambda place: place.newest.received_ns).name
         del self._places[longest], self._assemblers[longest]
         return True
+
+    def _are_paused(self, now_ns: int) -> bool:
+        """Returns whether no camera has sent anything for as long as its frames count."""
+        patience_ns = max((place.patience_ns for place in self._places.values()), default=0)
+        return now_ns - self._taken_ns > patience_ns
+
+    def _must_gather(self, now_ns: int) -> bool:
+        """Returns whether the first frames after a pause still wait for those of nodes that are expected."""
+        new_ns = [place.ready_ns for place in self._places.values() if place.is_new]
+        expected = min(max(self._endpoints, len(self._assemblers)), MAX_CAMERAS)
+        return 0 < len(new_ns) < expected and now_ns - min(new_ns) < GATHER_NS
 
     def _must_wait(self, members: Sequence[_Place], now_ns: int) -> bool:
         new_since_ns = min((place.ready_ns for place in members if place.is_new), default=None)
@@ -200,6 +230,17 @@ class RoomCameras:
             self._judge(place, first, is_silent=place not in live)
         return [place for place in live if place.status == "live"]
 
+    def _remembered(self, members: Sequence[_Place]) -> list[_Place]:
+        """Returns silent cameras that may be back soon: the others' light stays, and nothing is made for fewer."""
+        newest_ns = max(place.newest.received_ns for place in members)
+        return [
+            place
+            for place in self._places.values()
+            if place.status == "silent"
+            and newest_ns - place.newest.received_ns <= REMEMBERED_NS
+            and _status(place, members[0], is_silent=False)[0] != "other_board"
+        ]
+
     def _judge(self, place: _Place, first: _Place, *, is_silent: bool) -> None:
         status, remark = _status(place, first, is_silent=is_silent)
         if status == place.status:
@@ -214,7 +255,7 @@ class RoomCameras:
 def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraStatus, str]:
     """Returns whether a camera is rendered with the first one, and the sentence that says why not."""
     if is_silent:
-        return "silent", f"The camera {place.name} sends no frames; the others go on without it."
+        return "silent", f"The camera {place.name} sends no frames; the others continue without it."
     board, wanted = place.newest.view.board, first.newest.view.board
     if board is not None and wanted is not None and board != wanted:
         return (
@@ -224,7 +265,7 @@ def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraSta
     if _apart_ns(place, first) > max(place.patience_ns, first.patience_ns):
         return (
             "other_time",
-            f"The camera {place.name} is left out: its frames are of another time than those of {first.name}.",
+            f"The camera {place.name} is left out: its frames are from a different time than those of {first.name}.",
         )
     return "live", ""
 

@@ -116,7 +116,7 @@ class PairingSettings(StrictModel):
         default=20.0,
         ge=0,
         le=1000,
-        description="Greatest difference of capture time of colour and depth, ms.",
+        description="Largest difference in capture time between colour and depth, ms.",
     )
     patience_ms: float = Field(
         default=250.0, ge=0, le=5000, description="How long a colour frame waits for its pose and depth, ms."

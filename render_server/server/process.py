@@ -61,19 +61,20 @@ class ServerSettings(StrictModel):
 
     scene: Path | None = Field(default=None, description="Scene document to start with.")
     session: Path | None = Field(
-        default=None, description="File that keeps the current scene, so that a restart goes on with it."
+        default=None, description="File that keeps the current scene, so that a restart continues with it."
     )
     subscribe: tuple[str, ...] = Field(min_length=1, description="Endpoints of sensor nodes.")
-    publish: str = Field(description="Endpoint for composites and stats.")
+    publish: str = Field(description="Endpoint for composites and statistics.")
     control: str = Field(description="Endpoint for commands.")
     name: Name = Field(default="render-server", description="Name in topics and messages.")
     epoch: int | None = Field(
         default=None,
         ge=1,
-        description="Which start of its room's render server this is; `ping` answers with it. null = no room's.",
+        description="Number of this start among those of its room's render server, as `ping` returns it; null = "
+        "not part of a room.",
     )
     device: int | None = Field(default=None, ge=0, description="EGL device; null = the driver's first.")
-    allow_software: bool = Field(default=False, description="Accept a renderer without a GPU.")
+    allow_software: bool = Field(default=False, description="Allow rendering without a GPU.")
     jpeg_quality: int = Field(default=90, ge=1, le=100, description="Quality of published composites.")
     pairing: PairingSettings = Field(default_factory=PairingSettings)
 
@@ -277,6 +278,7 @@ def serve(
             epoch=settings.epoch,
             renderer_name=renderer_name,
             keep_scene=lambda kept: _keep(settings.session, kept),
+            endpoints=len(source.endpoints),
             use_source=use_source,
             count_objects=count_objects,
             mailbox_drops=drops,

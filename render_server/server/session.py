@@ -118,8 +118,8 @@ class RenderSession:
     Frames are rendered in the views `watched`, too. `scene_id` is the sender's id of the scene, if given; `instance`
     distinguishes this session from those before a restart, and `epoch` orders the render servers of a room.
     `keep_scene` is called with every accepted scene, so that a restart can resume with it; `mailbox_drops` returns
-    what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those configured);
-    `count_objects` returns what the GPU holds, by kind.
+    what the receiver dropped, by topic; so many `endpoints` are read at first, and `use_source` makes it read others
+    (None: those configured); `count_objects` returns what the GPU holds, by kind.
     """
 
     def __init__(
@@ -133,6 +133,7 @@ class RenderSession:
         renderer_name: str = "",
         keep_scene: Callable[[SceneDocument], None] = lambda _scene: None,
         mailbox_drops: Callable[[], Mapping[str, int]] = dict,
+        endpoints: int = 1,
         use_source: Callable[[Sequence[str] | None], SourceInUse] = _only_configured,
         count_objects: Callable[[], Mapping[str, int]] = dict,
         clock_ns: Callable[[], int] = time.time_ns,
@@ -145,7 +146,10 @@ class RenderSession:
         self._watchers: dict[str, tuple[int, tuple[ShownView, ...]]] = {}  # when each said so, and what
         self._renderer = renderer
         self._cameras = RoomCameras(
-            pairing, lambda fault: self._count_fault("bad_frames", fault), needs_depth=_needs_depth(scene)
+            pairing,
+            lambda fault: self._count_fault("bad_frames", fault),
+            needs_depth=_needs_depth(scene),
+            endpoints=endpoints,
         )
         self._told: Mapping[str, CameraStatus] = {}  # of the cameras, by name
         self._name = name
@@ -253,7 +257,7 @@ class RenderSession:
             node=self._name,
             capture_ns=self._clock_ns(),
             state="starting",
-            detail=f"Preparing shaders, which are compiled once on a machine: {shaders} of some {some}.",
+            detail=f"Compiling shaders, once per machine: {shaders} of about {some}.",
         )
 
     def _rates(self) -> dict[str, float]:
@@ -350,7 +354,7 @@ class RenderSession:
         if source.is_another:
             self._newest = ()  # of the previous source
             self._finished.clear()
-            self._cameras.restart()
+            self._cameras.restart(len(source.endpoints))
             self._renderer.forget_frames()
         return {"endpoints": list(source.endpoints)}
 

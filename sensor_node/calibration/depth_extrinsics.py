@@ -78,8 +78,8 @@ def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose
         seen = [(view, patch) for view, patch in patches if patch is not None]
         if len(seen) < LEAST_VIEWS:
             raise DeltalightError(
-                f"the depth sensor shows the board in {len(seen)} views only and {LEAST_VIEWS} are needed; record it "
-                "from 0.4 to 1.5 m at different tilts, or begin with a rough depth_from_rgb in extrinsics.yaml."
+                f"the depth sensor shows the board in only {len(seen)} views, and {LEAST_VIEWS} are needed; record"
+                " it from 0.4 to 1.5 m at different tilts, or begin with a rough depth_from_rgb in extrinsics.yaml."
             )
         rows, misses = _equations(seen, rgb_from_depth)
         turn, shift = np.split(np.linalg.lstsq(rows, -misses, rcond=None)[0], 2)

@@ -93,8 +93,8 @@ def mean_placement(poses: Sequence[Pose], name: str) -> Placement:
     """
     if len(poses) < LEAST_POSES:
         raise DeltalightError(
-            f"the board gives {name} in {len(poses)} moments only and {LEAST_POSES} are needed; record it at rest in "
-            "more places, seen whole by every camera concerned at the same time."
+            f"the board gives {name} at only {len(poses)} moments, and {LEAST_POSES} are needed; record it at rest"
+            " in more places, where every camera involved sees all of it at the same time."
         )
     mean = mean_pose(poses)
     metres, degrees = pose_offsets(poses, mean)
@@ -108,7 +108,7 @@ def mean_placement(poses: Sequence[Pose], name: str) -> Placement:
     if len(good) < LEAST_POSES or spread_m > MOST_SPREAD_M or spread_deg > MOST_SPREAD_DEG:
         raise DeltalightError(
             f"the poses for {name} spread by {1e3 * spread_m:.1f} mm and {spread_deg:.2f} degrees (at most "
-            f"{1e3 * MOST_SPREAD_M:.0f} mm and {MOST_SPREAD_DEG:.0f} degree will do); calibrate the lenses first, "
-            "and record the board larger in the picture and at rest."
+            f"{1e3 * MOST_SPREAD_M:.0f} mm and {MOST_SPREAD_DEG:.0f} degree is acceptable); calibrate the lenses"
+            " first, and record the board larger in the picture and at rest."
         )
     return Placement(mean, len(good), len(poses) - len(good), spread_m, spread_deg)

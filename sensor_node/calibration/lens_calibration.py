@@ -152,14 +152,14 @@ def require_good(result: LensResult) -> None:
     if fit.tilt_spread_deg < LEAST_TILT_SPREAD_DEG:
         raise DeltalightError(
             f"the target has one tilt in all views (it varies by {fit.tilt_spread_deg:.1f} degrees in one direction),"
-            " which leaves the focal length open; take views with it tilted by 20 to 45 degrees to the left, right, "
-            "front and back."
+            " which leaves the focal length undetermined; take views with it tilted by 20 to 45 degrees to the"
+            " left, right, front and back."
         )
     if not fit.focal_fraction <= MOST_FOCAL_FRACTION:
         raise DeltalightError(
             f"the views leave the focal length uncertain by {100 * fit.focal_fraction:.1f} % (at most "
-            f"{100 * MOST_FOCAL_FRACTION:.0f} % will do); take more views, with the target larger in the picture and "
-            "tilted by 20 to 45 degrees to the left, right, front and back."
+            f"{100 * MOST_FOCAL_FRACTION:.0f} % is acceptable); take more views, with the target larger in the"
+            " picture and tilted by 20 to 45 degrees to the left, right, front and back."
         )
     if not fit.rms_px <= MOST_RMS_FRACTION * width:
         raise DeltalightError(

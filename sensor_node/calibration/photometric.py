@@ -70,7 +70,9 @@ def read_bracket(folder: Path, eye: Eye) -> Bracket:
         DeltalightError: no such folder, or a picture without exposure.
     """
     if not folder.is_dir():
-        raise DeltalightError(f"'{folder}' is no folder; give one with the pictures of an exposure bracket.")
+        raise DeltalightError(
+            f"'{folder}' is not a folder; give one with the pictures of an exposure bracket."
+        )
     listed = folder / f"{eye}.txt"
     if listed.is_file():
         exposures = {entry.path: entry.exposure_s for entry in read_list(listed)}
@@ -81,7 +83,7 @@ def read_bracket(folder: Path, eye: Eye) -> Bracket:
     if lost or not exposures:
         name = lost[0] if lost else folder
         raise DeltalightError(
-            f"{name} tells no exposure; write it as third column of {eye}.txt, or give pictures with EXIF data."
+            f"{name} has no exposure; write it as the third column of {eye}.txt, or give pictures with EXIF data."
         )
     pictures = tuple(decode_rgb(read_bytes(path), str(path)) for path in exposures)
     return Bracket(pictures, tuple(float(exposure or 0) for exposure in exposures.values()))
@@ -112,7 +114,7 @@ def calibrate_response(bracket: Bracket) -> Response:
     if not residual <= MOST_RESIDUAL:
         raise DeltalightError(
             f"the exposures disagree about the light by {100 * residual:.0f} % (at most {100 * MOST_RESIDUAL:.0f} % "
-            "will do); keep camera and scene still, lock white balance and gain, and check the exposure times."
+            "is acceptable); keep camera and scene still, lock white balance and gain, and check the exposure times."
         )
     return Response(table, len(bracket.pictures), residual)
 
@@ -184,7 +186,7 @@ def _check_paper(albedo: float, spread: float) -> None:
     if spread > MOST_SPREAD:
         raise DeltalightError(
             f"the paper's albedo differs by {100 * spread:.0f} % from place to place or picture to picture (at most "
-            f"{100 * MOST_SPREAD:.0f} % will do); light the sheet evenly and keep shadows and gloss away."
+            f"{100 * MOST_SPREAD:.0f} % is acceptable); light the sheet evenly and keep shadows and gloss away."
         )
 
 

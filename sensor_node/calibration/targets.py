@@ -156,7 +156,7 @@ def parse_target(text: str | None, known: BoardSpec | None, folders: Sequence[Pa
     columns, rows, square = (float(group) for group in match.groups()) if match else (0.0, 0.0, 0.0)
     if min(columns, rows) < 3 or not 0 < square < 10:
         raise DeltalightError(
-            f"'{text}' is no chessboard; write chessboard:COLUMNSxROWS:SQUARE with its inner corners (3 or more "
+            f"'{text}' is not a chessboard; write chessboard:COLUMNSxROWS:SQUARE with its inner corners (3 or more "
             "each) and the edge of a square in metres, such as chessboard:8x6:0.117."
         )
     return Chessboard(int(columns), int(rows), square)

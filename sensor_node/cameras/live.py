@@ -105,8 +105,8 @@ def colour_camera(
         return CameraModel(width, height, np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]))
     if width * known.height != height * known.width:
         raise DeltalightError(
-            f"{source} is calibrated for {known.width}x{known.height}, which {width}x{height} is no scaled copy "
-            "of; leave width and height out or calibrate at that size."
+            f"{source} is calibrated for {known.width}x{known.height}, which {width}x{height} is not a scaled "
+            "copy of; leave width and height out or calibrate at that size."
         )
     return known.resized(width, height)
 
@@ -178,7 +178,7 @@ class LiveCamera(Camera):
             if age_s <= max_age_s:
                 return frame
         raise StaleFrameError(
-            f"the newest frame of {self.source} is {age_s:.2f} s old, {max_age_s:g} s are allowed; see its cable."
+            f"the newest frame of {self.source} is {age_s:.2f} s old, {max_age_s:g} s are allowed; check its cable."
         )
 
     def note_capture(self, monotonic_ns: int) -> None:

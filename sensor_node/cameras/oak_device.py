@@ -63,7 +63,7 @@ class OakDevice:
         except RuntimeError as error:
             self.close()
             raise CameraFailure(
-                f"the OAK {info.deviceId} does not start ({error}); plug it in again."
+                f"the OAK {info.deviceId} does not start ({error}); unplug it and plug it in again."
             ) from error
         except DeltalightError:
             self.close()

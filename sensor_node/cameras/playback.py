@@ -214,7 +214,7 @@ class PlaybackCamera(Camera):
 
     def _index_at(self, position_s: float) -> int:
         if math.isnan(position_s):
-            raise DeltalightError(f"{position_s} s is no place in a recording; give a number.")
+            raise DeltalightError(f"{position_s} s is not a position in a recording; give a number.")
         wanted = self._times[0] + int(np.clip(position_s, 0, 1e9) * 1e9)
         return max(int(np.searchsorted(self._times, wanted, "right")) - 1, 0)
 

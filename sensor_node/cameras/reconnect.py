@@ -61,7 +61,9 @@ class ReconnectingCamera(Camera):
         """
         self.close()
         if self._thread is not None:
-            raise DeltalightError(f"{self._name} hangs in its driver; plug it in again or start anew.")
+            raise DeltalightError(
+                f"{self._name} hangs in its driver; unplug it and plug it in again, or restart the node."
+            )
         self._inner.open()
         self._closing.clear()
         self._kept.clear()

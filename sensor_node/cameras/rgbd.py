@@ -115,7 +115,7 @@ class RgbdCamera(LiveCamera):
     def capture(self) -> SensorFrame:
         """Wait for the next pair of pictures."""
         if not self._capture.grab():
-            raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
+            raise CameraFailure(f"{self.source} no longer sends pictures; check that it is plugged in.")
         self.note_capture(time.monotonic_ns())
         backend = BACKENDS[self._kind]
         has_color, color = self._capture.retrieve(flag=backend.color)

@@ -121,7 +121,7 @@ class UvcCamera(LiveCamera):
         capture = cv2.VideoCapture(int(self._device) if self._device.isdecimal() else self._device, backend)
         if not capture.isOpened():
             raise CameraFailure(
-                f"{self.source} cannot be opened; end the program that uses it, or choose another one from "
+                f"{self.source} cannot be opened; stop the program that uses it, or choose another one from "
                 "`deltalight node --list`."
             )
         return capture
@@ -167,7 +167,7 @@ class UvcCamera(LiveCamera):
         """Wait for the next picture as the backend gives it, and note its capture time."""
         capture = self._capture
         if capture is None or not capture.grab():
-            raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
+            raise CameraFailure(f"{self.source} no longer sends pictures; check that it is plugged in.")
         grabbed_ns = time.monotonic_ns()
         given, raw = capture.retrieve()
         # V4L2 reports the time of the buffer by CLOCK_MONOTONIC in ms.
@@ -181,7 +181,7 @@ class UvcCamera(LiveCamera):
             picture = decode(self._grab(), self.source)
             if picture is not None:
                 return picture
-        raise CameraFailure(f"{self.source} gives broken pictures only; use a shorter cable or another port.")
+        raise CameraFailure(f"{self.source} sends only broken pictures; use a shorter cable or another port.")
 
 
 def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None] | None:

@@ -62,6 +62,6 @@ def light_warnings(radiance: RadianceMap) -> list[str]:
         fraction = float(solid[radiance.seen].sum()) / (2 * np.pi)
         sentences.append(
             f"the fish-eye lens sees {100 * fraction:.0f} % of the hemisphere about its axis; light from the rest is "
-            "guessed, so use a lens of 160 degrees or more, or correct `image_circle` in fisheye.yaml."
+            "estimated, so use a lens of 160 degrees or more, or correct `image_circle` in fisheye.yaml."
         )
     return sentences

@@ -14,7 +14,7 @@ class CborError(DeltalightError):
     """The bytes are no CBOR, or more of it than is read here."""
 
     def __init__(self) -> None:
-        super().__init__("it is no CBOR of definite length")
+        super().__init__("it is not CBOR of definite length")
 
 
 def decode_cbor(data: bytes) -> Any:  # noqa: ANN401 - as json.loads

@@ -244,7 +244,7 @@ def _sample(payload: bytes, encoding: int) -> Sample:
     else:
         raise DeltalightError(f"{name} is coded as {encoding:#04x}; send JSON (1) or CBOR (2).")
     if not isinstance(values, dict):
-        raise DeltalightError(f"{name} is no object.")
+        raise DeltalightError(f"{name} is not an object.")
     return validate(Sample, values, name)
 
 

@@ -40,16 +40,20 @@ class TrackingSettings(StrictModel):
     )
     listen: str | None = Field(
         default=None,
-        description="Address to receive at, such as 127.0.0.1 or 0.0.0.0; null = join the source's multicast group.",
+        description="Address to listen on, such as 127.0.0.1 or 0.0.0.0; null = join the source's multicast "
+        "group.",
     )
     port: int = Field(default=PORT, ge=0, le=65535, description="UDP port; 0 = a free one.")
     delay_s: float = Field(
-        default=0.0, ge=-1, le=1, description="How much later a pose arrives than a picture of its moment, s."
+        default=0.0,
+        ge=-1,
+        le=1,
+        description="How much later a pose arrives than the picture of the same moment, s.",
     )
     world_from_stage: tuple[Row, Row, Row, Row] = Field(
-        default=IDENTITY, description="The tracker's stage in the world, 4x4 by rows."
+        default=IDENTITY, description="Transform from the tracker's stage to the world, 4x4 by rows."
     )
-    lens: bool = Field(default=False, description="Take the lens from the packets, in place of rgb.yaml.")
+    lens: bool = Field(default=False, description="Take the lens from the packets instead of rgb.yaml.")
 
     @field_validator("listen")
     @classmethod
@@ -92,8 +96,8 @@ class TrackingReceiver:
             self._socket = _opened(self._settings)
         except OSError as fault:
             raise DeltalightError(
-                f"Tracking data cannot be received at UDP port {self._settings.port} ({fault.strerror}); end the"
-                " other program there or set another port or address in [node.tracking]."
+                f"Tracking data cannot be received at UDP port {self._settings.port} ({fault.strerror}); stop the"
+                " other program there, or set another port or address in [node.tracking]."
             ) from fault
         self._thread.start()
         return self

@@ -64,29 +64,29 @@ Not described here: the WebSockets `/api/v1/live` (pictures) and `/api/v1/events
 TAGS = [
     {
         "name": "scenes",
-        "description": "Scene documents, their revisions, undo, and which of them is rendered.",
+        "description": "Scene documents, their revisions, undo, and the active scene.",
     },
-    {"name": "objects", "description": "Virtual objects of a scene, with pose and material."},
+    {"name": "objects", "description": "Virtual objects in a scene, with pose and material."},
     {"name": "lights", "description": "Where light comes from."},
-    {"name": "method", "description": "How the real scene is relit."},
-    {"name": "output", "description": "The picture that comes out."},
+    {"name": "method", "description": "The relighting method."},
+    {"name": "output", "description": "The output picture."},
     {
         "name": "assets",
         "description": "Uploaded meshes, environment maps and precomputed materials, kept under their SHA-256.",
     },
     {
         "name": "live",
-        "description": "The picture, what a place in it shows, and what the fish-eye camera sees.",
+        "description": "The live picture, picking in it, and the fish-eye camera's picture.",
     },
-    {"name": "recordings", "description": "Recordings of nodes, and the replay of one in place of them."},
-    {"name": "snapshots", "description": "Pictures of one frame to keep, in any number of views."},
+    {"name": "recordings", "description": "Recordings of nodes, and their replay."},
+    {"name": "snapshots", "description": "Stored pictures of one frame, in any number of views."},
     {"name": "nodes", "description": "Nodes, render servers and cameras."},
     {
         "name": "rooms",
-        "description": "Rooms that run at once. `/rooms/NAME/...` is every route of this description, for the room "
-        "NAME; without, a route is for the first one.",
+        "description": "Rooms that run at once. Every route in this description also exists as `/rooms/NAME/...`, "
+        "for the room NAME; without it, a route applies to the first room.",
     },
-    {"name": "state", "description": "How the processes are doing."},
+    {"name": "state", "description": "State of the processes."},
 ]
 
 

@@ -117,14 +117,14 @@ class AuthMiddleware:
         host = headers.get("host", "")
         if not self._rules.needs_token and _host_name(host) not in LOOPBACK_NAMES:
             raise ProblemError(
-                400, "host", "This service is on loopback; address it as 127.0.0.1 or localhost."
+                400, "host", "This service is only reachable on loopback; open it as 127.0.0.1 or localhost."
             )
         origin = headers.get("origin")
         if (origin is not None and (_host_of(origin) or " ") != host.lower()) or _is_embedded(headers):
             raise ProblemError(
                 403,
                 "origin",
-                "Pages of other sites are refused; open the page from this service's own address.",
+                "Requests from other sites are refused; open the page from this service's own address.",
             )
 
     def _check_rate(self, scope: Scope) -> None:
@@ -229,13 +229,13 @@ def _read_only_role(principal: Principal) -> ProblemError:
     return ProblemError(
         403,
         "role",
-        f"The token `{principal.name}` may only look; use one of role control to change something.",
+        f"The token `{principal.name}` is read-only; use one with role control to make changes.",
     )
 
 
 def _unknown_token(was_given: bool) -> ProblemError:
     sentence = (
-        "The token or ticket is not known; make a token with `deltalight api token NAME`."
+        "The token or ticket is unknown; make a token with `deltalight api token NAME`."
         if was_given
         else "A token is needed; send it as `Authorization: Bearer TOKEN`."
     )

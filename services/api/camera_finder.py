@@ -19,10 +19,10 @@ class CameraAnswer(BaseModel):
     """A camera that this host has."""
 
     name: str
-    source: str = Field(description="What opens it, as `node --source` takes it.", examples=["uvc:0"])
+    source: str = Field(description="Source that opens it, as for `node --source`.", examples=["uvc:0"])
     kind: str = Field(examples=["uvc"])
     details: str
-    hint: str = Field(description="What keeps it from being opened, and what to do; else empty.")
+    hint: str = Field(description="Why it cannot be opened and what to do; else empty.")
 
 
 class MissingCameras(BaseModel):
@@ -37,7 +37,7 @@ class CamerasAnswer(BaseModel):
     """The cameras of this host."""
 
     cameras: list[CameraAnswer]
-    missing: list[MissingCameras] = Field(description="Kinds of which none was found, and why.")
+    missing: list[MissingCameras] = Field(description="Kinds of camera that were not found, and why.")
 
 
 class CameraFinder:
@@ -61,9 +61,9 @@ class CameraFinder:
         try:
             return search.result(TIMEOUT_S)
         except (FutureTimeoutError, subprocess.TimeoutExpired):
-            raise _failed("Looking for cameras takes too long; unplug what hangs") from None
+            raise _failed("Looking for cameras takes too long; unplug the device that hangs") from None
         except (OSError, subprocess.CalledProcessError, ValidationError):
-            raise _failed("Looking for cameras ended without an answer; look into the log") from None
+            raise _failed("Looking for cameras ended without an answer; check the log") from None
 
 
 def _find(search: "Future[CamerasAnswer]") -> None:

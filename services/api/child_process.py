@@ -49,7 +49,7 @@ class ChildProcess:
         self._thread.start()
         self._is_started.wait(START_TIMEOUT_S)
         if self._process is None:
-            raise DeltalightError(f"{arguments[0]} cannot be started ({self._fault}); end other programs.")
+            raise DeltalightError(f"{arguments[0]} cannot be started ({self._fault}); stop other programs.")
 
     @property
     def is_running(self) -> bool:

@@ -121,7 +121,8 @@ async def _if_match(
     if_match: Annotated[
         str | None,
         Header(
-            description='Revision that the change is made to, such as "7"; another one is refused with 409.',
+            description='Revision that the change is based on, such as "7"; if it is not the current one, the '
+            "change is refused with 409.",
             json_schema_extra={"pattern": rf"^({_ENTITY_TAG.pattern}|\*)$"},
         ),
     ] = None,
@@ -140,7 +141,7 @@ async def _precondition(
         str | None,
         Header(
             alias="Deltalight-Gesture",
-            description="Any id; changes in a row with the same one are undone together.",
+            description="Any id; consecutive changes with the same id are undone together.",
             examples=["drag-17"],
             json_schema_extra={"pattern": f"^{_GESTURE.pattern}$"},
         ),

@@ -37,13 +37,15 @@ class FisheyeLight(BaseModel):
 
     model_config = ConfigDict(allow_inf_nan=False)
 
-    x: float = Field(description="Of its middle, pixels of the picture.")
+    x: float = Field(description="Position of its centre, in pixels of the picture.")
     y: float
-    radius_px: float = Field(description="Greatest distance of its outline from its middle.")
-    color_linear: tuple[float, float, float] = Field(description="R G B, linear; the largest is 1.")
-    irradiance: tuple[float, float, float] = Field(description="On a surface that faces it, camera units.")
+    radius_px: float = Field(description="Greatest distance of its outline from its centre, pixels.")
+    color_linear: tuple[float, float, float] = Field(description="Linear RGB; the largest component is 1.")
+    irradiance: tuple[float, float, float] = Field(
+        description="Irradiance on a surface facing it, camera units."
+    )
     type: str = Field(description="As in the scene document.", examples=["sphere"])
-    id: int | None = Field(description="Of a light that is followed over time; else null.")
+    id: int | None = Field(description="Id of a light that is tracked over time; else null.")
 
 
 def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str, Any]]) -> list[FisheyeLight]:

@@ -41,7 +41,7 @@ class Metrics:
         )
         self._seconds = Histogram(
             "deltalight_api_request_seconds",
-            "Time from a request's head to the end of its answer, seconds.",
+            "Time from the head of a request to the end of its response, seconds.",
             ("operation",),
             buckets=_SECONDS,
             registry=self._registry,
@@ -98,11 +98,11 @@ class _Reported(Collector):
     def collect(self) -> Iterable[Metric]:
         """Return all metric families."""
         refused = CounterMetricFamily(
-            "deltalight_api_refused", "Requests refused, by kind of problem.", labels=["kind"]
+            "deltalight_api_refused", "Refused requests, by kind of problem.", labels=["kind"]
         )
         for kind, count in self._problems.counts.copy().items():
             refused.add_metric([kind], count)
-        answers = GaugeMetricFamily("deltalight_render_server_answers", "1 = the render server answers.")
+        answers = GaugeMetricFamily("deltalight_render_server_answers", "1 = the render server responds.")
         answers.add_metric([], float(self._link.is_reachable))
         return [refused, answers, *self._processes()]
 
@@ -111,10 +111,10 @@ class _Reported(Collector):
             "deltalight_process_report_age_seconds", "Age of a process's newest report.", labels=["process"]
         )
         rate = GaugeMetricFamily(
-            "deltalight_process_rate", "Rates that a process reports, 1/s.", labels=["process", "rate"]
+            "deltalight_process_rate", "Rates reported by a process, 1/s.", labels=["process", "rate"]
         )
         drops = CounterMetricFamily(
-            "deltalight_process_drops", "What a process lost, by cause.", labels=["process", "cause"]
+            "deltalight_process_drops", "Losses of a process, by cause.", labels=["process", "cause"]
         )
         degraded = CounterMetricFamily(
             "deltalight_process_degraded", "How often a process became degraded.", labels=["process"]
@@ -141,16 +141,16 @@ class _Streams(Collector):
         """Return all metric families."""
         live = self._live
         yield _gauge("deltalight_live_viewers", "Viewers of the live video.", live.viewers)
-        yield _gauge("deltalight_live_encoders", "Views that are encoded as H.264.", live.video.encoders)
+        yield _gauge("deltalight_live_encoders", "Views being encoded as H.264.", live.video.encoders)
         yield _counter("deltalight_live_frames_received", "Composites that came.", live.received)
         yield _counter("deltalight_live_frames_sent", "Frames sent, to all viewers together.", live.sent)
         yield _counter(
-            "deltalight_live_frames_skipped", "Frames that viewers were too slow for.", live.skipped
+            "deltalight_live_frames_skipped", "Frames skipped because viewers were too slow.", live.skipped
         )
-        yield _gauge("deltalight_event_listeners", "Clients that hear events.", self._events.listeners)
+        yield _gauge("deltalight_event_listeners", "Clients subscribed to events.", self._events.listeners)
         since_s = live.state()[1]
         if since_s is not None:
-            text = "Time since the newest composite came, seconds."
+            text = "Time since the newest composite arrived, seconds."
             yield _gauge("deltalight_live_frame_age_seconds", text, since_s)
 
 

@@ -17,11 +17,11 @@ class SceneSummary(BaseModel):
     """A scene in a list."""
 
     id: str = Field(description="Name in addresses.", examples=["4f0c2a9be1d37785"])
-    name: str = Field(description="Title for people.")
+    name: str = Field(description="Title to display.")
     revision: int = Field(description="The newest revision.")
     created: datetime
     changed: datetime
-    active: bool = Field(description="Whether it is the scene that is rendered.")
+    active: bool = Field(description="Whether this scene is being rendered.")
 
     @classmethod
     def of(cls, head: SceneHead) -> Self:
@@ -40,11 +40,12 @@ class PictureState(BaseModel):
     """What the render server made of a revision of the active scene."""
 
     state: Literal["shown", "pending", "refused", "superseded"] = Field(
-        description="`shown` = from the next frame on; `pending` = the render server has not taken it yet, and the "
-        "event `picture` tells when it has; `refused` = it cannot render this and shows what it had; `superseded` = "
-        "a newer change was made before the server had taken this one, and is shown in its place."
+        description="`shown` = from the next frame on; `pending` = the render server has not accepted it yet, and "
+        "the event `picture` reports when it has; `refused` = it cannot render this and keeps showing "
+        "the previous revision; `superseded` = a newer change was made before the server accepted "
+        "this one, and is shown in its place."
     )
-    revision: int = Field(description="The revision that this is said of.")
+    revision: int = Field(description="The revision that this describes.")
     detail: str = Field(description="Why it is not shown; else empty.")
 
     @classmethod
@@ -60,8 +61,8 @@ class SceneAnswer(BaseModel):
     revision: int = Field(description="The revision of the document; also the ETag.")
     created: datetime
     changed: datetime
-    active: bool = Field(description="Whether it is the scene that is rendered.")
-    what: str = Field(description="The change that made this revision.")
+    active: bool = Field(description="Whether this scene is being rendered.")
+    what: str = Field(description="The change that created this revision.")
     can_undo: bool
     can_redo: bool
     picture: PictureState | None = Field(description="null unless the scene is active.")
@@ -90,8 +91,8 @@ class RevisionEntry(BaseModel):
     revision: int
     at: datetime
     what: str = Field(description="What was changed.", examples=["knot: pose changed"])
-    name: str = Field(description="Title of the scene then.")
-    gesture: str | None = Field(description="Changes in a row with the same one are undone together.")
+    name: str = Field(description="Title of the scene at that revision.")
+    gesture: str | None = Field(description="Consecutive changes with the same id are undone together.")
 
     @classmethod
     def of(cls, revision: Revision) -> Self:
@@ -108,8 +109,10 @@ class RevisionEntry(BaseModel):
 class AssetAnswer(BaseModel):
     """An uploaded file."""
 
-    asset: str = Field(description="How scene documents name it.", examples=["sha256:2c26b46b68ffc68f..."])
-    names: list[str] = Field(description="Names under which it was uploaded.")
+    asset: str = Field(
+        description="Reference to use in scene documents.", examples=["sha256:2c26b46b68ffc68f..."]
+    )
+    names: list[str] = Field(description="File names under which it was uploaded.")
     kind: AssetKind = Field(
         description="`mesh` for objects and models, `map` for environment lights, `material` for what "
         "`material: {precomputed: ...}` names."
@@ -144,11 +147,11 @@ class ProcessAnswer(BaseModel):
     name: str
     state: str = Field(description="starting, running, waiting, degraded or stopping.")
     detail: str
-    age_s: float = Field(description="Seconds since it said so.")
+    age_s: float = Field(description="Seconds since it reported this.")
     rates: dict[str, float] = Field(description="1/s.")
-    drops: dict[str, int] = Field(description="What was lost since its start, by cause.")
+    drops: dict[str, int] = Field(description="Losses since its start, by cause.")
     clock_bound_ms: float | None = Field(
-        description="Greatest error of its clock against the server's; null = not compared."
+        description="Upper bound of its clock error against the server's; null = not compared."
     )
 
     @classmethod

@@ -45,24 +45,22 @@ _KINDS: tuple[tuple[type[DeltalightError], int, str], ...] = (
 
 # Advice for the two-word sentences of the framework.
 _ADVICE = {
-    "Not Found": ": nothing is at this address; /openapi.json lists what there is.",
-    "Method Not Allowed": ": this address does not take that method; /openapi.json lists those that it takes.",
+    "Not Found": ": there is nothing at this address; /openapi.json lists what there is.",
+    "Method Not Allowed": ": this address does not support that method; /openapi.json lists those that it does.",
 }
 
 
 class Problem(BaseModel):
     """What is wrong and what to do."""
 
-    type: str = Field(
-        description="Kind of the problem, for programs.", examples=[TYPE_PREFIX + "stale-revision"]
-    )
+    type: str = Field(description="Kind of problem, for programs.", examples=[TYPE_PREFIX + "stale-revision"])
     title: str = Field(description="The status in words.", examples=["Conflict"])
     status: int = Field(description="The HTTP status.", examples=[409])
     detail: str = Field(
-        description="One sentence for people.",
+        description="One sentence for the user.",
         examples=["the scene is at revision 7 and the change was made to 5; get it and change it again."],
     )
-    revision: int | None = Field(default=None, description="With stale-revision: the newest revision.")
+    revision: int | None = Field(default=None, description="The newest revision; only with `stale-revision`.")
 
 
 class ProblemError(HTTPException):
@@ -143,9 +141,7 @@ class Problems:
         @app.exception_handler(OSError)
         async def _disk(_request: Request, fault: OSError) -> JSONResponse:
             log.error("the data folder cannot be used", fault=str(fault))
-            sentence = (
-                f"The data folder cannot be used ({fault.strerror}); free some space, or see to its rights."
-            )
+            sentence = f"The data folder cannot be used ({fault.strerror}); free some space or check its permissions."
             return self.response(503, "storage-fault", sentence)
 
         @app.exception_handler(Exception)

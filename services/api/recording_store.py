@@ -98,7 +98,7 @@ class RecordingStore:
         """
         if not NAME.fullmatch(name):
             raise DeltalightError(
-                f"{name!r:.80} is no name for a recording; use up to 64 letters, digits, dashes and underscores."
+                f"{name!r:.80} is not a valid recording name; use up to 64 letters, digits, dashes and underscores."
             )
         path = self.folder / (name + SUFFIX)
         if path.exists() or path.with_name(path.name + ACTIVE_SUFFIX).exists():
@@ -252,7 +252,7 @@ class RecordingStore:
         path = self._path(name)
         out = self.folder / (name + SUFFIX)
         if path == out:
-            raise ConflictError(f"{name} was finished; there is nothing to mend.")
+            raise ConflictError(f"{name} was finished; there is nothing to recover.")
         with self._reading, _naming(path):
             recover_recording(path, out, lambda numbers: numbers)
             path.unlink()

@@ -23,8 +23,8 @@ class VideoAnswer(StrictModel):
     """Whether a recording's video is there."""
 
     state: Literal["absent", "making", "ready", "failed"]
-    progress: float = Field(ge=0, le=1, description="Share of the frames that are in it.")
-    detail: str = Field(default="", description="Why it could not be made; else empty.")
+    progress: float = Field(ge=0, le=1, description="Fraction of the frames encoded so far.")
+    detail: str = Field(default="", description="Why it failed; else empty.")
 
 
 @dataclass

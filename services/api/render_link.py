@@ -206,7 +206,9 @@ class RenderLink:
 
     def _refuse_where_silent(self) -> None:
         if self._answers is False:
-            raise UnansweredError("The render server does not answer; see that it runs, then try again.")
+            raise UnansweredError(
+                "The render server does not answer; check that it is running, then try again."
+            )
 
     def _require_alive(self) -> None:
         """Detect a dead server within a second; only the renderer knows how long its commands take."""

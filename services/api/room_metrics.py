@@ -24,7 +24,7 @@ class RoomMetrics:
         self._registry.register(_Placed(rooms, refused))
         self._gaps = Histogram(
             "deltalight_room_gap_seconds",
-            "Time without a picture when a room's render server was replaced, seconds.",
+            "Time without a picture while a room's render server was replaced, seconds.",
             ("room",),
             buckets=_GAP_SECONDS,
             registry=self._registry,
@@ -76,15 +76,17 @@ class _Placed(Collector):
         found = self._rooms()
         yield from _rooms(found.rooms)
         yield _slots(found.slots)
-        text = "Endpoints of the directory that were older than known ones."
+        text = "Outdated endpoints received from the directory."
         yield CounterMetricFamily("deltalight_rooms_stale_endpoints", text, value=self._refused())
 
 
 def _rooms(rooms: Iterable[RoomStatus]) -> Iterable[Metric]:
-    state = GaugeMetricFamily("deltalight_room_state", "1 = the room is so.", labels=["room", "state"])
+    state = GaugeMetricFamily(
+        "deltalight_room_state", "1 = the room is in this state.", labels=["room", "state"]
+    )
     waits = GaugeMetricFamily(
         "deltalight_room_waits",
-        "1 = the room waits: for a slot, or until it is started because it was drained or failed.",
+        "1 = the room is waiting: for a slot, or to be started after it was drained or failed.",
         labels=["room", "reason"],
     )
     restarts = CounterMetricFamily(

@@ -30,20 +30,20 @@ class SnapshotPicture(StrictModel):
     name: str
     view: str
     method: Method | None = None
-    file: str | None = Field(description="Name of its file; null where it could not be rendered.")
+    file: str | None = Field(description="Name of its file; null if it could not be rendered.")
     detail: str = Field(default="", description="Why it could not be rendered; else empty.")
 
 
 class SnapshotFacts(StrictModel):
     """What is known of a snapshot."""
 
-    id: str = Field(description="Its name in addresses.", examples=["20261121-101500-3fa2c1"])
+    id: str = Field(description="Its name in URLs.", examples=["20261121-101500-3fa2c1"])
     taken: datetime
     frame_id: int
     capture_ns: int = Field(description="When the frame was captured, ns since 1970 by the node's clock.")
-    scene_id: str | None = Field(description="The scene that was active; null = none was.")
+    scene_id: str | None = Field(description="The active scene; null = none.")
     scene_revision: int | None
-    recording: str | None = Field(description="The recording that was shown; null = live.")
+    recording: str | None = Field(description="The recording on display; null = live.")
     pictures: list[SnapshotPicture]
     files: list[str]
 

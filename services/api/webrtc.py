@@ -40,7 +40,7 @@ CONNECT_TIMEOUT_S = 15.0  # from the answer to the first packet
 OUR_PROFILES = ("64001f", "640c1f")  # High and Constrained High (RFC 6184, 8.1)
 PROFILES = (*OUR_PROFILES, "42e01f", "42001f")  # that are answered, the best first
 FIRST_OF_OURS = 120  # payload type; aiortc takes those from 97 on
-BAD_OFFER = "The body is no SDP offer of WebRTC; send that of an RTCPeerConnection."
+BAD_OFFER = "The body is not an SDP offer of WebRTC; send that of an RTCPeerConnection."
 NO_VIDEO = "The offer must receive one video (recvonly), and may have audio, and nothing else."
 NO_CODEC = (
     "The offer has no H.264 with packetization-mode 1, in which the pictures come; use a receiver that has."

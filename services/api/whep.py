@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from deltalight.services.api.webrtc import Peer
 
 NO_AIORTC = f"WHEP needs the package aiortc: {install_command('aiortc')}."
-NONE_ALLOWED = "WHEP is switched off here; set `whep_sessions` to how many may watch so."
-ALL_TAKEN = "All sessions of WHEP are taken; close some, or watch by WS /live."
+NONE_ALLOWED = "WHEP is disabled here; set `whep_sessions` to the number of viewers to allow."
+ALL_TAKEN = "All WHEP sessions are in use; close some, or watch through WS /live."
 ID_BYTES = 16  # whoever knows an id may end that session
 
 log = structlog.get_logger()
@@ -102,7 +102,7 @@ class WhepSessions:
         """
         task = self._running.get(session_id)
         if task is None:
-            raise NotFoundError("there is no such session of WHEP; it has ended.")
+            raise NotFoundError("there is no such WHEP session; it may have ended.")
         task.cancel()
         await asyncio.wait([task])
 

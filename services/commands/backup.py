@@ -22,7 +22,7 @@ def backup(
     config_file: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Copy scenes, tokens and assets into one file, also while the service runs.
+    """Copy scenes, tokens and assets into one file, even while the service runs.
 
     Recordings and snapshots are files of their own and are not in it.
     """
@@ -39,7 +39,7 @@ def restore(
     config_file: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Put scenes, tokens and assets of a backup in place; end the service first.
+    """Restore scenes, tokens and assets from a backup; stop the service first.
 
     What was there before is moved aside within the data folder, never deleted. Recordings and snapshots stay.
     """
@@ -79,4 +79,4 @@ def _print(contents: "Contents", place: str, *, as_json: bool) -> None:
         f"{contents.scenes} scenes with {contents.revisions} revisions and {contents.assets} assets ({size}) {place}"
     )
     if aside is not None:
-        typer.echo(f"What was there before is in {aside}; remove it when you do not need it any more.")
+        typer.echo(f"The previous data is in {aside}; delete it when you no longer need it.")

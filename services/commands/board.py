@@ -84,10 +84,10 @@ def board(
 
     described = out.with_suffix(".yaml")
     if out.suffix.lower() != ".pdf":
-        raise DeltalightError(f"'{out}' is no PDF file; name one with --out, such as board.pdf.")
+        raise DeltalightError(f"'{out}' is not a PDF file; name one with --out, such as board.pdf.")
     for path in (out, described):
         if path.exists() and not force:
-            raise DeltalightError(f"{path} exists already; write over it with --force or name another --out.")
+            raise DeltalightError(f"{path} already exists; overwrite it with --force or name another --out.")
     usual = DEFAULTS[kind]
     spec = _spec(
         kind,

@@ -74,7 +74,9 @@ def camera(
 ) -> None:
     """Calibrate the lens of a colour camera: writes OUT/calibration/rgb.yaml."""
     if coefficients not in (5, 8):
-        raise DeltalightError(f"--coefficients {coefficients} is no form of the plumb_bob lens; give 5 or 8.")
+        raise DeltalightError(
+            f"--coefficients {coefficients} is not a form of the plumb_bob lens; give 5 or 8."
+        )
     kind: LensKind = "plumb_bob_5" if coefficients == 5 else "plumb_bob_8"
     _calibrate_lens(_LensJob(source, "rgb", kind, out, target, views), force=force, as_json=as_json)
 

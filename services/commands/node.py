@@ -39,7 +39,7 @@ def node(
         bool,
         typer.Option(
             "--tracking",
-            help="Take the camera's pose from OpenTrackIO packets, by `node.tracking` in the configuration file.",
+            help="Take the camera's pose from OpenTrackIO packets, as configured in `node.tracking`.",
         ),
     ] = False,
     calibration: Annotated[

@@ -39,7 +39,7 @@ MethodName = Annotated[
     str,
     typer.Option(
         "--method",
-        help=f"Relighting method: {', '.join(METHODS)}, or a plugin's; dvct is as the demo's scene says.",
+        help=f"Relighting method: {', '.join(METHODS)}, or a plugin's; dvct uses the settings of the demo's scene.",
     ),
 ]
 
@@ -56,7 +56,7 @@ OneCamera = Annotated[
     typer.Option(
         "--camera",
         metavar="NAME",
-        help="Whose pictures, by its node's name, where a room has several cameras.",
+        help="Camera whose pictures to use, by the name of its node, if a room has several.",
     ),
 ]
 Data = Annotated[

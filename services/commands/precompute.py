@@ -12,8 +12,8 @@ def precompute(
     source: Annotated[
         Path,
         typer.Argument(
-            help="Scene document; its assets lie as it names them. Or a measured BRDF (.brdf), or the folder of a "
-            "polynomial texture map or an ABTF (info.json)."
+            help="Scene document, with its assets where it refers to them; a measured BRDF (.brdf); or the folder of "
+            "a polynomial texture map or an ABTF (info.json)."
         ),
     ],
     out: Annotated[
@@ -23,7 +23,8 @@ def precompute(
 ) -> None:
     """Compute the light transfer and the occlusion fields of a scene's objects, so that no picture waits for them.
 
-    What is in the cache already is not computed again; Ctrl-C keeps the objects that are done.
+    What is in the cache already is not computed again. A run that was ended, by Ctrl-C too, leaves the objects that
+    are done, and of an occlusion field its shells: the next goes on there.
 
     A measured BRDF, a polynomial texture map or an ABTF becomes a file for `material: {precomputed: FILE}` of scene
     documents.
@@ -34,8 +35,8 @@ def precompute(
         _precompute_material(source, out)
     elif out is not None:
         raise DeltalightError(
-            f"{source} is taken for a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the folder "
-            "of a texture by the light; leave it out."
+            f"{source} is treated as a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the"
+            " folder of a texture by the light; leave it out."
         )
     else:
         _precompute_scene(source)

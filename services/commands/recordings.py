@@ -62,7 +62,7 @@ def recover(
 
     copied = recover_recording(file, out or recovered_name(file), _track("recovering"))
     if copied is None:
-        typer.echo(json.dumps({"out": None}) if as_json else f"{file} is whole; there is nothing to mend.")
+        typer.echo(json.dumps({"out": None}) if as_json else f"{file} is whole; there is nothing to recover.")
     else:
         _print_copied(copied, as_json=as_json)
 

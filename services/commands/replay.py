@@ -47,9 +47,9 @@ def replay(
 
     frames = open_source(source)  # refuses here what a node would take for a live camera
     if fast and (rate is not None or start is not None or control is not None):
-        raise DeltalightError("--fast knows no times; leave --rate, --start and --control out.")
+        raise DeltalightError("--fast ignores recorded times; leave out --rate, --start and --control.")
     if paused and control is None:
-        raise DeltalightError("--paused needs --control, the endpoint at which it is told to go on.")
+        raise DeltalightError("--paused needs --control, the endpoint at which it is resumed.")
     camera: PlaybackCamera | None = None
     if not fast:
         camera = PlaybackCamera(

@@ -42,7 +42,7 @@ def list_rooms(
 
 @rooms.command()
 def drain(room: Room, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
-    """End the render server of a room until it is started again; its slot is free for rooms that wait."""
+    """Stop a room's render server until it is started again; waiting rooms can use its slot."""
     _print_rooms(_directory(directory, config_file).command("drain", room))
 
 
@@ -66,13 +66,13 @@ def move(
 
 @rooms.command("drain-host")
 def drain_host(host: Host, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
-    """Move the rooms of a host to other hosts, one after another; rooms that find no slot end and wait."""
+    """Move the rooms of a host to other hosts, one after another; rooms without a slot there stop and wait."""
     _print_rooms(_directory(directory, config_file).host_command("drain-host", host))
 
 
 @rooms.command("undrain-host")
 def undrain_host(host: Host, *, directory: Directory = HERE, config_file: ConfigFile = None) -> None:
-    """Let rooms start on a drained host again."""
+    """Allow rooms to start on a drained host again."""
     _print_rooms(_directory(directory, config_file).host_command("undrain-host", host))
 
 
@@ -83,10 +83,10 @@ def claim(
     ],
     *,
     frames_per_s: Annotated[
-        float, typer.Option(min=0.1, max=240, help="Frames a second that each room shall reach.")
+        float, typer.Option(min=0.1, max=240, help="Frame rate that each room should reach.")
     ] = 30.0,
 ) -> None:
-    """Print what this host offers to a cluster, by the figures of a room: the options of `ray start`."""
+    """Print the `ray start` options for this host, from the memory and time that a room needs."""
     from deltalight.services.rooms.capacity import find_device_apart, labels_of, load_figures, slots_of
     from deltalight.services.rooms.ray_cluster import SLOT_RESOURCE
     from deltalight.services.rooms.render_actor import hardware_devices

@@ -133,7 +133,7 @@ def up(
         )
         plan.require_free_ports()
         with Supervisor(plan.specs()) as supervisor:
-            typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
+            typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (press Ctrl-C to stop).")
             supervisor.run()
 
 
@@ -149,8 +149,8 @@ def _require_fitting(
         raise DeltalightError("--ray-address names the cluster of --placer ray; give both, or neither.")
     if rooms_host != LOOPBACK and not on_cluster:
         raise DeltalightError(
-            "--rooms-host is for web processes elsewhere, which reach the render servers of --placer ray alone; leave"
-            " it out, or give both."
+            "--rooms-host is for web processes on other hosts, which can only reach render servers of --placer"
+            " ray; leave it out, or give both."
         )
     if on_cluster and rooms is None:
         raise DeltalightError("--placer ray runs the rooms of a rooms file; name one with --rooms.")
@@ -183,7 +183,7 @@ def _run_rooms(
             rooms, commands, data, Path(folder), port, rooms_port, on_cluster, ray_address, rooms_host
         )
         host.require_free_ports()
-        typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
+        typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (press Ctrl-C to stop).")
         host.run(lambda line: typer.echo(line, err=True))
 
 

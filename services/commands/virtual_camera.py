@@ -44,7 +44,9 @@ def virtual_camera(
         while (picture := newest_picture(receiver, PERIOD_S)) is None:
             pass
         webcam.begin(size_px or (picture.shape[1], picture.shape[0]))
-        typer.echo(f"{device} shows the relit picture, {webcam.size[0]}x{webcam.size[1]}; Ctrl-C ends it.")
+        typer.echo(
+            f"{device} shows the relit picture, {webcam.size[0]}x{webcam.size[1]}; press Ctrl-C to stop."
+        )
         while True:
             webcam.show(picture)
             newer = newest_picture(receiver, PERIOD_S)

@@ -115,4 +115,4 @@ class FisheyeReader:
         )
 
     def _fault(self) -> DeltalightError:
-        return DeltalightError(f"The fish-eye pictures {self._name} are not whole; export the bag again.")
+        return DeltalightError(f"The fish-eye pictures {self._name} are incomplete; export the bag again.")

@@ -97,7 +97,7 @@ def _add(
 
     if not Path(asset).is_file():
         raise DeltalightError(
-            f"{name}: {asset} is no file here; export from the folder that has the scene's assets."
+            f"{name}: {asset} is not a file here; export from the folder that has the scene's assets."
         )
     try:
         loaded = trimesh.load_scene(asset)

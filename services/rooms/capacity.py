@@ -20,7 +20,7 @@ GPU_LABEL, MEMORY_LABEL = "gpu", "gpu-memory-mb"  # of a host of a cluster: what
 USED_SHARE = 0.9  # of a device's memory; the rest is for the driver, and for what else runs
 CLAIMED_SHARE = 0.95  # of the claimed memory that must be there: drivers keep some to themselves
 PROBE_TIMEOUT_S = 60.0
-MAKE_REPORT = "make it on this host by `deltalight gpu-check --steps memory,speed`"
+MAKE_REPORT = "make it on this host with `deltalight gpu-check --steps memory,speed`"
 # What reading JSON of another kind raises: text that is none, other keys and types, numbers beyond all, deep nesting.
 _NO_FIGURES = (
     ValueError,
@@ -103,8 +103,8 @@ def slots_of(figures: RoomFigures, found: "FoundDevice", frames_per_s: float) ->
     """
     if figures.device != found.name:
         raise DeltalightError(
-            f"the figures in {figures.path} are of {figures.device}, and this host renders on {found.name}; make them"
-            " here by `deltalight gpu-check --steps memory,speed`."
+            f"the figures in {figures.path} are for {figures.device}, and this host renders on {found.name}; make"
+            " them here with `deltalight gpu-check --steps memory,speed`."
         )
     by_time = max(1, int(1000.0 / frames_per_s / figures.frame_ms))
     if found.memory_bytes is None:

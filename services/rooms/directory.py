@@ -57,7 +57,7 @@ class DirectoryServer:
             known = (LIST, *commands)
             hint = nearest(request.op, known) or ", ".join(known)
             raise DeltalightError(
-                f"the directory of rooms knows no command '{request.op}'; did you mean {hint}?"
+                f"the directory of rooms has no command '{request.op}'; did you mean {hint}?"
             )
         return self._keeper.status().model_dump(mode="json")
 
@@ -106,7 +106,7 @@ class DirectoryClient:
             reply = self._client.request(request, ANSWER_TIMEOUT_S)
         except DeltalightError as fault:
             raise SilentDirectoryError(
-                f"the directory of rooms does not answer ({fault}); see that `deltalight up --rooms` runs."
+                f"the directory of rooms does not answer ({fault}); check that `deltalight up --rooms` is running."
             ) from fault
         if reply.error is not None:
             raise DeltalightError(reply.error)

@@ -23,9 +23,11 @@ from deltalight.services.rooms.placer import (
 )
 from deltalight.services.rooms.ray_cluster import SLOT_RESOURCE, ClusterHost, RayCluster
 from deltalight.services.rooms.render_actor import END_TIMEOUT_S, SESSION, News, RenderActor, RenderTask
+from deltalight.services.rooms.slot_holder import SlotHolder
 
 START_TIMEOUT_S = 60.0  # until an actor answers for the first time
 CALLS_AT_ONCE = 3  # of an actor: news, end and process_id
+HOSTS_INTERVAL_S = 1.0  # between looks for hosts that lack a spare
 
 
 @dataclass
@@ -45,10 +47,6 @@ class _Spare:
     waits: Any  # the answer that is awaited
 
 
-class SlotHolder:
-    """Holds a render slot for a spare that has become a room's actor; ends with its keeper."""
-
-
 class RayPlacer:
     """Places each render server by an actor on a host of the cluster (a `Placer`), in a slot that the host offers.
 
@@ -56,7 +54,8 @@ class RayPlacer:
     the actor finds the keys of its host; all hosts of a fleet have the same. A host that does not have what it
     claims, by the `figures` of a room if they are known, is refused: it has no slots until Ray starts there anew.
 
-    With a `spare`, a command line that prepares and waits (`ChildSpec.warm`), each host that has had a room has one.
+    With a `spare`, a command line that prepares and waits (`ChildSpec.warm`), each host has one, without a room too:
+    that is where rooms go whose host is lost.
     """
 
     def __init__(
@@ -72,6 +71,7 @@ class RayPlacer:
         self._figures, self._spare_spec = figures, spare
         self._spares: dict[str, _Spare] = {}  # by Ray's id of the host, as the next
         self._spare_due_s: dict[str, float] = {}
+        self._hosts_due_s = 0.0
         self._refused: dict[str, str] = {}  # why, by Ray's id of the host
         self._cluster = cluster
         self._command = command
@@ -165,19 +165,31 @@ class RayPlacer:
         return None if placed is None else placed.placement.room
 
     def _keep_spares(self) -> None:
-        """Start the spare of each host whose rooms have had the time to start, and forget those that died."""
+        """Start the spare of each host whose rooms have had the time to start, and forget those that died.
+
+        A host that has just come may be about to get a room that waits: its spare is started at the second look.
+        """
         now_s = time.monotonic()
         for node_id in [each for each, spare in self._spares.items() if not self._waits(spare)]:
-            self._cluster.ray.kill(self._spares.pop(node_id).actor)
+            self._end_spare(node_id)
             self._spare_due_s[node_id] = now_s + SPARE_AFTER_S
-        if self._spare_spec is None:
+        if self._spare_spec is None or now_s < self._hosts_due_s:
             return
-        for host in {placed.host.node_id: placed.host for placed in self._placed.values()}.values():
-            if host.node_id not in self._spares and now_s >= self._spare_due_s[host.node_id]:
-                name = f"spare-{host.node_id[:12]}-{now_s:.3f}"
-                made = self._remote(RenderActor, host, 0, name=name, lifetime="detached")
-                actor = made.remote(None, self._spare_spec)
-                self._spares[host.node_id] = _Spare(actor, actor.waits.remote())
+        self._hosts_due_s = now_s + HOSTS_INTERVAL_S
+        for host in self._hosts():
+            due_s = self._spare_due_s.setdefault(host.node_id, self._hosts_due_s)
+            if host.node_id not in self._spares and now_s >= due_s:
+                self._spares[host.node_id] = self._started_spare(self._spare_spec, host)
+
+    def _started_spare(self, spec: ChildSpec, host: ClusterHost) -> _Spare:
+        name = f"spare-{host.node_id[:12]}-{time.monotonic():.3f}"
+        actor = self._remote(RenderActor, host, 0, name=name, lifetime="detached").remote(None, spec)
+        return _Spare(actor, actor.waits.remote())
+
+    def _end_spare(self, node_id: str) -> None:
+        spare = self._spares.pop(node_id, None)
+        if spare is not None:
+            self._cluster.ray.kill(spare.actor)
 
     def _waits(self, spare: _Spare) -> bool:
         ray = self._cluster.ray
@@ -234,6 +246,7 @@ class RayPlacer:
         for event in news.events:
             if event.host_refused:
                 self._refused[placed.host.node_id] = event.detail
+                self._end_spare(placed.host.node_id)
         if any(event.kind == "lost" for event in news.events):
             self._forget(slot)
         else:

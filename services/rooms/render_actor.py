@@ -165,7 +165,7 @@ def _started(
     endpoints = placement.publish, placement.control
     for endpoint in endpoints:
         if not ports.is_free(int(endpoint.rpartition(":")[2])):
-            raise DeltalightError(f"another program listens at {endpoint}; other ports are tried.")
+            raise DeltalightError(f"another program listens at {endpoint}; trying other ports.")
     if task.session:
         SESSION.write_text(task.session)
     devices = hardware_devices()

@@ -31,15 +31,16 @@ class NodeEntry(StrictModel):
         default=None,
         min_length=1,
         max_length=MAX_ADDRESS,
-        description="Camera, dataset folder, .mcap recording or `synthetic`; relative to the rooms file.",
+        description="Camera, dataset folder, .mcap recording or `synthetic`; paths are relative to the rooms "
+        "file.",
     )
     found: Name | None = Field(
-        default=None, description="Name under which a node of another host announces itself."
+        default=None, description="Name under which a node on another host announces itself."
     )
     endpoint: str | None = Field(
         default=None,
         max_length=MAX_ADDRESS,
-        description="Where a node of another host publishes, `tcp://KEY@HOST:PORT`.",
+        description="Endpoint at which a node on another host publishes, `tcp://KEY@HOST:PORT`.",
     )
 
     @model_validator(mode="after")
@@ -59,17 +60,17 @@ class RoomEntry(StrictModel):
     nodes: tuple[Name, ...] = Field(
         min_length=1,
         max_length=MAX_NODES,
-        description="Nodes of this file that it shows; rooms may share one.",
+        description="Nodes of this file whose frames the room shows; rooms may share nodes.",
     )
     scene: Path | None = Field(
         default=None,
         description="Scene document to import and show; null = the last one shown, else the recording's.",
     )
-    title: str = Field(default="", max_length=200, description="For people; empty = its name.")
+    title: str = Field(default="", max_length=200, description="Title to display; empty = the name.")
     labels: dict[LabelKey, LabelValue] = Field(
         default={},
         max_length=MAX_LABELS,
-        description="Labels that its host on a cluster must have, such as the camera's network.",
+        description="Labels that its host in a cluster must have, such as the camera's network.",
     )
 
 
@@ -82,15 +83,15 @@ class RoomsFile(StrictModel):
         | Literal["auto"]
     ) = Field(
         default=1,
-        description="How many rooms run at once on this host, or a list with the EGL device of each slot, or `auto`: "
-        "as many as fit by `figures`.",
+        description="Number of rooms that run at once on this host, or a list with the EGL device of each slot, "
+        "or `auto` = as many as fit according to `figures`.",
     )
     figures: Path | None = Field(
         default=None,
         description="report.json of `deltalight gpu-check --steps memory,speed` on a device like those of the slots.",
     )
     frames_per_s: Annotated[float, Field(gt=0, le=240)] = Field(
-        default=30.0, description="What each room shall reach, for `slots: auto`."
+        default=30.0, description="Frame rate that each room should reach, for `slots: auto`."
     )
     nodes: dict[Name, NodeEntry] = Field(min_length=1, max_length=MAX_ROOMS)
     rooms: dict[Name, RoomEntry] = Field(min_length=1, max_length=MAX_ROOMS)
@@ -173,6 +174,6 @@ def _with_scene(name: str, room: RoomEntry, folder: Path) -> RoomEntry:
     scene = folder / room.scene
     if not scene.is_file():
         raise DeltalightError(
-            f"the scene {scene} of the room {name} is not there; name a scene document that is."
+            f"the scene {scene} of the room {name} does not exist; name a scene document that does."
         )
     return room.replaced(scene=scene)

@@ -23,7 +23,7 @@ class RoomNode(StrictModel):
 class RoomEndpoints(StrictModel):
     """Endpoints of a room's render server; those with a newer epoch replace them."""
 
-    epoch: int = Field(ge=1, description="Counts the starts of render servers, of all rooms together.")
+    epoch: int = Field(ge=1, description="Number of render server starts, over all rooms.")
     publish: str = Field(description="Pictures and reports.")
     control: str = Field(description="Commands.")
 
@@ -35,26 +35,27 @@ class RoomStatus(StrictModel):
     title: str = ""
     nodes: tuple[RoomNode, ...] = Field(min_length=1)
     state: RoomState = Field(
-        description="`waiting` for a slot, or drained; `starting`; `running`; `failed` until it is started again."
+        description="`waiting` (for a slot, or drained), `starting`, `running`, or `failed` until it is "
+        "restarted."
     )
-    why: str = Field("", description="Why it waits, failed, or shows nothing; else empty.")
+    why: str = Field("", description="Why the room is waiting, failed, or shows nothing; else empty.")
     waits_for: Reason | None = Field(
-        None, description="`slot` = until one is free; `drained`, `failed` = until it is started again."
+        None, description="`slot` = until one is free; `drained`, `failed` = until it is restarted."
     )
-    slot: str | None = Field(None, description="Where its render server runs.")
+    slot: str | None = Field(None, description="Slot in which its render server runs.")
     endpoints: RoomEndpoints | None = None
-    moving_to: str | None = Field(None, description="The slot in which its next render server starts.")
-    restarts: int = Field(0, ge=0, description="How often its render server was lost and placed again.")
+    moving_to: str | None = Field(None, description="Slot in which its next render server will start.")
+    restarts: int = Field(0, ge=0, description="How often its render server was lost and replaced.")
 
 
 class SlotStatus(StrictModel):
     """Room for one render server."""
 
     name: str
-    device: str = Field(description="On which it renders.")
-    room: str | None = Field(description="Which room is in it; null = free.")
-    host: str = Field(description="Whose device it is.")
-    drained: bool = Field(False, description="Whether its host is drained, so that no room starts in it.")
+    device: str = Field(description="Device on which it renders.")
+    room: str | None = Field(description="Room in this slot; null = free.")
+    host: str = Field(description="Host of the device.")
+    drained: bool = Field(False, description="Whether its host is drained, so that no room starts there.")
 
 
 class RoomList(StrictModel):

@@ -90,7 +90,7 @@ def map_facts(path: Path) -> Facts:
     height, width = read_linear(path).shape[:2]
     if width != 2 * height:
         raise DeltalightError(
-            f"{path} has {width}x{height} pixels; a latitude-longitude map is twice as wide as high."
+            f"{path} has {width}x{height} pixels; a latitude-longitude map must be twice as wide as it is high."
         )
     return {"width": width, "height": height}
 

@@ -148,7 +148,7 @@ class ObjectFiles(FolderFiles):
         except Exception as fault:
             cause = str(fault).strip().partition("\n")[0][:200] or type(fault).__name__
             raise StorageFaultError(
-                f"The store of assets does not answer as it should ({cause}); see to {self._address}."
+                f"The store of assets does not respond as expected ({cause}); check {self._address}."
             ) from fault
 
 
@@ -173,7 +173,7 @@ def _file_system(address: str) -> tuple[Any, str]:
         ) from fault
     except ValueError as fault:
         raise DeltalightError(
-            f"{address} is no address of a store of assets ({fault}); write one such as s3://BUCKET/FOLDER."
+            f"{address} is not the address of an asset store ({fault}); write one such as s3://BUCKET/FOLDER."
         ) from fault
     return objects, str(root).rstrip("/")
 

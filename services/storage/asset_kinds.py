@@ -104,9 +104,9 @@ def recognise(head: bytes, size_bytes: int, name: str) -> AssetFormat:
 
 def _advice(head: bytes, name: str) -> str:
     if head.lstrip()[:1] == b"{":
-        return f"{name} looks like a glTF document, which names other files; pack all in a .zip, or export a .glb."
+        return f"{name} looks like a glTF document, referring to other files; pack them in a .zip, or export a .glb."
     known = ", ".join(each.name.upper() for each in FORMATS)
-    return f"{name} is no file of a known format; upload one of {known}."
+    return f"{name} is not in a known format; upload one of {known}."
 
 
 def clean_name(name: str) -> str:

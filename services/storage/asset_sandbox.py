@@ -60,7 +60,7 @@ def run_limited(
     try:
         answer = json.loads(done.stdout.splitlines()[-1])
     except (IndexError, ValueError) as fault:
-        raise RejectedAssetError(f"{name} ends the program that loads it; export it again.") from fault
+        raise RejectedAssetError(f"{name} crashes the program that loads it; export it again.") from fault
     if "fault" in answer:
         raise RejectedAssetError(answer["fault"].replace(str(path), name))
     return dict(answer)

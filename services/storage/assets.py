@@ -275,7 +275,7 @@ class AssetStore:
         path = self.path(asset)
         if not path.is_file():
             raise StorageFaultError(
-                f"the file of {asset.names[0]} ({reference}) is gone from the data folder; upload it again, or end "
+                f"the file of {asset.names[0]} ({reference}) is gone from the data folder; upload it again, or stop "
                 "the service and run `deltalight restore BACKUP`."
             )
         return path
@@ -326,7 +326,7 @@ class AssetNames:
         row = self._rows[asset]
         if row is None:
             raise DeltalightError(
-                f"`{place}` names {asset!r:.200}, which is no uploaded asset; upload the file, then name it as "
+                f"`{place}` names {asset!r:.200}, which is not an uploaded asset; upload the file, then name it as "
                 "sha256:..."
             )
         if row.kind != _needed_kind(place):

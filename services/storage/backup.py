@@ -40,7 +40,7 @@ CHUNK_BYTES = 1 << 20
 LARGEST_MANIFEST_BYTES = 64 << 20
 _UNPACKING = ".unpacking-"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-RESTORE_HINT = "end the service and run `deltalight restore BACKUP`"
+RESTORE_HINT = "stop the service and run `deltalight restore BACKUP`"
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def restore_backup(path: Path, folder: Path) -> Contents:
     the folder finishes it.
 
     Raises:
-        DeltalightError: the file is no whole backup, is of another version, or the folder is in use.
+        DeltalightError: the file is not a complete backup, is of another version, or the folder is in use.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -184,7 +184,7 @@ def _explained(database: Path) -> Iterator[None]:
         yield
     except sqlite3.OperationalError as fault:
         raise DeltalightError(
-            f"{database} cannot be used now ({fault}); free some space, or end other users of it."
+            f"{database} cannot be used now ({fault}); free some space, or stop other programs that use it."
         ) from fault
     except sqlite3.DatabaseError as fault:
         raise DeltalightError(f"{database} is damaged ({fault}); {RESTORE_HINT}.") from fault
@@ -214,7 +214,7 @@ def _unpack(path: Path, to: Path) -> Contents:
     except OSError as fault:
         raise DeltalightError(f"{path} cannot be restored ({fault.strerror or fault}).") from fault
     except (*DAMAGE, KeyError, ValueError, TypeError, RuntimeError) as fault:
-        raise DeltalightError(f"{path} is no whole backup ({fault}); give another one.") from fault
+        raise DeltalightError(f"{path} is not a complete backup ({fault}); give another one.") from fault
     contents, digests = _examined(to / DATABASE, path)
     for digest, name in digests.items():
         if not (to / ASSETS / digest / name).is_file():
@@ -256,4 +256,4 @@ def _extract(archive: zipfile.ZipFile, entry: _Entry, to: Path, path: Path) -> N
         file.flush()
         os.fsync(file.fileno())
     if (size, digest.hexdigest()) != (entry.size, entry.sha256):
-        raise DeltalightError(f"{path} is damaged: {entry.name} is not what it was; give another backup.")
+        raise DeltalightError(f"{path} is damaged: {entry.name} has changed; give another backup.")

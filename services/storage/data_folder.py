@@ -39,7 +39,7 @@ def use_folder_alone(folder: Path) -> ExitStack:
     return _locked(
         folder,
         fcntl.LOCK_EX,
-        "is in use; end the service (and `deltalight backup`) that uses it, then try again.",
+        "is in use; stop the service (and `deltalight backup`) that uses it, then try again.",
     )
 
 

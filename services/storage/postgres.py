@@ -105,7 +105,7 @@ class PostgresDatabase(Database):
         except DBAPIError as fault:
             if not _is_gone(fault):
                 raise StorageFaultError(
-                    f"The database cannot be used now ({_first_line(fault)}); try again, or see to its server."
+                    f"The database cannot be used now ({_first_line(fault)}); try again, or check its server."
                 ) from fault
             raise self._gone_error(fault) from fault
         except PoolTimeoutError as fault:

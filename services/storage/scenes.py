@@ -195,7 +195,9 @@ class SceneStore:
         def step(session: Session, newest: RevisionRow) -> RevisionRow:
             shown = _origin(session, newest)
             if shown.before is None:
-                raise ConflictError("there is nothing to undo; the scene is as it was made.")
+                raise ConflictError(
+                    "there is nothing to undo; the scene has not changed since it was created."
+                )
             return _shown_again(
                 newest, _revision(session, newest.scene_id, shown.before), "undo", newest.number
             )
@@ -211,7 +213,7 @@ class SceneStore:
 
         def step(session: Session, newest: RevisionRow) -> RevisionRow:
             if newest.redo is None:
-                raise ConflictError("there is nothing to redo; only undone changes can be made again.")
+                raise ConflictError("there is nothing to redo; only undone changes can be redone.")
             undone = _revision(session, newest.scene_id, newest.redo)
             return _shown_again(newest, _origin(session, undone), "redo", undone.redo)
 

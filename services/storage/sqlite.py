@@ -69,11 +69,11 @@ class SqliteDatabase(Database):
             cause = fault.orig if isinstance(fault, DatabaseError) else fault
             if getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
                 raise StorageFaultError(
-                    f"{self._path} is damaged ({cause}); end the service and run `deltalight restore BACKUP`."
+                    f"{self._path} is damaged ({cause}); stop the service and run `deltalight restore BACKUP`."
                 ) from fault
             raise StorageFaultError(
-                f"The database cannot be used now ({cause}); free some space, end other users of it, or name "
-                "another --data folder."
+                f"The database cannot be used now ({cause}); free some space, stop other programs that use it, or"
+                " name another --data folder."
             ) from fault
 
 

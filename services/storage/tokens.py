@@ -48,7 +48,9 @@ class TokenStore:
             DeltalightError: the name is wrong or taken.
         """
         if not _NAME.fullmatch(name):
-            raise DeltalightError(f"`{name}` is no name for a token; use letters, digits, dots and dashes.")
+            raise DeltalightError(
+                f"`{name}` is not a valid name for a token; use letters, digits, dots and dashes."
+            )
         token_id, secret, salt = (
             secrets.token_hex(6),
             secrets.token_urlsafe(_SECRET_BYTES),

@@ -73,7 +73,7 @@ def test_steps_are_chosen_by_name_and_keep_their_order() -> None:
     assert [step.name for step in choose_steps("speed, doctor")] == ["doctor", "speed"]
     assert choose_steps(None) == STEPS
     with pytest.raises(
-        DeltalightError, match=r"'shader' is no step of gpu-check; the nearest is shaders, of doctor,"
+        DeltalightError, match=r"'shader' is not a step of gpu-check; the nearest is shaders, of doctor,"
     ):
         choose_steps("doctor,shader")
 

@@ -145,7 +145,7 @@ def test_names_of_motions_and_methods() -> None:
     assert [each.name for each in parse_variants(TIMED_METHODS, RENDERED)] == TIMED_METHODS.split(",")
     assert set(RENDERED) < set(FIXED)
     for name in ("camera", "path", "fisheye"):
-        with pytest.raises(DeltalightError, match=f"'{name}' is no method"):
+        with pytest.raises(DeltalightError, match=f"'{name}' is not a method"):
             parse_variants(name, RENDERED)
 
 

@@ -84,7 +84,7 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(
     for other, sentence in (
         (tmp_path / "absent.json", "cannot be read"),
         (tmp_path / "text.json", "not valid JSON"),
-        (tmp_path / "counts.json", "is no report"),
+        (tmp_path / "counts.json", "is not a report"),
         (write(tmp_path / "size.json", "exact", size=(640, 480)), "64x48; 640x480"),
         (write(tmp_path / "machine.json", "exact", cpus=4), "different machines"),
         (write(tmp_path / "method.json", "paper"), "in common"),
@@ -162,8 +162,8 @@ def test_what_cannot_be_drawn_is_refused_in_a_sentence(
         (("--speed", speed, "--quality", quality), "same --methods"),
         (("--speed", speed, "--speed", other, "--quality", quality), "different machines"),
         (("--speed", other, "--quality", quality), "moving as in `camera`"),
-        (("--speed", speed, "--quality", speed), "no report of `bench quality`"),
-        (("--speed", quality, "--quality", quality), "no report of this version's `bench speed`"),
+        (("--speed", speed, "--quality", speed), "not a report of `bench quality`"),
+        (("--speed", quality, "--quality", quality), "not a report of this version's `bench speed`"),
     ):
         assert run(["bench", "plot", *map(str, options), "--out", str(tmp_path / "plot.svg")]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()

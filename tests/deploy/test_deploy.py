@@ -107,6 +107,30 @@ def test_volumes_belong_to_the_user_that_runs() -> None:
     assert mounted == set(made[1].split())
 
 
+def test_health_is_checked_each_half_minute() -> None:
+    ours = [
+        each for each in compose()["services"].values() if each.get("image", "").startswith("deltalight/")
+    ]
+    assert len(ours) >= 3
+    assert {each["healthcheck"]["interval"] for each in ours} == {"30s"}
+
+
+@pytest.mark.parametrize(
+    ("file", "service", "device", "rule"),
+    [(OAK, "node", "/dev/bus/usb", ["c 189:* rmw"]), (DRI, "server", "/dev/dri", None)],
+    ids=["oak", "dri"],
+)
+def test_containers_with_a_device_have_its_group(
+    file: Path, service: str, device: str, rule: list[str] | None
+) -> None:
+    """As user 10001 they see it by the host's group alone."""
+    override = yaml.safe_load(VARIABLE.sub(r"\1", file.read_text()))["services"][service]
+    given = [*override.get("devices", []), *override.get("volumes", [])]
+    assert [each.split(":")[0] for each in given] == [device]
+    assert override.get("device_cgroup_rules") == rule
+    assert [group.isdecimal() for group in override["group_add"]] == [True]
+
+
 @pytest.mark.parametrize("file", [NVIDIA, DRI], ids=["nvidia", "dri"])
 @pytest.mark.parametrize("service", ["server", "rooms"])
 def test_the_commands_on_gpus_are_the_other_one_without_software(file: Path, service: str) -> None:

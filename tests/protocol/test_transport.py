@@ -252,7 +252,7 @@ def test_endpoints_that_leave_the_host_are_refused(endpoint: str) -> None:
         lambda: Receiver([endpoint], []),
         lambda: RequestClient(endpoint),
     ):
-        with pytest.raises(DeltalightError, match="leaves this host"):
+        with pytest.raises(DeltalightError, match="is reachable from other hosts"):
             build()
 
 

@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from deltalight.render_server.occlusion_fields import (
     load_field,
     store_field,
 )
+from deltalight.render_server.precomputation import KeptParts
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.occlusion_field import (
     FieldSettings,
@@ -215,7 +217,7 @@ def test_fields_that_were_not_used_for_longest_give_way(
         os.utime(tmp_path / f"{number}.npz", ns=(number, number))
     assert load_field(tmp_path, "0", SETTINGS) is not None
     room = 3 * (tmp_path / "0.npz").stat().st_size
-    monkeypatch.setattr("deltalight.render_server.occlusion_fields.cache_limit_bytes", lambda: room)
+    monkeypatch.setattr("deltalight.render_server.precomputation.cache_limit_bytes", lambda: room)
     store_field(tmp_path, "3", ball_field)
     assert sorted(path.name for path in tmp_path.glob("*.npz*")) == [
         f"{number}.npz{end}" for number in (0, 2, 3) for end in ("", ".sha256")
@@ -232,6 +234,38 @@ def test_a_second_start_computes_nothing(
     found = OcclusionFields(pytest.fail, tmp_path).find(placed(ball), SETTINGS)
     assert found is not None
     assert (found.occlusion == ball_field.occlusion).all()
+
+
+def test_a_field_that_was_broken_off_goes_on_with_its_next_shell(
+    tmp_path: Path, ball: TriangleMesh, ball_field: OcclusionField
+) -> None:
+    surface = object_surface([ball], plain=True)
+    parts, computed = KeptParts(tmp_path, "ab"), []
+
+    def counting(name: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+        def counted() -> np.ndarray:
+            computed.append(name)
+            return compute()
+
+        return parts.part(name, counted)
+
+    def break_off(done: float) -> None:
+        if done > 0.9:  # in the last but one shell of what the ball reflects
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compute_field(surface, SETTINGS, break_off, counting)
+    damaged = tmp_path / "ab-occlusion-1.npz"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    computed.clear()
+    again = compute_field(surface, SETTINGS, lambda _share: None, counting)
+    assert computed == ["occlusion-1", "transfer-2"]
+    assert (again.occlusion == ball_field.occlusion).all()
+    assert again.transfer is not None
+    assert ball_field.transfer is not None
+    assert (again.transfer == ball_field.transfer).all()
+    parts.remove()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_terminal_shows_how_far_the_field_is(

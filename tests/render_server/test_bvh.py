@@ -12,7 +12,8 @@ import trimesh
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
-from deltalight.render_server.passes.gbuffer import MeshBuffers, ObjectBvh
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.passes.gbuffer import MeshBuffers, ObjectBvh, bvh_texture
 from deltalight.render_server.scene.bvh import LEAF_SIZE, Bvh, RayCaster, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -78,19 +79,16 @@ def traced(
     rows = np.zeros((len(origins), 2, 4), np.float32)
     rows[:, 0, :3], rows[:, 1, :3] = origins, directions
     faces = bvh.packed_triangles(corners, vertices_of(corners))
-    contents = [rows.tobytes(), bytes(16 * len(origins)), bvh.packed(), faces]
-    buffers = [gpu.ctx.buffer(content) for content in contents]
-    rays, hits = buffers[:2]
+    rays, hits = (gpu.ctx.buffer(content) for content in (rows.tobytes(), bytes(16 * len(origins))))
+    textures = [bvh_texture(gpu, packed) for packed in (bvh.packed(), faces)]
+    hierarchy = {"bvh_nodes": textures[0], "bvh_faces": textures[1]}
     kernel = Kernel(gpu, SHADER)
-    kernel.run(
-        (len(origins),), UNREAD, Rays=rays, Hits=hits, Nodes=buffers[2], Faces=buffers[3], count=len(origins)
-    )
+    kernel.run((len(origins),), UNREAD, hierarchy, Rays=rays, Hits=hits, count=len(origins))
     found = np.frombuffer(hits.read(), np.float32).reshape(-1, 4).copy()
     met = found[:, 1] >= 0
     found[met, 1] = bvh.order[found[met, 1].astype(int)]
     kernel.release()
-    for buffer in buffers:
-        buffer.release()
+    release_all(rays, hits, *textures)
     return found
 
 
@@ -207,9 +205,10 @@ def test_a_refitted_bvh_of_shuffled_triangles_is_worn(gpu: GpuContext) -> None:
     bounds = (corners.min(axis=(0, 1)), corners.max(axis=(0, 1)))
     for each in (corners, shuffled):
         objects.set_triangles(each, bounds, mesh)
-        nodes = objects.bindings["Nodes"]
-        assert isinstance(nodes, moderngl.Buffer)
-        assert nodes.read() == build_bvh(each).packed()
+        nodes = objects.bindings["bvh_nodes"]
+        assert isinstance(nodes, moderngl.Texture)
+        packed = build_bvh(each).packed()
+        assert nodes.read()[: len(packed)] == packed
     objects.release()
     mesh.release()
 

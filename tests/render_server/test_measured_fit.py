@@ -114,7 +114,7 @@ def _mesh(_content: bytes) -> bytes:
         (_cut, "is damaged or cut short"),
         (_turned, "is damaged or cut short"),
         (_newer, "is a precomputed material of version 2, and this release reads version 1"),
-        (_mesh, "is no precomputed material; make it with `deltalight precompute"),
+        (_mesh, "is not a precomputed material; make it with `deltalight precompute"),
     ],
 )
 def test_bad_material_files(tmp_path: Path, change: Callable[[bytes], bytes], sentence: str) -> None:
@@ -141,13 +141,13 @@ WHOLE = brdf_text(PAINT)
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "is no whole .brdf file"),
-        ("# only a comment\n", "is no whole .brdf file"),
-        (WHOLE[: len(WHOLE) // 2 - 30], "is no whole .brdf file"),
+        ("", "is not a complete .brdf file"),
+        ("# only a comment\n", "is not a complete .brdf file"),
+        (WHOLE[: len(WHOLE) // 2 - 30], "is not a complete .brdf file"),
         ("ply\nformat ascii 1.0\n", "holds something else than numbers"),
         (WHOLE.replace(" 0.", " nan ", 1), "not finite"),
         (WHOLE.replace(" 0.", " 1e300 ", 1), "beyond 1e"),
-        (WHOLE.replace("400 410", "410 400"), "is no whole .brdf file"),
+        (WHOLE.replace("400 410", "410 400"), "is not a complete .brdf file"),
         ("2\n400 500\n" + "0.1 0 0.2 0 1 1\n" * 200, "from 400 to 500 nm, which tells no colour"),
         (
             "2\n400 700\n" + "0.1 0 0.2 0 1 1\n" * 9,

@@ -156,7 +156,10 @@ def test_in_even_light_it_reflects_its_albedo(gpu: GpuContext, tmp_path: Path, s
 def test_what_is_none_is_refused(gpu: GpuContext, tmp_path: Path) -> None:
     stage = Stage(tmp_path)
     document = stage.document([sphere(stage, PAINT)], [ambient(0.4)])
-    for content, sentence in ((b"ply\n", "paint.dlmat is no precomputed material"), (None, "cannot be read")):
+    for content, sentence in (
+        (b"ply\n", "paint.dlmat is not a precomputed material"),
+        (None, "cannot be read"),
+    ):
         path = tmp_path / "paint.dlmat"
         path.unlink()
         if content is not None:

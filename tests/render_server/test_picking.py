@@ -176,7 +176,7 @@ def test_unknown_depth_is_nothing(gpu: GpuContext, stage: Stage, has_object: boo
 def test_what_cannot_be_picked_is_a_sentence(gpu: GpuContext, stage: Stage) -> None:
     document = everyday(stage)
     renderer = SceneRenderer(gpu, document)
-    with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
+    with pytest.raises(DeltalightError, match="Nothing has been rendered yet"):
         renderer.pick(1, 1)
     renderer.render(frame())
     assert renderer.pick(-0.5, HEIGHT - 0.51).kind in ("real", "nothing")

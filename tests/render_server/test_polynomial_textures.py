@@ -174,7 +174,7 @@ def _rewritten(folder: Path, change: Callable[[dict[str, Any]], object]) -> None
             ),
             "lacks whole scales and biases",
         ),
-        (lambda folder: (folder / "info.json").write_text("{"), "is no JSON document"),
+        (lambda folder: (folder / "info.json").write_text("{"), "is not a JSON document"),
         (lambda folder: (folder / "info.json").unlink(), "cannot be read"),
         (
             lambda folder: (folder / "plane_3.jpg").write_bytes(b"JPEG?"),

@@ -56,7 +56,7 @@ def test_the_renderer_gives_its_own_triangles_or_those_of_depth(gpu: GpuContext,
     sensed = model.replaced(real={"geometry": "depth"})
     for document in (model, sensed, sensed.replaced(objects=())):
         renderer = SceneRenderer(gpu, document)
-        with pytest.raises(DeltalightError, match="place is not known"):
+        with pytest.raises(DeltalightError, match="position is not known"):
             renderer.room()
         renderer.render(taken)
         room = renderer.room()

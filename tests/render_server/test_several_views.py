@@ -50,6 +50,7 @@ WORLD_KERNELS = "voxelize", "reflective_shadow_map", "light_voxels", "filter_vox
 FRONT, BACK, TOP, END = -0.29, -0.31, 0.2, 0.6  # of a wall: x of both sides, height, half its length
 BEHIND = look_at((-0.75, -0.3, 0.9), (-0.12, 0, 0.05))  # looks over the wall, at its back
 FACING = look_at((0.7, -0.2, 0.6), (-0.3, 0, 0.2))  # sees its front
+EVERY_PIXEL = 160_000  # triangles: a node of the mesh for each, whoever shares the budget
 GREY, RED = (120, 120, 120), (190, 30, 30)
 
 
@@ -76,10 +77,12 @@ def seen_room(pose: BoardPose, number: int = 0, **changes: Any) -> ViewFrame:  #
     return frame(picture, pose=pose, **{**given, **changes})
 
 
-def document(stage: Stage, geometry: str, **method: object) -> SceneDocument:
+def document(
+    stage: Stage, geometry: str, material: dict[str, float] | None = None, **method: object
+) -> SceneDocument:
     """A white cube before the wall, whose front is lit."""
     wall = shifted(trimesh.creation.box((FRONT - BACK, 2 * END, TOP)), (FRONT + BACK) / 2, 0, TOP / 2)
-    white = stage.virtual(cube(0.1, (-0.12, 0, 0)), (0.8, 0.8, 0.8))
+    white = stage.virtual(cube(0.1, (-0.12, 0, 0)), (0.8, 0.8, 0.8), material or {})
     model = trimesh.util.concatenate([floor(1.0), wall])
     own = {} if "name" in method else method
     given = stage.document([white], [directional((-0.9, 0.1, -0.5))], model, **{**FAST, **own})
@@ -131,8 +134,10 @@ def test_a_frame_that_comes_twice_counts_once(made: Callable[..., SceneRenderer]
     """Two cameras at one place know what one knows: light and obstacles must not add up."""
     settings, geometry = METHODS[method], "fused" if method == "dlpv" else "depth"
     view = seen_room(FACING)
-    one = made(geometry, **settings).render(view)
-    pair = made(geometry, **settings).render_views([view, replace(view, frame_id=1)])
+    one = made(geometry, **settings, triangle_budget=EVERY_PIXEL).render(view)
+    pair = made(geometry, **settings, triangle_budget=EVERY_PIXEL).render_views(
+        [view, replace(view, frame_id=1)]
+    )
     assert np.abs(one.color.astype(int) - view.color).max() > 40
     for each in pair:
         assert np.abs(each.color.astype(int) - one.color).max() <= 1
@@ -173,6 +178,26 @@ def test_the_world_is_made_once_and_each_view_by_itself(
     assert not {f"{name} (view 2)" for name in of_world} & doubled
     again = counted(seen_room(FACING), small)
     assert set(again) == {"composite", "linearize"}, "nothing moved"
+
+
+def test_beams_of_smooth_objects_are_traced_once_and_end_in_each_view(
+    made: Callable[..., SceneRenderer], gpu: GpuContext
+) -> None:
+    kernels: Counter[str] = Counter()
+    renderer = made("model", material={"metallic": 1.0, "roughness": 0.3})
+    with watched(gpu, lambda run: kernels.update([run.kernel])):
+        renderer.render_views([seen_room(FACING), seen_room(BEHIND)])
+    assert [
+        kernels[name] for name in ("caustic_beams RAY_COUNT=4 WIDE", "caustic_ends", "caustic_places")
+    ] == [1, 2, 2]
+    assert not kernels["caustic_beams RAY_COUNT=4"], "nothing mirrors so sharply"
+
+
+def test_several_cameras_share_the_budget_of_triangles(made: Callable[..., SceneRenderer]) -> None:
+    renderer = made("depth", triangle_budget=2000)
+    views = [seen_room(FACING), seen_room(BEHIND)]
+    renderer.render_views(views)
+    assert 1000 < len(renderer.room().corners) <= 2000
 
 
 def test_a_camera_without_its_pose_leaves_to_the_room_what_it_saw(made: Callable[..., SceneRenderer]) -> None:
@@ -248,7 +273,7 @@ def test_a_frame_that_is_not_shown_lights_the_room_and_one_left_out_does_not(
     assert picks[0] == picks[2] != picks[1]
     (second,) = pictures(renderer, CameraFrame("b", facing))
     assert renderer.pick(*middle).distance_m == picks[1]
-    with pytest.raises(DeltalightError, match="Nothing was rendered"):
+    with pytest.raises(DeltalightError, match="Nothing has been rendered"):
         renderer.pick(*middle, camera="a")
     assert psnr_db(second, facing.color) < 45, "the object is in it"
     again = pictures(renderer, CameraFrame("a", behind), CameraFrame("b", facing))

@@ -195,7 +195,7 @@ def test_another_source_begins_as_if_there_had_been_none(gpu: GpuContext, stage:
             renderer.render(replace(view, color=255 - view.color))
         if others:
             renderer.forget_frames()
-            with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
+            with pytest.raises(DeltalightError, match="Nothing has been rendered yet"):
                 renderer.pick(1, 1)
         pictures.append([renderer.render(noisy_view(number)).color for number in range(2)])
         renderer.release()

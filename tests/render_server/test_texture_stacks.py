@@ -274,7 +274,7 @@ def described(**changes: object) -> Callable[[Path], object]:
         (lambda folder: (folder / "2.png").write_bytes(b"\x89PNG"), "2.png cannot be read as a picture"),
         (lambda folder: (folder / "2.png").unlink(), "2.png cannot be read as a picture"),
         (lambda folder: Image.new("RGB", (8, 8)).save(folder / "0.png"), "have several sizes"),
-        (lambda folder: (folder / "info.json").write_text("["), "is no JSON document"),
+        (lambda folder: (folder / "info.json").write_text("["), "is not a JSON document"),
         (lambda folder: (folder / "info.json").write_text("[]"), "holds no JSON object"),
         (lambda folder: (folder / "info.json").write_bytes(b" " * (2 << 20)), "has more than 1 MB"),
     ],

@@ -140,7 +140,7 @@ def test_the_mean_turn_does_not_depend_on_signs_of_quaternions() -> None:
 @pytest.mark.parametrize(
     ("poses", "sentence"),
     [
-        (scattered(3, 0.001, 0.002), "3 moments only"),
+        (scattered(3, 0.001, 0.002), "only 3 moments"),
         (scattered(20, 0.02, 0.002), "spread by"),
         (scattered(20, 0.001, 0.03), "spread by"),
     ],
@@ -208,7 +208,7 @@ def test_depth_of_another_scale_is_refused(synthetic: SyntheticCamera) -> None:
 def test_depth_that_shows_no_board_is_refused(synthetic: SyntheticCamera) -> None:
     assert synthetic.board is not None
     far = rigid_matrix(np.eye(3), (0.0, 0.0, 0.5))
-    with pytest.raises(DeltalightError, match="in 0 views only"):
+    with pytest.raises(DeltalightError, match="in only 0 views"):
         place_depth_sensor(all_tilts(synthetic), synthetic.board, far)
 
 

@@ -83,12 +83,12 @@ def test_a_bracket_is_read_from_a_list_or_from_exif(tmp_path: Path) -> None:
 
 
 def test_a_picture_without_exposure_is_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(DeltalightError, match="tells no exposure"):
+    with pytest.raises(DeltalightError, match="has no exposure"):
         read_bracket(tmp_path, "rgb")
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(DeltalightError, match=r"a\.png tells no exposure"):
+    with pytest.raises(DeltalightError, match=r"a\.png has no exposure"):
         read_bracket(tmp_path, "rgb")
-    with pytest.raises(DeltalightError, match="is no folder"):
+    with pytest.raises(DeltalightError, match="is not a folder"):
         read_bracket(tmp_path / "nowhere", "rgb")
 
 

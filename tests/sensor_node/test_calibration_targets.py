@@ -231,7 +231,7 @@ def test_a_source_without_pictures_is_a_sentence(tmp_path: Path, source: str, se
 
 @pytest.mark.parametrize("text", ["chessboard:8x6", "chessboard:2x6:0.1", "chessboard:8x6:0", "chessboard"])
 def test_a_wrong_chessboard_is_a_sentence(text: str) -> None:
-    with pytest.raises(DeltalightError, match="is no chessboard"):
+    with pytest.raises(DeltalightError, match="is not a chessboard"):
         parse_target(text, None, ())
 
 

@@ -164,7 +164,7 @@ def test_wrong_commands_are_refused(source: Source) -> None:
         for rate in (0.0, -1.0, 1e9, float("nan")):
             with pytest.raises(DeltalightError, match=r"rate of 0\.05 to 20"):
                 reader.camera.set_rate(rate)
-        with pytest.raises(DeltalightError, match="is no place"):
+        with pytest.raises(DeltalightError, match="is not a position"):
             reader.camera.seek(float("nan"))
     with pytest.raises(DeltalightError, match="rate"):
         PlaybackCamera(source, loop=False, rate=0)

@@ -54,16 +54,11 @@ JPEG_QUALITY = 75  # keeps most below 100 kB
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-NEEDS_BROWSER = [
-    pytest.mark.slow(seconds=6),
-    pytest.mark.skipif(
-        CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
-    ),
-    pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(),
-        reason="the dashboard is not built; `./run test --all` builds it",
-    ),
-]
+USES_BROWSER = pytest.mark.skipif(
+    CHROMIUM is None or not (DASHBOARD / "index.html").is_file(),
+    reason="no Chromium is installed, or the dashboard is not built; `./run test --all` sees to both",
+)
+NEEDS_BROWSER = [pytest.mark.slow(seconds=6), USES_BROWSER]
 
 
 @contextmanager

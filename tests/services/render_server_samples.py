@@ -175,7 +175,7 @@ class InvertingRenderer:
     def pick(self, x: float, y: float, ignore: str | None = None, camera: str | None = None) -> Picked:
         seen = next(iter(self.newest.values()), None) if camera is None else self.newest.get(camera)
         if seen is None:
-            raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
+            raise DeltalightError("Nothing has been rendered yet; ask again when there is a picture.")
         self.ignored = ignore
         return Picked(seen.frame_id, (x, y))
 

@@ -163,9 +163,9 @@ def zip_bomb() -> bytes:
 @pytest.mark.parametrize(
     ("content", "name", "expected"),
     [
-        (b"\x89PNG\r\n\x1a\n" + bytes(64), "chair.glb", "no file of a known format"),
-        (b"%PDF-1.7\n", "chair.obj", "no file of a known format"),
-        (b"\x7fELF" + bytes(64), "room.exr", "no file of a known format"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(64), "chair.glb", "not in a known format"),
+        (b"%PDF-1.7\n", "chair.obj", "not in a known format"),
+        (b"\x7fELF" + bytes(64), "room.exr", "not in a known format"),
         (mesh(), "chair.obj", "is a GLB file and not OBJ"),
         (zip_bomb(), "bomb.zip", "more than 2 MB unpacked"),
         (mesh({"count": -3}), "lie.glb", "where a count belongs"),
@@ -365,9 +365,9 @@ def test_tokens_that_cannot_be_read_let_nobody_in(tmp_path: Path, monkeypatch: p
 
 
 def test_addresses_and_methods_that_there_are_not(api: RunningApi) -> None:
-    assert "nothing is at" in refused(api, lambda: api.client.get("/nothing"), 404, "not-found")
+    assert "there is nothing at" in refused(api, lambda: api.client.get("/nothing"), 404, "not-found")
     text = refused(api, lambda: api.client.delete("/state"), 405, "method-not-allowed")
-    assert "does not take that method" in text
+    assert "does not support that method" in text
 
 
 def test_a_render_server_that_dies_holds_nobody_up(tmp_path: Path) -> None:

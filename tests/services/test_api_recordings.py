@@ -207,10 +207,10 @@ def test_a_video_without_pyav_is_one_sentence(tmp_path: Path, monkeypatch: pytes
     ("body", "expected"),
     [
         ({"composites": 1}, "composites"),
-        ({"name": "../take"}, "no name for a recording"),
-        ({"name": "a.mcap"}, "no name for a recording"),
-        ({"name": ""}, "no name for a recording"),
-        ({"name": "/etc/take"}, "no name for a recording"),
+        ({"name": "../take"}, "not a valid recording name"),
+        ({"name": "a.mcap"}, "not a valid recording name"),
+        ({"name": ""}, "not a valid recording name"),
+        ({"name": "/etc/take"}, "not a valid recording name"),
         ({"duration_s": 0}, "duration_s"),
         ({"duration": 3}, "the nearest known key is `duration_s`"),
         ({"node": "a b"}, "node"),
@@ -249,7 +249,7 @@ def test_a_killed_recorder_leaves_a_recording_that_is_mended(api: RunningApi, cl
     assert mended.status_code == 200, mended.text
     assert (mended.json()["state"], mended.json()["frames"]) == ("finished", listed["frames"])
     assert not list((api.store.folder / "recordings").glob("torn*.active"))
-    assert "nothing to mend" in sentence(client.post("/recordings/torn/recover"), 409)
+    assert "nothing to recover" in sentence(client.post("/recordings/torn/recover"), 409)
 
 
 def test_a_service_that_ends_finishes_what_grows(tmp_path: Path) -> None:

@@ -237,8 +237,8 @@ def test_parts_are_replaced_and_patched(
     [
         ("PATCH", "", {"metod": {}}, 422, "unknown key `metod`; the nearest known key is `method`"),
         ("PATCH", "", {"objects": [{"asset": "t.obj", "pose": {"scale": -1}}]}, 422, "objects[0].pose.scale"),
-        ("PATCH", "", {"objects": [{"asset": "/etc/passwd"}]}, 422, "no uploaded asset"),
-        ("PATCH", "", {"objects": [{"asset": "../../store.sqlite3"}]}, 422, "no uploaded asset"),
+        ("PATCH", "", {"objects": [{"asset": "/etc/passwd"}]}, 422, "not an uploaded asset"),
+        ("PATCH", "", {"objects": [{"asset": "../../store.sqlite3"}]}, 422, "not an uploaded asset"),
         ("PATCH", "", {"lights": {"environment": {"map": "t.obj"}}}, 422, "needs a map"),
         ("PATCH", "", [1, 2], 422, "`body` is wrong"),
         ("PUT", "", [1, 2], 422, "the scene"),

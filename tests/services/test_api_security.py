@@ -58,7 +58,7 @@ def test_which_addresses_leave_the_host(host: str, leaves: bool) -> None:
 def test_loopback_needs_no_token_but_refuses_a_wrong_one(open_api: RunningApi) -> None:
     client = open_api.client
     assert client.get("/scenes").json() == []
-    assert "not known" in sentence(client.get("/scenes", headers=bearer("guess")), 401)
+    assert "is unknown" in sentence(client.get("/scenes", headers=bearer("guess")), 401)
     assert client.get("/settings").json()["needs_token"] is False
 
 
@@ -74,7 +74,7 @@ def test_elsewhere_every_request_needs_a_token(guarded: RunningApi) -> None:
     assert "token is needed" in sentence(client.get("/scenes", headers={"Cookie": f"token={token}"}), 401)
     assert client.get(f"/scenes?token={token}").status_code == 401
     guarded.store.tokens.revoke("me")
-    assert "not known" in sentence(client.get("/scenes", headers=bearer(token)), 401)
+    assert "is unknown" in sentence(client.get("/scenes", headers=bearer(token)), 401)
 
 
 def test_a_token_that_an_earlier_version_stored_is_told_to_be_made_again(guarded: RunningApi) -> None:
@@ -108,7 +108,7 @@ def test_role_view_may_look_only(guarded: RunningApi) -> None:
         ("POST", "/assets?name=a.glb"),
         ("POST", f"/scenes/{scene_id}/activate"),
     ):
-        assert "may only look" in sentence(client.request(method, path, headers=headers), 403)
+        assert "is read-only" in sentence(client.request(method, path, headers=headers), 403)
     assert guarded.store.scenes.get(scene_id).document.revision == 1
 
 
@@ -256,7 +256,7 @@ def test_a_token_file_lets_in_with_role_control(tmp_path: Path) -> None:
     (tmp_path / "token").write_text(f"{secret}\n")
     with running_api(tmp_path / "data", host="0.0.0.0", token_file=str(tmp_path / "token")) as running:
         assert running.client.post("/scenes", json={}, headers=bearer(secret)).status_code == 201
-        assert "not known" in sentence(running.client.get("/scenes", headers=bearer(other)), 401)
+        assert "is unknown" in sentence(running.client.get("/scenes", headers=bearer(other)), 401)
         assert running.store.tokens.all() == []
 
 

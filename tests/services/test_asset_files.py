@@ -123,14 +123,14 @@ def test_copies_are_as_many_as_a_cache_may_hold(
 @pytest.mark.usefixtures("s3")
 def test_a_store_that_refuses_is_a_sentence_and_nothing_is_half_stored(tmp_path: Path) -> None:
     with Store(tmp_path, assets="s3://no-such-bucket/x", probe=trusting_probe) as store:
-        with pytest.raises(StorageFaultError, match=r"store of assets .* see to s3://no-such-bucket/x"):
+        with pytest.raises(StorageFaultError, match=r"store of assets .* check s3://no-such-bucket/x"):
             upload(store, TETRAHEDRON, "shape.obj")
         assert store.assets.all() == []
         assert not [path for path in (tmp_path / "assets").rglob("*") if path.is_file()]
 
 
 def test_wrong_addresses_are_sentences(tmp_path: Path) -> None:
-    with pytest.raises(DeltalightError, match="is no address of a store of assets"):
+    with pytest.raises(DeltalightError, match="is not the address of an asset store"):
         Store(tmp_path, assets="carrier-pigeon://loft")
 
 

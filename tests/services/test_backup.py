@@ -104,7 +104,7 @@ def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(cli: RunCli, tm
     with Store(data):
         refused = cli("restore", kept, "--data", data)
     assert refused.returncode == 2
-    assert "is in use; end the service" in refused.stderr
+    assert "is in use; stop the service" in refused.stderr
     assert "cannot be restored" in cli("restore", tmp_path / "none.zip", "--data", data).stderr
     assert shown(data) == "first"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "kept.zip"]
@@ -145,7 +145,7 @@ def test_a_backup_writes_nothing_but_its_own_files(tmp_path: Path, name: str) ->
         archive.writestr(name, b"")
         files = [{"name": name, "size": 0, "sha256": "0" * 64}]
         archive.writestr(MANIFEST, json.dumps({"format": 1, "files": files}))
-    with pytest.raises(DeltalightError, match="no whole backup"):
+    with pytest.raises(DeltalightError, match="not a complete backup"):
         restore_backup(tmp_path / "evil.zip", tmp_path / "data")
 
 

@@ -189,11 +189,11 @@ def test_a_board_that_does_not_fit_is_refused_with_what_does() -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--out", "board.txt"), "is no PDF file"),
+        (("--out", "board.txt"), "is not a PDF file"),
         (("--out", "board.pdf", "--dictionary", "DICT_4X4_60"), "nearest name is DICT_4X4_50"),
         (("--out", "board.pdf", "--rows", "9", "--columns", "9", "--marker-mm", "10"), "ids go from 0 to 49"),
         (("--out", "board.pdf", "--lamp-marker", "3"), "also on the board"),
-        (("--out", "old.pdf"), "exists already"),
+        (("--out", "old.pdf"), "already exists"),
     ],
 )
 def test_wrong_use_is_a_sentence(

@@ -84,7 +84,7 @@ def test_json_has_the_figures_and_older_results_stay(shots: Path, tmp_path: Path
     assert report["views"] == len(report["per_view"])
     assert report["rms_px"] < 0.2
     before = (tmp_path / "calibration" / "rgb.yaml").read_bytes()
-    assert "write over it with --force" in sentence(calibrate(*arguments))
+    assert "overwrite it with --force" in sentence(calibrate(*arguments))
     assert (tmp_path / "calibration" / "rgb.yaml").read_bytes() == before
     assert calibrate(*arguments, "--force").exit_code == 0
 
@@ -140,7 +140,7 @@ def test_extrinsics_are_refused_or_kept_and_never_overwritten(take: Path, tmp_pa
     before = path.read_bytes()
     arguments = ("extrinsics", take, "--out", tmp_path, "--what")
     assert "has world_from_fisheye already" in sentence(calibrate(*arguments, "world_from_fisheye"))
-    assert "0 moments only" in sentence(calibrate(*arguments, "rgb_from_fisheye"))
+    assert "only 0 moments" in sentence(calibrate(*arguments, "rgb_from_fisheye"))
     assert "leave depth_from_rgb uncertain" in sentence(calibrate(*arguments, "depth_from_rgb"))
     assert path.read_bytes() == before
 

@@ -54,7 +54,7 @@ def test_memory_and_time_both_limit_the_slots() -> None:
     [
         (card(GIB), "no room fits"),
         (card(None), "does not tell its memory"),
-        (card(name="llvmpipe"), "are of NVIDIA RTX A4000/PCIe/SSE2, and this host renders on llvmpipe"),
+        (card(name="llvmpipe"), "are for NVIDIA RTX A4000/PCIe/SSE2, and this host renders on llvmpipe"),
     ],
 )
 def test_devices_that_figures_do_not_fit_are_refused(found: FoundDevice, sentence: str) -> None:
@@ -164,4 +164,4 @@ def test_this_host_says_what_it_has_and_offers_it(cli: RunCli, tmp_path: Path) -
     assert f"gpu={label_text(found.name)}" in offered.stdout
     path.write_text(json.dumps(report("another", 1 << 20)))
     refused = cli("rooms", "claim", str(path))
-    assert (refused.returncode, "are of another" in " ".join(refused.stderr.split())) == (2, True)
+    assert (refused.returncode, "are for another" in " ".join(refused.stderr.split())) == (2, True)

@@ -20,12 +20,14 @@ import trimesh
 import deltalight as dl
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import linear_color
 from deltalight.protocol.radiance_files import read_linear
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.render_server.view import resized_frame
 from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 from deltalight.services.object_sizes import likely_factor
+from deltalight.services.offline import RenderJob
 from tests.services.conftest import ROOT, RunCli
 
 FRAMES = 3
@@ -180,6 +182,24 @@ def test_another_method_by_the_short_form_of_out(cli: RunCli, take: Path, tmp_pa
         assert done.returncode == 0, done.stderr
     passes = [records(tmp_path / method)[0]["pass_times_ms"] for method in ("dlpv", "dvct")]
     assert [any("propagate" in name for name in of_one) for of_one in passes] == [True, False]
+
+
+def test_pictures_are_the_best_unless_another_quality_is_asked_for(
+    cli: RunCli, take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    qualities: list[str] = []
+
+    def refuse(job: RenderJob, _watcher: object) -> None:
+        qualities.append(job.scene.method.quality)
+        raise DeltalightError("nothing is rendered here")
+
+    monkeypatch.setattr("deltalight.services.offline.run_job", refuse)
+    scene = write_scene(tmp_path / "scene.json", objects=[], method={"name": "none", "quality": "balanced"})
+    common = ("render", take / "take", "--scene", scene, "-o", tmp_path / "out")
+    for options in ((), ("--quality", "live")):
+        assert_refused(cli(*common, *options), "nothing is rendered")
+    assert qualities == ["best", "live"]
+    assert cli(*common, "--quality", "fast").returncode == 2
 
 
 def test_a_video_in_place_of_a_folder(cli: RunCli, take: Path, tmp_path: Path) -> None:

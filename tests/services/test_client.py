@@ -216,7 +216,7 @@ def test_with_a_token_everything_works_streams_too(tmp_path: Path) -> None:
             assert next(client.events())["role"] == "control"
         with Client(service.address, "guess") as client:
             for attempt in (client.state, lambda: next(client.frames())):
-                with pytest.raises(ApiError, match="not known") as refused:
+                with pytest.raises(ApiError, match="is unknown") as refused:
                     attempt()
                 assert (refused.value.status, refused.value.kind) == (401, "token")
         with Client(service.address) as client, pytest.raises(DeltalightError, match="401"):
@@ -240,17 +240,17 @@ def test_faults_are_sentences(service: Service, client: Client, tmp_path: Path) 
         pytest.raises(DeltalightError, match="correct the address"),
     ):
         unfinished.state()
-    with pytest.raises(DeltalightError, match="is no address"):
+    with pytest.raises(DeltalightError, match="is not an address"):
         Client("http://host:port")
     with (
         Client(f"{service.address}/api/v1/live.jpg?") as picture,
-        pytest.raises(DeltalightError, match="is no Deltalight"),
+        pytest.raises(DeltalightError, match="is not a Deltalight service"),
     ):
         picture.state()
     with pytest.raises(DeltalightError, match="cannot be read"):
         client.upload(tmp_path / "absent.glb")
     (tmp_path / "wrong.glb").write_bytes(b"MZ")
-    with pytest.raises(ApiError, match="no file of a known format") as refused:
+    with pytest.raises(ApiError, match="not in a known format") as refused:
         client.upload(tmp_path / "wrong.glb")
     assert (refused.value.status, refused.value.kind) == (422, "rejected-asset")
 

@@ -81,7 +81,7 @@ def button(page: Page, name: str) -> Locator:
 
 def test_a_wrong_token_is_told_and_a_right_one_is_kept_by_the_tab(guarded: LiveApi, page: Page) -> None:
     sign_in(page, "guess")
-    expect(page.get_by_role("alert")).to_contain_text("not known")
+    expect(page.get_by_role("alert")).to_contain_text("is unknown")
     photograph(page, "sign_in")
     sign_in(page, guarded.api.store.tokens.create("desk", "control"))
     expect(page.get_by_role("status").filter(has_text="Live")).to_be_visible()
@@ -91,7 +91,7 @@ def test_a_wrong_token_is_told_and_a_right_one_is_kept_by_the_tab(guarded: LiveA
     page.get_by_role("menuitem", name="Ambient light").click()
     expect(page.get_by_role("treeitem", name="Ambient light 2")).to_be_visible()
     guarded.api.store.tokens.revoke("desk")
-    expect(page.get_by_role("alert")).to_contain_text("not known")
+    expect(page.get_by_role("alert")).to_contain_text("is unknown")
     expect(page.get_by_label("Token")).to_be_focused()
 
 

@@ -198,7 +198,7 @@ def test_a_room_that_is_not_known_yet_says_so(page: Desk) -> None:
     page.page.get_by_role("status").filter(has_text=sentence).wait_for()
     page.page.unroute("**/live/room.glb")
     page.complaints.clear()  # the browser's own line about the refusal
-    page.named("button", "Read the room again").click()
+    page.named("button", "Update the room").click()
     page.page.locator("canvas.room[data-shown=true]").wait_for()
 
 

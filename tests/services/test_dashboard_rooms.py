@@ -67,7 +67,7 @@ def test_rooms_are_chosen_by_their_pictures_and_drained_by_hand(page: Page, api:
     expect(door.get_by_role("menuitem", name="Move to slot-3")).to_be_visible()
     photograph(page, "rooms_menu")
     door.get_by_role("menuitem", name="Move to slot-3").click()
-    expect(door).to_contain_text("moves to slot-3")
+    expect(door).to_contain_text("moving to slot-3")
     assert api.client.get("/rooms/door").json()["moving_to"] == "slot-3"
     rooms.get_by_role("button", name="Open The door").click()
     page.wait_for_url(re.compile("room=door"))
@@ -85,7 +85,7 @@ def test_rooms_are_chosen_by_their_pictures_and_drained_by_hand(page: Page, api:
     expect(host).to_contain_text("drained")
     photograph(page, "rooms_hosts")
     assert [each["drained"] for each in api.client.get("/hosts").json()] == [True, False, False]
-    host.get_by_role("button", name="Take rooms").click()
+    host.get_by_role("button", name="Accept rooms").click()
     expect(host.get_by_role("button", name="Drain")).to_be_visible()
 
 

@@ -140,7 +140,7 @@ def test_frames_that_stay_away_are_told_with_where_to_look(live: LiveApi, page: 
     page.open()
     live.stream.is_busy, live.stream.camera_fps = True, 0.0
     says(page, "No new frames")
-    expect(page.page.locator(".picture-banner")).to_contain_text("See Nodes below")
+    expect(page.page.locator(".picture-banner")).to_contain_text("Nodes, below")
     expect(page.page.locator(".picture.not-live")).to_have_count(1)
 
 
@@ -218,7 +218,7 @@ def test_a_still_is_shown_until_the_first_live_picture(live: LiveApi, stack: Sta
         live.api.store.poster.unlink()
         live.api.store.poster_before.unlink()
     assert still.bounding_box() == page.page.locator(".picture").bounding_box(), "it fills the picture"
-    expect(page.page.locator(".picture-banner")).to_contain_text("A still picture")
+    expect(page.page.locator(".picture-banner")).to_contain_text("This is a still")
     before = page.named("img", "The camera's picture")
     page.until(lambda: before.evaluate("each => each.naturalWidth"), "what was before")
     covers = "each => getComputedStyle(each).clipPath"

@@ -257,4 +257,4 @@ def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, cli_process: RunCli
     assert done.returncode == 2
     last_line = done.stderr.strip().splitlines()[-1]
     assert "--allow-software" in last_line
-    assert "started again" not in done.stderr
+    assert "restarting it" not in done.stderr

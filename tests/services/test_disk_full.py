@@ -1,4 +1,6 @@
-"""A disk of the kernel's own that is full or read-only, under `api` and `record`: one sentence, nothing half-written.
+"""A disk of the kernel's own that is full or read-only, or a limit of files, under `api` and `record`.
+
+What is refused is one sentence, and nothing is half-written.
 
 The disk is a tmpfs of a mount namespace, so it needs a Linux that lets the user make one.
 """
@@ -7,11 +9,12 @@ import secrets
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from shlex import quote
 
 import httpx
+import psutil
 import pytest
 
 from deltalight.protocol.source import open_source
@@ -54,20 +57,27 @@ def disk(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def served(disk: Path) -> Iterator[tuple[httpx.Client, Path]]:
-    """A web process with its data on a disk of 4 MB, and that disk as the process sees it."""
+@contextmanager
+def serving(disk: Path, size: str, script: str) -> Iterator[tuple[httpx.Client, int]]:
+    """A web process that a shell script starts, with its data on a disk of this size; and its process id."""
     (port,) = ports.private_ports(1)
-    command = on_small_disk("4m", disk, 'exec "$@"', "api", "--port", port, "--data", disk / "data")
+    command = on_small_disk(size, disk, script, "api", "--port", port, "--data", disk / "data")
     with (
         httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=PATIENCE_S) as client,
         subprocess.Popen(command, cwd=ROOT) as process,
     ):
         try:
             wait_for(lambda: client.get("/health").is_success)
-            yield client, Path(f"/proc/{process.pid}/root{disk}")
+            yield client, process.pid
         finally:
             process.kill()
+
+
+@pytest.fixture
+def served(disk: Path) -> Iterator[tuple[httpx.Client, Path]]:
+    """A web process with its data on a disk of 4 MB, and that disk as the process sees it."""
+    with serving(disk, "4m", 'exec "$@"') as (client, process_id):
+        yield client, Path(f"/proc/{process_id}/root{disk}")
 
 
 def upload(client: httpx.Client, name: str, size: int) -> httpx.Response:
@@ -101,6 +111,25 @@ def test_a_full_disk_refuses_uploads_and_changes_and_goes_on_when_there_is_room(
     client.delete(f"/assets/{kept[0]}").raise_for_status()
     assert client.post("/scenes", json={"objects": []}).status_code == 201
     assert upload(client, "t.obj", 100_000).status_code == 201
+
+
+def test_files_beyond_what_the_user_may_write_are_refused_and_it_goes_on_once_they_may_be(disk: Path) -> None:
+    """As for a quota, the system refuses by another error than that of a full disk: here that of RLIMIT_FSIZE."""
+    lamps = [{"type": "sphere", "position_m": [0, 0, 1 + number / 100]} for number in range(64)]
+    scene = {"lights": {"manual": lamps}}
+    with serving(disk, "32m", 'ulimit -S -f 4096 && exec "$@"') as (client, process_id):  # 2 MB
+        assert "File too large" in sentence(upload(client, "large.obj", 3_000_000), 503)
+        kept = [upload(client, "small.obj", 100_000).json()["asset"]]
+        stored = 0
+        while (answer := client.post("/scenes", json=scene)).is_success:
+            stored += 1
+        assert "The database cannot be used now" in sentence(answer, 503)
+        assert [each["asset"] for each in client.get("/assets").raise_for_status().json()] == kept
+        before = len(client.get("/scenes").raise_for_status().json())
+        psutil.Process(process_id).rlimit(psutil.RLIMIT_FSIZE, (psutil.RLIM_INFINITY, psutil.RLIM_INFINITY))
+        assert client.post("/scenes", json=scene).status_code == 201
+        assert upload(client, "large.obj", 3_000_000).status_code == 201
+        assert len(client.get("/scenes").raise_for_status().json()) == before + 1 > stored > 0
 
 
 def run_to_its_end(command: list[str]) -> subprocess.CompletedProcess[str]:

@@ -154,7 +154,7 @@ def glb_tree(path: Path) -> dict[str, Any]:
 def test_exports_say_what_is_missing(recording: Path, tmp_path: Path, cli: RunCli) -> None:
     with pytest.raises(DeltalightError, match="nothing to export"):
         write_scene_glb(tmp_path / "a.glb", parse_scene({"lights": {"mode": "fisheye"}}))
-    with pytest.raises(DeltalightError, match=r"object0: .* is no file here"):
+    with pytest.raises(DeltalightError, match=r"object0: .* is not a file here"):
         write_scene_glb(tmp_path / "a.glb", parse_scene({"objects": [{"asset": "/nowhere/a.stl"}]}))
     blind = tmp_path / "blind.mcap"
     with RecordingWriter(blind) as writer:

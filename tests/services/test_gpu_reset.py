@@ -61,7 +61,7 @@ def session_of(renderer: InvertingRenderer) -> RenderSession:
     [
         (GUILTY, "by work of this process"),
         (INNOCENT, "by work of another process"),
-        (UNKNOWN, "for a reason that the driver does not know"),
+        (UNKNOWN, "for a reason unknown to the driver"),
     ],
 )
 def test_each_kind_of_reset_is_a_sentence(status: int, words: str) -> None:
@@ -153,4 +153,4 @@ def test_another_process_goes_on_with_the_same_scene(tmp_path: Path) -> None:
     said = [line for line in lines if "was reset" in line or "died" in line]
     assert len(said) == 2
     assert said[0].startswith("render server: deltalight: The GPU was reset by work of another process")
-    assert said[1] == "render server: died with exit code 75; it is started again."
+    assert said[1] == "render server: died with exit code 75; restarting it."

@@ -130,7 +130,7 @@ def test_stage_follows_the_longest_path_of_its_section(account: FrameAccount) ->
 def test_wrong_method_is_one_sentence_with_the_nearest_name(cli: RunCli) -> None:
     done = cli("graph", "--method", "dlvp")
     assert done.returncode == 2
-    assert "'dlvp' is no method; the nearest is dlpv" in done.stderr
+    assert "'dlvp' is not a method; the nearest is dlpv" in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 

@@ -20,7 +20,7 @@ from deltalight.services.api.live_video import KEY_INTERVAL_S
 from deltalight.services.h264 import H264Decoder, H264Encoder
 from deltalight.services.live_message import LiveHeader, unpack
 from tests.services.api_samples import running_api
-from tests.services.dashboard_samples import NEEDS_BROWSER, complaints_of
+from tests.services.dashboard_samples import USES_BROWSER, complaints_of
 from tests.services.live_samples import event_socket, live_socket, next_event
 from tests.services.moving_samples import (
     HEIGHT,
@@ -250,8 +250,7 @@ def test_without_pyav_jpeg_goes_on_and_settings_say_so(
 
 
 @pytest.mark.slow
-@NEEDS_BROWSER[1]
-@NEEDS_BROWSER[2]
+@USES_BROWSER
 def test_the_dashboard_shows_what_the_jpeg_shows(live: Running, browser: Browser) -> None:
     live.stream.is_still = True
     with browser.new_context(viewport={"width": 1280, "height": 800}) as context:

@@ -1,6 +1,10 @@
-"""`deltalight precompute`: computed once, kept, broken off without a trace."""
+"""`deltalight precompute`: computed once, kept, gone on with after a kill, broken off without a trace."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -8,7 +12,9 @@ import trimesh
 from PIL import Image
 
 from tests.render_server.brdf_samples import brdf_file, grey_brdf
-from tests.services.conftest import RunCli
+from tests.services.conftest import ROOT, RunCli
+
+PATIENCE_S = 60.0
 
 
 def scene_with(folder: Path, **changes: object) -> Path:
@@ -52,6 +58,51 @@ def test_fields_of_a_scene_with_aroof(cli: RunCli, tmp_path: Path, kept: Path) -
     assert len(list(kept.with_name("occlusion-fields").glob("*.npz"))) == 1
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow(seconds=8)
+def test_a_killed_process_leaves_what_is_done_and_the_next_goes_on(
+    cli: RunCli, tmp_path: Path, kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    trimesh.creation.icosphere(3).export(tmp_path / "ball.ply")
+    objects = [{"id": "box", "asset": "box.ply"}, {"id": "ball", "asset": "ball.ply"}]
+    method = {"name": "aroof", "shells": 3, "resolution": 16, "rays": 64}
+    scene = str(scene_with(tmp_path, objects=objects, method=method))
+    fields = kept.with_name("occlusion-fields")
+    command = [sys.executable, "-m", "deltalight.services.cli", "precompute", scene]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, cwd=ROOT, text=True, **pipes) as process:
+        assert process.stdout is not None
+        box = [process.stdout.readline() for _ in range(2)]
+        assert "light transfer of" in process.stdout.readline()  # of the ball, whose field comes next
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not list(fields.glob("*-occlusion-0.npz")):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        process.kill()
+        assert process.stdout.read() == ""
+    assert process.returncode == -signal.SIGKILL
+    done = {path.name: path.stat().st_ino for path in (*kept.glob("*.npz"), *fields.glob("*.npz"))}
+    assert len(done) >= 4  # two transfers, the box's field, a shell of the ball's
+
+    again = cli("precompute", scene)
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.splitlines(keepends=True)[:2] == box
+    assert "parts of its occlusion field are from a run that was cut off" in again.stderr
+    assert "of `box`" not in again.stderr
+    assert "light transfer of" not in again.stderr
+    whole = {path.name: path.stat().st_ino for path in (*kept.glob("*.npz"), *fields.glob("*.npz"))}
+    assert len(whole) == 4
+    assert {name: inode for name, inode in done.items() if "-" not in name}.items() <= whole.items()
+
+    monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "undisturbed"))
+    assert cli("precompute", scene).stdout == again.stdout
+    assert contents(tmp_path / "undisturbed") == contents(kept.parent)
+
+
 def test_what_cannot_be_precomputed_is_said_in_one_sentence(cli: RunCli, tmp_path: Path, kept: Path) -> None:
     nothing = cli("precompute", str(scene_with(tmp_path, shading={})))
     moving = cli("precompute", str(scene_with(tmp_path, objects=[{"asset": "box.ply", "rigid": False}])))
@@ -92,7 +143,7 @@ def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None
     before = out.read_bytes()
     source.write_text("1 2 3")
     for arguments, sentence in (
-        (("--out", str(out)), "paint.brdf is no whole .brdf file"),
+        (("--out", str(out)), "paint.brdf is not a complete .brdf file"),
         ((), "say where it goes: --out paint.dlmat"),
         (("--out", "paint.json"), "say where it goes: --out paint.dlmat"),
     ):
@@ -104,4 +155,4 @@ def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None
     refused = cli("precompute", str(tmp_path), "--out", str(out))
     assert "info.json cannot be read" in refused.stderr
     refused = cli("precompute", str(scene_with(tmp_path)), "--out", str(out))
-    assert "is taken for a scene document, and --out is for a measured BRDF" in refused.stderr
+    assert "is treated as a scene document, and --out is for a measured BRDF" in refused.stderr

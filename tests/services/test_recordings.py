@@ -183,7 +183,7 @@ def test_what_was_lost_is_told(tmp_path: Path, cli: RunCli) -> None:
 def test_recover_leaves_whole_recordings_and_taken_names_alone(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", frames(2))
     done = CliRunner().invoke(app, ["recordings", "recover", str(path)])
-    assert (done.exit_code, "nothing to mend" in done.stdout) == (0, True)
+    assert (done.exit_code, "nothing to recover" in done.stdout) == (0, True)
     assert names(tmp_path) == ["a.mcap"]
     active = tmp_path / "b.mcap.active"
     active.write_bytes(path.read_bytes())  # finished by its content, and yet not by its name

@@ -31,7 +31,7 @@ BOARD: dict[str, Any] = {
 class Room:
     """A session with a clock, and nodes that send to it."""
 
-    def __init__(self) -> None:
+    def __init__(self, endpoints: int = 1) -> None:
         self.now_ns = START
         self.renderer = InvertingRenderer()
         scene = SceneDocument.model_validate({"real": {"geometry": {"model": "/nowhere/table.glb"}}})
@@ -40,6 +40,7 @@ class Room:
             scene,
             name="server",
             clock_ns=lambda: self.now_ns,
+            endpoints=endpoints,
             use_source=lambda _: SourceInUse((), is_another=True),
         )
 
@@ -124,6 +125,30 @@ def test_frames_of_a_moment_are_rendered_together_and_each_picture_names_its_nod
     assert set(room.session.stats().rates) == {"frames_per_s", "frames_per_s left", "frames_per_s right"}
 
 
+def test_first_frames_and_those_after_a_pause_wait_for_all_endpoints() -> None:
+    room, names = Room(endpoints=3), ("left", "right", "above")
+    for pause in range(3):
+        for name in names:
+            assert room.shown() == []
+            room.pass_ms(100)
+            room.send(name, pause)
+        assert room.shown() == [(name, pause) for name in names]
+        assert set(room.statuses().values()) == {"live"}
+        for _ in range(6):
+            room.begin(*names)
+        room.pass_ms(5000)
+    room.send("left", 7)
+    for elapsed_ms in (299, 1):
+        assert room.shown() == []
+        room.pass_ms(elapsed_ms)
+    assert room.shown() == [("left", 7)]
+    assert room.statuses() == {"left": "live", "right": "silent", "above": "silent"}
+    assert room.renderer.rooms[-1] == [("left", 7, True), ("right", 1, False), ("above", 1, False)]
+    room.pass_ms(100)
+    room.send("left", 8)
+    assert room.shown() == [("left", 8)], "they are not waited for again and again"
+
+
 def test_a_slower_camera_is_not_waited_for_and_its_last_frame_lights_the_room(room: Room) -> None:
     for number in range(12):
         if number % 6 == 0:
@@ -156,10 +181,19 @@ def test_a_silent_camera_drops_out_with_one_notice_and_has_its_place_again(
         assert [*at_once, *room.shown()] == [("right", number)]
         room.pass_ms(90)
     assert at_once  # the other is not waited for any more
-    assert room.renderer.rooms[-1] == [("right", 29, True)]
+    assert room.renderer.rooms[-1] == [("right", 29, True), ("left", 1, False)]  # lights the room for a while
     assert room.statuses() == {"left": "silent", "right": "live"}
-    assert "The camera left sends no frames; the others go on without it." in room.session.stats().detail
+    assert "The camera left sends no frames; the others continue without it." in room.session.stats().detail
     assert capsys.readouterr().out.count("a camera is left out") <= 1
+    for number in range(30, 60):
+        room.send("right", number)
+        room.pictures()
+        room.pass_ms(1000)
+    assert [cameras[0][1] for cameras in room.renderer.rooms if len(cameras) == 1] == [
+        57,
+        58,
+        59,
+    ]  # 30 s later
     room.send("left", 40)
     room.send("right", 40)
     assert room.shown() == [("left", 40), ("right", 40)]

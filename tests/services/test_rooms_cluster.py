@@ -5,6 +5,7 @@ Each host is a raylet of this machine; render servers, sockets and pictures are 
 
 import itertools
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from typing import Any
 
 import psutil
 import pytest
+from playwright.sync_api import Locator, expect
 
 from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.ray_cluster import (
@@ -26,6 +28,7 @@ from deltalight.services.rooms.ray_cluster import (
     OBJECT_STORE_BYTES,
     RayCluster,
 )
+from tests.services.dashboard_samples import SIZE, USES_BROWSER, chromium, complaints_of, photograph
 from tests.services.rooms_installation import (
     PATIENCE_S,
     Installation,
@@ -244,6 +247,61 @@ def test_a_drained_host_is_emptied(hosts: Hosts, installation: Installation) -> 
     assert settled(installation, "hall") == picture
     after = installation.directory.host_command("undrain-host", host).slots
     assert not any(slot.drained for slot in after)
+
+
+THUMBNAIL_PIXELS = """async (image) => {
+    await image.decode();
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+    canvas.getContext("2d").drawImage(image, 0, 0);
+    return canvas.toDataURL();
+}"""
+
+
+@USES_BROWSER
+def test_a_room_is_moved_to_another_host_in_the_page(hosts: Hosts, installation: Installation) -> None:
+    arrange(hosts, installation, "hall")
+    settled(installation, "hall")
+    server, left = installation.server("hall"), host_of(installation, "hall")
+    (free,) = hosts.networks.keys() - {left}
+    with chromium() as browser:
+        page = browser.new_page(viewport=SIZE)  # type: ignore[arg-type]
+        complaints = complaints_of(page)
+        page.goto(f"http://127.0.0.1:{installation.client.base_url.port}/")
+        rooms = page.get_by_role("dialog", name="Rooms")
+        hall, attic = (rooms.get_by_role("article", name=name, exact=True) for name in ("hall", "attic"))
+        where = hall.get_by_role("button", name="Where hall runs")
+        expect(where).to_contain_text(f"{left}/1")
+        before = next_thumbnail(installation, hall)
+        where.click()
+        hall.get_by_role("menuitem", name=f"Move to {free}/1").click()
+        expect(where).to_contain_text(f"moves to {free}/1")
+        photograph(page, "room_moves")
+        expect(where).to_have_text(re.compile(rf"^\s*{free}/1$"))
+        wait_for(lambda: is_gone(server))
+        assert next_thumbnail(installation, hall) == before
+        assert host_of(installation, "hall") == free
+        hosts_listed = rooms.get_by_role("list", name="Hosts").get_by_role("listitem")
+        expect(hosts_listed.filter(has_text=free)).to_contain_text("1 of 1 slots in use")
+        hosts_listed.filter(has_text=left).get_by_role("button", name="Drain").click()
+        attic.get_by_role("button", name="Where attic runs").click()
+        attic.get_by_role("menuitem", name="Start").click()
+        expect(attic).to_contain_text("It starts when a slot is free: all 1 slots are in use")
+        photograph(page, "room_moved")
+        rooms.get_by_role("button", name="Open hall").click()
+        expect(page.get_by_role("img", name="Live picture", exact=True)).to_be_visible()
+        assert complaints == []
+
+
+def next_thumbnail(installation: Installation, card: Locator) -> str:
+    """The picture that a room's card shows next, of a frame that is rendered from now on."""
+    frames = installation.frames("hall")
+    wait_for(lambda: installation.frames("hall") > frames)
+    image = card.locator("img")
+    expect(image).to_be_visible()
+    for _ in range(2):  # the first may have been on its way before
+        expect(image).not_to_have_attribute("src", str(image.get_attribute("src")))
+    return str(image.evaluate(THUMBNAIL_PIXELS))
 
 
 ALONE = """

@@ -108,7 +108,7 @@ ROOM = "nodes: {a: {source: synthetic}}\nrooms: {hall: {nodes: [a]%s}}\n%s"
         (ROOM % ("", "slots: [0, 1]"), ("--placer", "ray"), "give `slots` as a number"),
         (ROOM % (", labels: {network: east}", ""), (), "the room hall asks for labels"),
         (ROOM % ("", ""), ("--ray-address", "auto"), "--ray-address names the cluster of --placer ray"),
-        (ROOM % ("", ""), ("--rooms-host", "10.0.0.1"), "--rooms-host is for web processes elsewhere"),
+        (ROOM % ("", ""), ("--rooms-host", "10.0.0.1"), "--rooms-host is for web processes on other hosts"),
         (None, ("--placer", "ray"), "--placer ray runs the rooms of a rooms file"),
         (None, ("--source", "synthetic", "--ray-address", "auto"), "--ray-address names the cluster"),
         (ROOM % ("", ""), ("--placer", "ray", "--ray-address", "127.0.0.1:1"), "nobody answers"),

@@ -25,6 +25,7 @@ def test_a_killed_room_returns_with_an_equal_picture_and_the_other_goes_on(
     address = f"/rooms/door/scenes/{scene['id']}/objects/{item}"
     installation.client.patch(address, json=moved).raise_for_status()
     before, hall = settled(installation, "door"), settled(installation, "hall")
+    assert before != hall, "the object was moved, and is not seen"
     other = installation.server("hall")
     frames, restarts = installation.frames("hall"), installation.room("hall").restarts
     installation.wait_for_spare()

@@ -346,7 +346,7 @@ def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
 
 
 def test_pick_asks_the_renderer(session: RenderSession, renderer: InvertingRenderer) -> None:
-    with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
+    with pytest.raises(DeltalightError, match="Nothing has been rendered yet"):
         session.execute(request("pick", x=3, y=4))
     feed(session, 5)
     session.step()
@@ -430,7 +430,7 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
     session.receive(pose(2, START + 2))
     assert session.step() is None
     assert renderer.unfinished == []
-    with pytest.raises(DeltalightError, match="Nothing was rendered"):
+    with pytest.raises(DeltalightError, match="Nothing has been rendered"):
         session.execute(request("pick", x=1, y=1))
     for wrong in ({}, {"endpoints": []}, {"endpoints": "tcp://127.0.0.1:1"}, {"endpoints": ["a"] * 17}):
         with pytest.raises(DeltalightError, match="the command set_source"):

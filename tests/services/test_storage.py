@@ -235,10 +235,10 @@ def test_the_same_content_is_kept_once_under_both_names(store: Store) -> None:
 @pytest.mark.parametrize(
     ("content", "name", "sentence"),
     [
-        (b"MZ\x90\x00 program", "chair.glb", "no file of a known format"),
-        (b'{"asset": {"version": "2.0"}}', "chair.gltf", "pack all in a .zip"),
+        (b"MZ\x90\x00 program", "chair.glb", "not in a known format"),
+        (b'{"asset": {"version": "2.0"}}', "chair.gltf", "pack them in a .zip"),
         (TETRAHEDRON, "chair.ply", "is a OBJ file and not PLY"),
-        (b"", "chair.obj", "no file of a known format"),
+        (b"", "chair.obj", "not in a known format"),
         (TETRAHEDRON, "..", "needs the file's own name"),
         (TETRAHEDRON, "sha256:00", "needs the file's own name"),
     ],

@@ -120,7 +120,7 @@ def test_pictures_arrive_and_resume_when_the_receiver_comes_back(
                 assert min(agreements_db(receiver.pictures)) > LEAST_PSNR_DB
             show_until(out, lambda: not out.status.is_connected)
     place = f"{scheme}://{ports.LOOPBACK}:{port}"
-    takes = f"{place} takes the relit picture, 160x120; Ctrl-C ends it."
+    takes = f"{place} is receiving the relit picture, 160x120; press Ctrl-C to stop."
     assert [each for each in told if "takes no" not in each] == [takes, takes]
     assert all(
         each.startswith(place) and each.endswith("trying again until it does.")
@@ -154,7 +154,7 @@ def test_ctrl_c_ends_the_command_and_no_line_holds_a_secret(tmp_path: Path) -> N
         _, printed = sending.communicate(timeout=PATIENCE_S)
     stream.close()
     assert sending.returncode == 130, printed
-    assert "takes the relit picture, 160x120" in printed
+    assert "is receiving the relit picture, 160x120" in printed
     assert "secret" not in printed
     assert "stream-key" not in printed
     assert "Traceback" not in printed

@@ -136,7 +136,7 @@ def test_what_is_no_virtual_camera_is_told(kernel: Kernel, device: Path, tmp_pat
         with pytest.raises(DeltalightError, match="Another program writes to"):
             camera.begin((48, 32))
     kernel.fault = errno.ENOTTY
-    with pytest.raises(DeltalightError, match="is no virtual camera"):
+    with pytest.raises(DeltalightError, match="is not a virtual camera"):
         VirtualCamera(device)
 
 

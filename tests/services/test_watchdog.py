@@ -120,7 +120,7 @@ def test_a_stopped_process_is_killed_and_started_again() -> None:
         assert again is not None
         assert again is not child
         assert again.fault() is None
-    assert "render server: gave no sign of life for 2 s; it is killed." in lines
+    assert "render server: gave no sign of life for 2 s; killing it." in lines
 
 
 def test_every_plan_watches_its_render_server(tmp_path: Path) -> None:

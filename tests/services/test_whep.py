@@ -137,7 +137,7 @@ def test_pictures_are_those_of_the_jpegs_from_the_shared_encoder_and_delete_ends
                 assert "profile-level-id=64" in player.peer.remoteDescription.sdp
                 assert client.delete(session).status_code == 200
                 await player.until_closed()
-                assert "no such session" in sentence(client.delete(session), 404)
+                assert "no such WHEP session" in sentence(client.delete(session), 404)
 
     asyncio.run(watch())
 
@@ -231,13 +231,13 @@ def without_h264(offer: str) -> str:
 def test_wrong_offers_are_one_sentence(live: Running) -> None:
     good = made_offer("video")
     for offer, words in (
-        ("", "no SDP offer"),
-        ("v=0\r\n", "no SDP offer"),
-        ("\0" * 100, "no SDP offer"),
-        ('{"type": "offer"}', "no SDP offer"),
-        (good[: len(good) // 3], "no SDP offer"),
-        (good.replace("a=ice-ufrag", "a=x"), "no SDP offer"),
-        (good.replace("a=fingerprint", "a=x"), "no SDP offer"),
+        ("", "not an SDP offer"),
+        ("v=0\r\n", "not an SDP offer"),
+        ("\0" * 100, "not an SDP offer"),
+        ('{"type": "offer"}', "not an SDP offer"),
+        (good[: len(good) // 3], "not an SDP offer"),
+        (good.replace("a=ice-ufrag", "a=x"), "not an SDP offer"),
+        (good.replace("a=fingerprint", "a=x"), "not an SDP offer"),
         (good.replace("a=recvonly", "a=sendonly"), "one video"),
         (made_offer("audio"), "one video"),
         (made_offer("video", "data"), "one video"),
@@ -267,7 +267,7 @@ def test_tokens_and_tickets_let_in_and_revoking_ends(
         let_in = client.post(f"/whep?ticket={ticket}", content=offer, headers=SDP)
         assert let_in.status_code == 201
         again = client.post(f"/whep?ticket={ticket}", content=offer, headers=SDP)
-        assert "not known" in sentence(again, 401)
+        assert "is unknown" in sentence(again, 401)
         session = let_in.headers["location"].removeprefix("/api/v1")
         assert "token is needed" in sentence(client.delete(session), 401)
 
@@ -275,7 +275,7 @@ def test_tokens_and_tickets_let_in_and_revoking_ends(
             async with watching(client, **bearer) as (player, _):
                 await player.picture()
                 full = client.post("/whep", content=offer, headers=SDP | bearer)
-                assert "All sessions" in sentence(full, 429)
+                assert "All WHEP sessions" in sentence(full, 429)
                 assert client.delete(session, headers=bearer).status_code == 200
                 tokens.revoke("wall")
                 await player.until_closed()
@@ -302,7 +302,7 @@ def test_an_encoder_that_fails_ends_the_session(live: Running, monkeypatch: pyte
 
 def test_where_there_is_no_whep_a_sentence_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with moving_api(tmp_path / "off", whep_sessions=0) as running:
-        assert "switched off" in running.api.client.get("/settings").json()["no_whep"]
+        assert "disabled" in running.api.client.get("/settings").json()["no_whep"]
     with moving_api(tmp_path / "elsewhere", whep_host="192.0.2.1") as running:  # RFC 5737: nobody's
         answer = running.api.client.post("/whep", content=made_offer("video"), headers=SDP)
         assert "No UDP port opens at 192.0.2.1" in sentence(answer, 503)

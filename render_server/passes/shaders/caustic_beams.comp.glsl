@@ -1,5 +1,5 @@
 // Beams of light that smooth virtual surfaces reflect: the flux of each block of a light's map of the objects is
-// split over a few rays, each traced to the first surface that it hits. WIDE: they sample the GGX lobe; otherwise all
+// split over a few rays, each traced to the first object that it meets. WIDE: they sample the GGX lobe; otherwise all
 // go in the mirror direction. REFRACTED: they go through transparent objects, along the strongest of the paths into
 // which surfaces divide each ray.
 #include "common/light_rays.glsl"
@@ -12,8 +12,8 @@
 #ifdef REFRACTED
 #include "common/refraction.glsl"
 #endif
-#define APPENDS_BEAMS
-#include "common/beams.glsl"
+#define APPENDS_SENT_BEAMS
+#include "common/sent_beams.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform sampler2D virtual_light_uv;
@@ -24,8 +24,6 @@ uniform float least_alpha;     // for materials with lobes of at least this widt
 uniform float greatest_alpha;  // and below this one
 uniform float bias_real;       // m
 uniform float normal_offset;   // m: away from the object's own triangles
-uniform float reach;           // m: how far beams are traced
-#include "common/camera.glsl"
 
 #ifdef WIDE
 const float LOBE_FRACTION = 0.5;    // a ray represents part of its lobe: this wide, so that together they are little wider
@@ -33,13 +31,10 @@ const float LOBE_FRACTION = 0.5;    // a ray represents part of its lobe: this w
 const float LOBE_FRACTION = 1.0;    // all go in the mirror direction, and are as wide as the lobe
 #endif
 const float RAYS_APART = inversesqrt(float(RAY_COUNT));   // of a block's edge
-const float OVERLAP = 0.6;          // deviation / distance to the next beam: their sum is even within a few percent
 // Standard deviation of the normal distribution with the peak of a GGX lobe cut off at 85 % of its energy;
 // half-vectors turn half as far as the directions they reflect.
 const float LOBE_DEVIATION = 2.0 * 0.65;
 const float ALIKE = 0.5;            // cosine between normals of neighbours on one smooth surface
-const float MARCH_PIXELS = 2.0;     // a step of the march over the depth image
-const int MARCH_STEPS = 512;
 
 struct Spot { bool present; vec3 point; vec3 normal; vec3 seen_from; int material; };   // seen_from: direction of the light
 
@@ -78,9 +73,7 @@ bool is_wanted(ivec2 texel, int material) {
 }
 #endif
 
-// Drift of a mirror's ray from this texel to the next block along `axis`, at a distance t.
-struct Drift { vec3 start; vec3 turn; };
-
+// Of a mirror's ray from this texel to the next block along `axis`.
 Drift drift_along(LightView view, ivec2 texel, ivec2 axis, Spot here, float side) {
     int apart = max(block_edge / 2, 1);
     vec3 own = reflect(here.seen_from, here.normal);
@@ -94,25 +87,6 @@ Drift drift_along(LightView view, ivec2 texel, ivec2 axis, Spot here, float side
     return Drift(across, vec3(0.0));   // alone in its block: treated as flat
 }
 
-// Distance at which a ray hits the visible real scene, 1e30 if it does not.
-float meets_real(vec3 from, vec3 direction, float limit) {
-    float t = 0.0;
-    for (int i = 0; i < MARCH_STEPS && t < limit; ++i) {
-        vec3 p = from + t * direction;
-        vec3 c = (camera_from_world * vec4(p, 1.0)).xyz;
-        vec2 pixel = camera_pinhole.xy * c.xy / c.z + camera_pinhole.zw + 0.5;
-        if (c.z <= 0.0 || any(lessThan(pixel, vec2(0.0))) || any(greaterThanEqual(pixel, picture_size))) break;
-        float stride = MARCH_PIXELS * c.z / camera_pinhole.x;
-        vec4 seen = texelFetch(real_surface_position, ivec2(pixel), 0);
-        vec3 n = texelFetch(real_surface_normal, ivec2(pixel), 0).xyz;
-        float before = dot(p - seen.xyz, n), slope = dot(direction, n);
-        if (seen.w > 0.0 && before <= 0.0 && slope < 0.0 && distance(p, seen.xyz) < 4.0 * stride)
-            return max(t - before / slope, 0.0);
-        t += stride;
-    }
-    return 1e30;
-}
-
 // Fraction of a lobe's ray that is not lost between microfacets (Heitz 2014), for visible normals.
 float unmasked(float n_dot_v, float n_dot_l, float alpha) {
     vec2 c = vec2(n_dot_v, n_dot_l);
@@ -120,33 +94,12 @@ float unmasked(float n_dot_v, float n_dot_l, float alpha) {
     return (1.0 + lambda.x) / (1.0 + lambda.x + lambda.y);
 }
 
-// The footprint's variance has a fraction of the distance to the next beams along both axes, and `round`, each beam's
-// own standard deviation in all directions.
-void set_footprint(inout Beam beam, Drift x, Drift y, float round) {
-    mat3 basis = basis_around(beam.direction.xyz);
-    vec2 a = OVERLAP * ((x.start + beam.from.w * x.turn) * basis).xy;
-    vec2 b = OVERLAP * ((y.start + beam.from.w * y.turn) * basis).xy;
-    float xx = a.x * a.x + b.x * b.x + round * round, xy = a.x * a.y + b.x * b.y;
-    float yy = a.y * a.y + b.y * b.y + round * round;
-    float det = max(xx * yy - xy * xy, 1e-20);
-    beam.across = vec4(vec3(yy, -xy, xx) / det, 1.0 / (2.0 * PI * sqrt(det) * FOOTPRINT_FRACTION));
-    float half_sum = 0.5 * (xx + yy);
-    beam.direction.w = FOOTPRINT_CUT * sqrt(half_sum + sqrt(max(half_sum * half_sum - det, 0.0)));
-}
-
 void send(vec3 from, vec3 direction, vec3 flux, float spread, Drift x, Drift y) {
-    Beam beam;
-    beam.from = vec4(from, 0.0);
-    MeshHit hit = closest_hit(Ray(beam.from.xyz, direction));
-    float object = hit.triangle < 0 ? 1e30 : hit.distance;
-    float real = meets_real(beam.from.xyz, direction, min(object, reach));
-    beam.from.w = min(object, real);
-    if (beam.from.w > reach) return;
-    beam.direction = vec4(direction, 0.0);
-    beam.flux = vec4(flux, real < object ? 0.0 : 1.0);
-    set_footprint(beam, x, y, spread * beam.from.w);
-    uint at = atomicAdd(beam_count, 1u);
-    if (at < uint(beams.length())) beams[at] = beam;
+    MeshHit hit = closest_hit(Ray(from, direction));
+    SentBeam beam = SentBeam(vec4(from, hit.triangle < 0 ? 1e30 : hit.distance), vec4(direction, spread), vec4(flux, 0.0),
+        vec4(x.start, 0.0), vec4(x.turn, 0.0), vec4(y.start, 0.0), vec4(y.turn, 0.0));
+    uint at = atomicAdd(sent_count, 1u);
+    if (at < uint(sent_beams.length())) sent_beams[at] = beam;
 }
 
 ivec2 texel_of_ray(LightView view, ivec2 block, vec4 numbers) {
@@ -318,9 +271,9 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
 #endif
 
 void main() {
-    LightView view = light_views[view_index];
+    LightView view = listed_view(view_index);
     ivec3 at = ivec3(gl_GlobalInvocationID);
-    Light light = lights[light_of_view(view_index)];
+    Light light = listed_light(light_of_view(view_index));
     if (any(greaterThanEqual(at.xy * block_edge, ivec2(view.tile.zz))) || is_image(light)) return;
     cast_ray(light, view, at.xy, at.z);
 }

@@ -34,7 +34,7 @@ uint needs(ivec2 texel) {
 
 void pick(uint i, uint count, ivec2 tile, int layer) {
     if (i >= count) return;
-    BeamPlace at = places[i];
+    BeamPlace at = place_of_beam(i);
     bool meets = all(lessThanEqual(at.low, tile + 7)) && all(greaterThanEqual(at.high, tile));
     if (at.layer == layer && at.sharp == 0 && meets) picked[atomicAdd(picked_count, 1u)] = i;
 }
@@ -52,8 +52,8 @@ Texel texel_at(ivec2 place, uint needed, int layer) {
     return t;
 }
 
-void gather(inout Texel t, Beam beam, BeamPlace at, mat3 basis) {
-    bool reached = all(greaterThanEqual(t.place, at.low)) && all(lessThanEqual(t.place, at.high));
+void gather(inout Texel t, Beam beam, ivec4 bounds, mat3 basis) {
+    bool reached = all(greaterThanEqual(t.place, bounds.xy)) && all(lessThanEqual(t.place, bounds.zw));
     if (reached) t.sum += caustic_part(beam, basis, t.p, t.normal);
 }
 
@@ -68,7 +68,7 @@ void gather_layer(ivec2 tile, uint needed[ROWS], int layer) {
     Texel held[ROWS];
     for (int i = 0; i < ROWS; ++i)
         held[i] = texel_at(tile + ivec2(gl_LocalInvocationID.xy) + ivec2(0, i * GROUP_ROWS), needed[i], layer);
-    uint count = min(beam_count, uint(beams.length()));
+    uint count = beams_held();
     for (uint first = 0u; first < count; first += uint(THREADS)) {
         if (gl_LocalInvocationIndex == 0u) picked_count = 0u;
         memoryBarrierShared();
@@ -77,10 +77,10 @@ void gather_layer(ivec2 tile, uint needed[ROWS], int layer) {
         memoryBarrierShared();
         barrier();
         for (uint j = 0u; j < picked_count; ++j) {
-            Beam beam = beams[picked[j]];
-            BeamPlace at = places[picked[j]];
+            Beam beam = beam_at(picked[j]);
+            ivec4 bounds = bounds_of_beam(picked[j]);
             mat3 basis = basis_around(beam.direction.xyz);
-            for (int i = 0; i < ROWS; ++i) gather(held[i], beam, at, basis);
+            for (int i = 0; i < ROWS; ++i) gather(held[i], beam, bounds, basis);
         }
         barrier();
     }

@@ -21,7 +21,7 @@ float slant_at(Beam beam, int layer, vec2 centre) {
 
 BeamPlace place_of(Beam beam) {
     vec3 c = (camera_from_world * vec4(beam.from.xyz + beam.from.w * beam.direction.xyz, 1.0)).xyz;
-    if (c.z <= 0.0) return BeamPlace(ivec2(0), ivec2(-1), -1, 0, ivec2(0));
+    if (c.z <= 0.0) return BeamPlace(ivec2(0), ivec2(-1), -1, 0);
     int layer = beam.flux.w > 0.5 ? OBJECT_LAYER : REAL_LAYER;
     vec2 centre = camera_pinhole.xy * c.xy / c.z + camera_pinhole.zw;
     float radius = camera_pinhole.x * beam.direction.w / c.z;
@@ -31,11 +31,11 @@ BeamPlace place_of(Beam beam) {
     float extent = slant_at(beam, layer, centre) * radius;
     ivec2 low = max(ivec2(floor((centre - extent) / float(unit))), ivec2(0));
     ivec2 high = min(ivec2(ceil((centre + extent) / float(unit))), last);
-    bool nowhere = any(greaterThan(low, high));
-    return BeamPlace(low, high, nowhere ? -1 : layer, sharp ? 1 : 0, ivec2(0));
+    if (any(greaterThan(low, high))) return BeamPlace(ivec2(0), ivec2(-1), -1, 0);   // nowhere
+    return BeamPlace(low, high, layer, sharp ? 1 : 0);
 }
 
 void main() {
-    uint count = min(beam_count, uint(beams.length()));
-    for (uint i = first_item(); i < count; i += items_apart()) places[i] = place_of(beams[i]);
+    uint count = beams_held();
+    for (uint i = first_item(); i < count; i += items_apart()) put_place(i, place_of(beam_at(i)));
 }

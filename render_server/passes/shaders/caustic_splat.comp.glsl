@@ -22,9 +22,9 @@ void splat(Beam beam, BeamPlace place) {
 }
 
 void main() {
-    uint count = min(beam_count, uint(beams.length()));
+    uint count = beams_held();
     for (uint i = gl_WorkGroupID.x; i < count; i += gl_NumWorkGroups.x) {
-        BeamPlace place = places[i];
-        if (place.layer >= 0 && place.sharp != 0) splat(beams[i], place);
+        BeamPlace place = place_of_beam(i);
+        if (place.layer >= 0 && place.sharp != 0) splat(beam_at(i), place);
     }
 }

@@ -40,12 +40,12 @@ void light(ivec2 pixel, ivec2 size) {
         int i = 0;
         if (!known && light_count > 0) do {
             vec3 l; float radius;
-            vec3 across = light_at(lights[i], position.xyz, normal.xyz, l, radius);
+            vec3 across = light_at(listed_light(i), position.xyz, normal.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
             if (cosine <= 0.0) continue;
-            vec2 seen = light_visibility(lights[i], position.xyz, normal.xyz, bias);
+            vec2 seen = light_visibility(listed_light(i), position.xyz, normal.xyz, bias);
             e_mu += across * cosine * seen.x;
-            vec3 arrives = arriving(lights[i], position.xyz, seen, beam_alpha);
+            vec3 arrives = arriving(listed_light(i), position.xyz, seen, beam_alpha);
             e_rho += across * cosine * arrives;
             unshadowed += dot(across, vec3(1.0 / 3.0)) * cosine;
             if (specular_surfaces && normal.w >= 0.0) {

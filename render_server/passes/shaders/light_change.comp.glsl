@@ -25,10 +25,10 @@ void main() {
         after += ambient * texelFetch(unoccluded, texel, 0).rgb;
         for (int i = 0; i < light_count; ++i) {
             vec3 l; float radius;
-            vec3 across = light_at(lights[i], s.position, s.normal, l, radius);
+            vec3 across = light_at(listed_light(i), s.position, s.normal, l, radius);
             float cosine = dot(s.normal, l);
             if (cosine <= 0.0) continue;
-            vec2 seen = visibility(lights[i], s.position, s.normal, bias, bias);
+            vec2 seen = visibility(listed_light(i), s.position, s.normal, bias, bias);
             before += across * cosine * seen.x;
             after += across * cosine * seen.y;
         }

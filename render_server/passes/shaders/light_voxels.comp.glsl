@@ -81,12 +81,12 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     int i = 0;
     if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
         vec3 to_light; float radius;
-        vec3 across = light_at(lights[i], p, n, to_light, radius);
+        vec3 across = light_at(listed_light(i), p, n, to_light, radius);
         float cosine = dot(n, to_light);
         if (cosine <= 0.0) continue;
-        vec2 v = light_fraction(lights[i], p, n);
+        vec2 v = light_fraction(listed_light(i), p, n);
         mu += across * cosine * v.x;
-        rho += across * cosine * arriving(lights[i], p, v, 0.0);
+        rho += across * cosine * arriving(listed_light(i), p, v, 0.0);
     } while (++i < light_count);
     if (keep_light) {
 #ifndef REAL_RHO

@@ -62,7 +62,7 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
 #endif
 
 void main() {
-    LightView view = light_views[view_index];
+    LightView view = listed_view(view_index);
     if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy);
 #ifdef REAL
@@ -72,5 +72,5 @@ void main() {
 #endif
     if (depth == NOTHING) return;
     vec2 s = texel_lateral(view, texel);
-    inject_texel(lights[light_of_view(view_index)], view, texel, s, depth, ray_point(view, s, depth));
+    inject_texel(listed_light(light_of_view(view_index)), view, texel, s, depth, ray_point(view, s, depth));
 }

@@ -30,12 +30,12 @@ void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy), size = imageSize(visibility_out).xy;
     int layer = int(gl_GlobalInvocationID.z);
     if (any(greaterThanEqual(texel, size))) return;
-    Light light = lights[first_image + layer];
+    Light light = listed_light(first_image + layer);
     vec2 uv = (vec2(texel) + 0.5) / vec2(size) - vec2(light.map_u.w, light.map_v.w);
     vec3 u = light.map_u.xyz, v = light.map_v.xyz;
     vec3 q = u * (uv.x / dot(u, u)) + v * (uv.y / dot(v, v)) - light.plane.xyz * light.plane.w;
     vec2 shown = vec2(0.0);
     if (is_mirroring(light, q, int(light.axis_u.w)))
-        shown = visibility(lights[int(light.axis_v.w)], q, light.plane.xyz, bias_real, 0.0);
+        shown = visibility(listed_light(int(light.axis_v.w)), q, light.plane.xyz, bias_real, 0.0);
     imageStore(visibility_out, ivec3(texel, layer), vec4(shown, 0.0, 0.0));
 }

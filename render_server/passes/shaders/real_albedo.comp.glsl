@@ -25,11 +25,11 @@ vec3 unblocked(Light light, vec3 p, vec3 n) {
 vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
     int own = light_of_view(view_index);
-    vec3 of_own = unblocked(lights[own], p, n);
+    vec3 of_own = unblocked(listed_light(own), p, n);
     int j = 0;
     if (light_count > 1) do {
         if (j == own) e += of_own;   // sums in the lights' order
-        Light light = lights[j < own ? j : j + 1];
+        Light light = listed_light(j < own ? j : j + 1);
         e += unblocked(light, p, n) * real_visibility(light, p, n, bias_real);
     } while (++j < light_count - 1);
     return own == light_count - 1 ? e + of_own : e;
@@ -54,13 +54,13 @@ vec3 albedo_at(LightView view, ivec2 texel) {
     if (!camera_sees(p)) return unseen_albedo(p);
     vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
     vec3 to_light; float radius;
-    light_at(lights[light_of_view(view_index)], p, to_light, radius);
+    light_at(listed_light(light_of_view(view_index)), p, to_light, radius);
     if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
     return clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
 }
 
 void main() {
-    LightView view = light_views[view_index];
+    LightView view = listed_view(view_index);
     uint i = next_wanted(view, first_item());
     if (i < texels_of(view)) do {
         ivec2 texel = map_texel(view, i);

@@ -102,8 +102,8 @@ void split(Light light, LightView view, ivec2 texel) {
 #endif
 
 void main() {
-    LightView view = light_views[view_index];
-    Light light = lights[light_of_view(view_index)];
+    LightView view = listed_view(view_index);
+    Light light = listed_light(light_of_view(view_index));
     uint i = next_wanted(view, first_item());
     if (i < texels_of(view)) do {
         split(light, view, map_texel(view, i));

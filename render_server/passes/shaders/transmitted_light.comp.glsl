@@ -13,8 +13,6 @@
 layout(local_size_x = 64) in;
 layout(rgba16f) readonly uniform image2D reflected_radiance;   // of the objects
 layout(rgba16f) writeonly uniform image2D radiance_out;
-// An image, because OpenGL guarantees no more than eight storage blocks, and sixteen samplers.
-layout(rgba32f) readonly uniform image2D light_records;   // a row a light
 uniform float pixel_size;      // m at 1 m depth
 #include "common/camera.glsl"
 
@@ -35,20 +33,6 @@ void hold(vec3 from, vec3 direction, vec3 weight, int medium) {
     if (held_count < HELD && greatest(weight) > LEAST_WEIGHT) held[held_count++] = Path(from, direction, weight, medium);
 }
 
-vec4 light_record(int i, int column) { return imageLoad(light_records, ivec2(column, i)); }
-
-// Without what shadows and mirror images need.
-Light lamp(int i) {
-    Light light;
-    light.place = light_record(i, 0);
-    light.color = light_record(i, 1);
-    light.shape = light_record(i, 2);
-    light.axis_u = light_record(i, 3);
-    light.axis_v = light_record(i, 4);
-    light.mirror = light_record(i, 6);
-    return light;
-}
-
 // Fraction of a cone around d that a disc of half-angle `radius` around l fills. Both are even discs, which overlap by a smooth step from
 // where one covers the other to where they part, of the same sum. Chords measure: on a sphere, a disc's area is PI times its chord's square.
 float covered_by_disc(vec3 d, vec3 l, float radius, float spread) {
@@ -62,7 +46,7 @@ float covered_by_disc(vec3 d, vec3 l, float radius, float spread) {
 vec3 lamps_along(vec3 from, vec3 d, float spread) {
     vec3 sum = vec3(0.0);
     for (int i = 0; i < light_count; ++i) {
-        Light light = lamp(i);
+        Light light = listed_light(i);
         if (is_image(light)) continue;   // the picture shows the real one
         vec3 l; float radius;
         vec3 across = unmirrored_light_at(light, from, vec3(0.0), l, radius);

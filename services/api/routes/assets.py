@@ -29,7 +29,7 @@ PNG: dict[int | str, dict[str, Any]] = {
 }
 _KNOWN = ", ".join(each.name.upper() for each in FORMATS)
 KEPT_ANSWERS: dict[int | str, dict[str, Any]] = {
-    200: {"model": AssetAnswer, "description": "The same content was there already."}
+    200: {"model": AssetAnswer, "description": "The same content already exists."}
 }
 _UPLOAD_ANSWERS = {**KEPT_ANSWERS, **responses(400, 413, 415, 422)}
 _UPLOAD_BODY = {
@@ -43,7 +43,7 @@ _UPLOAD_BODY = {
 
 @router.get("")
 def list_assets(shared: Shared) -> list[AssetAnswer]:
-    """List all assets, the newest first."""
+    """List all assets, newest first."""
     return [AssetAnswer.of(asset) for asset in shared.store.assets.all()]
 
 
@@ -54,7 +54,7 @@ async def upload_asset(
     response: Response,
     name: Annotated[str, Query(max_length=1000, description="Name of the file.", examples=["chair.glb"])],
 ) -> AssetAnswer:
-    """Upload a mesh, map or precomputed material as the body of the request; 200 where the content is there already.
+    """Upload a mesh, map or precomputed material as the request body; 200 if the content already exists.
 
     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
     A .zip of one glTF and its files is kept as one .glb.
@@ -78,7 +78,7 @@ def announced(shared: Context, asset: Asset, response: Response, *, is_new: bool
 
 @router.get("/{digest}", responses=responses(404))
 def get_asset(shared: Shared, digest: Digest) -> AssetAnswer:
-    """Return what is known of an asset."""
+    """Return the facts of an asset."""
     return AssetAnswer.of(shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX)))
 
 
@@ -96,14 +96,14 @@ def download_asset(shared: Shared, digest: Digest) -> StoredFileResponse:
 @router.get("/{digest}/thumbnail.png", response_class=StoredFileResponse, responses=responses(404, 422) | PNG)
 @in_pool("thumbnails")
 def thumbnail(shared: Shared, digest: Digest) -> StoredFileResponse:
-    """Return a picture of a mesh, map or material, 256 x 256 pixels on a transparent ground."""
+    """Return a thumbnail of a mesh, map or material: 256 x 256 pixels on a transparent background."""
     path = shared.store.assets.thumbnail(digest.removeprefix(DIGEST_PREFIX))
     return StoredFileResponse(path, media_type="image/png", headers=UNCHANGING)
 
 
 @router.delete("/{digest}", status_code=204, responses=responses(404, 409))
 def delete_asset(shared: Shared, digest: Digest) -> None:
-    """Delete an asset that no scene uses, now or in a revision that undo may bring back."""
+    """Delete an asset that no scene uses, currently or in a revision that undo can restore."""
     asset = shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX))
     shared.store.assets.remove(digest.removeprefix(DIGEST_PREFIX))
     shared.events.publish("asset", {"digest": asset.reference, "name": asset.names[0], "deleted": True})

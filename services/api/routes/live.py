@@ -34,15 +34,15 @@ CODECS: dict[str, LiveCodec] = {"jpeg": "jpeg", "h264": "h264"}
 _TOO_MANY_ORDERS = "change view, camera and codec less often"
 UNKNOWN_CODEC = f"there is no such codec; ask for one of {', '.join(CODECS)}"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
-NO_ANSWER = "The render server does not answer, or (with Retry-After) too many requests wait for it."
+NO_ANSWER = "The render server does not respond, or (with Retry-After) has too many pending requests."
 JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
 
 WantedView = Annotated[
-    ShownView | None, Query(description="What to look at; without, the scene's own `output.view`.")
+    ShownView | None, Query(description="View to return; default: the scene's `output.view`.")
 ]
 WantedCamera = Annotated[
     str | None,
-    Query(max_length=64, description="Whose picture, by its node's name; without, the first camera's."),
+    Query(max_length=64, description="Name of the camera's node; default: the first camera."),
 ]
 _VIEW: TypeAdapter[ShownView | None] = TypeAdapter(ShownView | None)
 
@@ -52,21 +52,25 @@ ROUTERS = (live_router, events_router)
 
 
 class TicketAnswer(BaseModel):
-    """A ticket for one address."""
+    """A ticket for one URL."""
 
-    ticket: str = Field(description="To be added to the address as `?ticket=...`.")
-    expires_s: float = Field(description="Seconds within which it lets in, once.", examples=[TICKET_LIFE_S])
+    ticket: str = Field(description="Ticket to add to the URL as `?ticket=...`.")
+    expires_s: float = Field(
+        description="Seconds for which it is valid, for one use.", examples=[TICKET_LIFE_S]
+    )
 
 
 class Pick(BaseModel):
     """What a pixel of the newest composite shows; points are metres in the world."""
 
-    frame_id: int = Field(description="The frame that was looked at.")
+    frame_id: int = Field(description="The frame that was examined.")
     kind: Literal["real", "object", "nothing"]
     object: str | None = Field(description="Id of the virtual object; else null.")
-    point_m: tuple[float, float, float] | None = Field(description="Where the surface is; null for nothing.")
-    normal: tuple[float, float, float] | None = Field(description="Its unit normal; null where unknown.")
-    distance_m: float | None = Field(description="From the camera; null for nothing.")
+    point_m: tuple[float, float, float] | None = Field(
+        description="Point on the surface; null if there is none."
+    )
+    normal: tuple[float, float, float] | None = Field(description="Its unit normal; null if unknown.")
+    distance_m: float | None = Field(description="Distance from the camera; null if there is no surface.")
 
 
 class Pixel(BaseModel):
@@ -74,32 +78,34 @@ class Pixel(BaseModel):
 
     model_config = ConfigDict(strict=True)
 
-    x: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="To the right; the first pixel's centre is 0.")
-    y: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="Down; the first pixel's centre is 0.")
+    x: float = Field(
+        ge=-0.5, le=MAX_EDGE_PX, description="Pixels to the right; the centre of the first pixel is 0."
+    )
+    y: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="Pixels down; the centre of the first pixel is 0.")
     ignore: str | None = Field(
         None,
         max_length=200,
-        description="Id of an object to look through, at the real scene behind it: one that is being dragged.",
+        description="Id of an object to ignore, such as the one being dragged, to pick the real scene behind it.",
     )
     camera: str | None = Field(
-        None, max_length=64, description="Whose picture, by its node's name; null = the first camera's."
+        None, max_length=64, description="Name of the camera's node; null = the first camera."
     )
 
 
 class FisheyeAnswer(BaseModel):
-    """The fish-eye picture's size and the lights in it; a light that it does not show is left out."""
+    """The size of the fish-eye picture and the lights visible in it."""
 
-    seen_ns: int = Field(description="When it was taken, ns since 1970 by the node's clock.")
-    node: str = Field(description="The node that sees it.")
-    width: int = Field(description="Of the picture, pixels.")
+    seen_ns: int = Field(description="Capture time, ns since 1970 by the node's clock.")
+    node: str = Field(description="Node of the fish-eye camera.")
+    width: int = Field(description="Size of the picture, pixels.")
     height: int
-    clipped_share: float = Field(description="Of what it sees, what was too bright to be measured.")
+    clipped_share: float = Field(description="Fraction of the visible area that was too bright to measure.")
     lights: list[FisheyeLight]
 
 
 @live_router.post("/tickets", status_code=201)
 def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
-    """Get a ticket with the caller's role, for addresses that cannot carry a token: WebSockets and pictures."""
+    """Get a ticket with the caller's role, for requests that cannot carry a token: WebSockets and pictures."""
     return TicketAnswer(ticket=shared.tickets.issue(principal_of(request.scope)), expires_s=TICKET_LIFE_S)
 
 
@@ -127,7 +133,7 @@ async def live(
 async def live_mjpeg(
     shared: Shared, view: WantedView = None, camera: WantedCamera = None
 ) -> StreamingResponse:
-    """The newest frames as one endless multipart answer, for pictures in pages."""
+    """Stream the newest frames as one endless multipart response, for pictures in web pages."""
     shared.live.require(camera)
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
     return StreamingResponse(
@@ -140,7 +146,7 @@ async def live_mjpeg(
     response_class=Response,
     responses={
         **responses(404),
-        **unavailable("No picture has come from the render server yet."),
+        **unavailable("No picture has arrived from the render server yet."),
         **JPEG_ANSWER,
     },
 )
@@ -158,7 +164,7 @@ async def live_picture(shared: Shared, view: WantedView = None, camera: WantedCa
     "/poster.jpg", response_class=StoredFileResponse, responses={**responses(404), **JPEG_ANSWER}
 )
 def poster(shared: Shared) -> StoredFileResponse:
-    """Return the still that stands for the live picture until it comes; `/settings` says whether there is one."""
+    """Return the still that is shown until the first live picture; `/settings` says whether there is one."""
     return _still(shared.store.poster)
 
 
@@ -166,7 +172,7 @@ def poster(shared: Shared) -> StoredFileResponse:
     "/poster-before.jpg", response_class=StoredFileResponse, responses={**responses(404), **JPEG_ANSWER}
 )
 def poster_before(shared: Shared) -> StoredFileResponse:
-    """Return the camera's own picture of the poster's frame; `/settings` says whether there is one."""
+    """Return the camera's own picture of the still's frame; `/settings` says whether there is one."""
     return _still(shared.store.poster_before)
 
 
@@ -179,7 +185,7 @@ def _still(path: Path) -> StoredFileResponse:
 @live_router.post("/live/pick", responses={**responses(400, 404), **unavailable(NO_ANSWER)})
 @in_pool("render server")
 def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 200}])]) -> Pick:
-    """Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on."""
+    """Return what a pixel of the newest composite shows: where to put an object, or which object was clicked."""
     shared.live.require(pixel.camera)
     payload = pixel.model_dump(exclude_none=True)
     return Pick.model_validate(shared.link.command("pick", payload, PICK_TIMEOUT_S))
@@ -187,7 +193,7 @@ def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 
 
 @live_router.get("/fisheye", responses=responses(404))
 def fisheye(shared: Shared) -> FisheyeAnswer:
-    """Return what the fish-eye camera sees: the size of its picture, and the places of the lights in it."""
+    """Return what the fish-eye camera sees: the size of its picture and the positions of the lights in it."""
     message, _ = _newest_fisheye(shared)
     frame = shared.live.newest
     height, width = message.picture_shape[:2]

@@ -27,7 +27,7 @@ VIDEO_ANSWER: dict[int | str, dict[str, Any]] = {
 @router.get("/{recording_id}/video", responses=responses(404, 409, 422))
 @in_pool("recordings")
 def get_recording_video(shared: Shared, recording_id: RecordingId) -> VideoAnswer:
-    """Return whether the video of the relit pictures is there, or how far it is."""
+    """Return whether the video of the relit pictures is available, or its progress."""
     require_at_rest(shared, recording_id)
     return shared.videos.state(recording_id)
 
@@ -35,7 +35,7 @@ def get_recording_video(shared: Shared, recording_id: RecordingId) -> VideoAnswe
 @router.post("/{recording_id}/video", status_code=202, responses=responses(404, 409, 422))
 @in_pool("recordings")
 def make_recording_video(shared: Shared, recording_id: RecordingId) -> VideoAnswer:
-    """Make a video of the relit pictures that were recorded along (H.264), in the background, and keep it.
+    """Encode the recorded relit pictures as a video (H.264) in the background, and keep it.
 
     The package `av` makes it (extra `video`).
     """
@@ -47,7 +47,7 @@ def make_recording_video(shared: Shared, recording_id: RecordingId) -> VideoAnsw
 @router.delete("/{recording_id}/video", status_code=204, responses=responses(404, 409))
 @in_pool("recordings")
 def delete_recording_video(shared: Shared, recording_id: RecordingId) -> None:
-    """Stop the making of a video, or delete it; the recording stays."""
+    """Stop encoding a video, or delete it; the recording stays."""
     require_at_rest(shared, recording_id)
     shared.recordings.get(recording_id)
     shared.videos.stop(recording_id)
@@ -60,7 +60,7 @@ def delete_recording_video(shared: Shared, recording_id: RecordingId) -> None:
     responses=responses(404, 409, 416, 422) | unavailable("It is being made.") | VIDEO_ANSWER,
 )
 async def recording_video(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
-    """Download the video of the relit pictures; ranges of it too.
+    """Download the video of the relit pictures; ranges are supported.
 
     Where it is not there, it is begun. 503 with `Retry-After` comes instead if it takes longer than some seconds.
     """

@@ -29,9 +29,11 @@ RecordingId = Annotated[
     str,
     Path(pattern=f"^{NAME.pattern}$", description="The recording's name.", examples=["take-20261121-101500"]),
 ]
-Rate = Annotated[float, Field(ge=MIN_RATE, le=MAX_RATE, description="Recorded seconds a second.")]
+Rate = Annotated[
+    float, Field(ge=MIN_RATE, le=MAX_RATE, description="Playback speed: recorded seconds per second.")
+]
 MOST_STEPS = 1_000_000
-Seconds = Annotated[float, Field(ge=0, le=1e6, description="From the recording's first frame.")]
+Seconds = Annotated[float, Field(ge=0, le=1e6, description="Position from the recording's first frame.")]
 POSTER_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}
 }
@@ -51,32 +53,34 @@ class NewRecording(StrictModel):
     """What to record; every key has a default."""
 
     name: str | None = Field(
-        default=None, max_length=64, description="Letters, digits, dashes, underscores; null = the time."
+        default=None,
+        max_length=64,
+        description="Letters, digits, dashes and underscores; null = the current time.",
     )
     duration_s: float | None = Field(
-        default=None, ge=0.1, le=86_400, description="Ends so long after the first frame; null = by stop."
+        default=None, ge=0.1, le=86_400, description="Duration from the first frame; null = until stopped."
     )
     node: Name | None = Field(
-        default=None, description="Which node; null = the one whose picture comes first."
+        default=None, description="Node to record; null = the first one to send a picture."
     )
     composites: StrictBool = Field(
-        default=False, description="Keep the relit pictures too, beside the frames, for `video.mp4`."
+        default=False, description="Also keep the relit pictures, for `video.mp4`."
     )
 
 
 class Stream(StrictModel):
-    """What one stream of a recording holds."""
+    """The contents of one stream of a recording."""
 
     messages: int
     size_bytes: int = Field(description="Before compression.")
 
 
 class Check(StrictModel):
-    """One thing that relighting needs."""
+    """One requirement for relighting."""
 
     what: Literal["depth", "pose", "light"]
     is_there: bool
-    text: str = Field(description="What there is, or what to do without.")
+    text: str = Field(description="What is available, or what to do if it is not.")
 
 
 def _checklist(facts: Facts) -> list[Check]:
@@ -110,24 +114,24 @@ def _checklist(facts: Facts) -> list[Check]:
 
 
 class RecordingAnswer(StrictModel):
-    """A recording, finished or growing."""
+    """A recording, finished or in progress."""
 
-    id: str = Field(description="Its name, also in addresses.", examples=["take-20261121-101500"])
+    id: str = Field(description="Its name, also in URLs.", examples=["take-20261121-101500"])
     state: Literal["waiting", "recording", "finished", "interrupted"] = Field(
-        description="`waiting` = no frame has come yet; `interrupted` = its recorder was killed: recover it."
+        description="`waiting` = no frame has arrived yet; `interrupted` = its recorder was killed: recover it."
     )
-    detail: str = Field(description="What keeps it from growing, or from being read; else empty.")
-    changed: datetime = Field(description="When it was finished; while it grows: when it was begun.")
+    detail: str = Field(description="Why it cannot grow or be read; else empty.")
+    changed: datetime = Field(description="When it was finished; while recording, when it was started.")
     size_bytes: int
     duration_s: float | None
     frames: int | None
     frames_per_s: float | None
-    composites: int = Field(description="Relit pictures that were recorded along.")
-    lost: dict[str, int] = Field(description="What never came, by stream; known while it grows.")
+    composites: int = Field(description="Number of relit pictures in it.")
+    lost: dict[str, int] = Field(description="Missing messages, by stream; known while recording.")
     streams: dict[str, Stream]
-    scene: str | None = Field(description="Title of the attached scene, empty for one without; null = none.")
-    checklist: list[Check] = Field(description="What relighting needs; empty while it grows.")
-    notes: list[str] = Field(description="What else is to be known of it.")
+    scene: str | None = Field(description="Title of the attached scene, empty if untitled; null = no scene.")
+    checklist: list[Check] = Field(description="Requirements for relighting; empty while recording.")
+    notes: list[str] = Field(description="Further notes.")
 
     @classmethod
     def growing(cls, session: RecordingSession) -> Self:
@@ -184,24 +188,29 @@ class NewReplay(StrictModel):
     position_s: Seconds = 0.0
     playing: bool = True
     rate: Rate = 1.0
-    loop: bool = Field(default=True, description="Begin again at the end; else it stays there, paused.")
+    loop: bool = Field(default=True, description="Start again at the end; false = stay there, paused.")
 
 
 class ReplayChange(StrictModel):
-    """What is to be otherwise; the rest stays."""
+    """What to change; everything else stays as it is."""
 
     position_s: Seconds | None = None
     step_frames: int | None = Field(
-        default=None, ge=-MOST_STEPS, le=MOST_STEPS, description="Frames on, or back: `1` is the next one."
+        default=None,
+        ge=-MOST_STEPS,
+        le=MOST_STEPS,
+        description="Frames to step forward, or back if negative.",
     )
     playing: bool | None = None
     rate: Rate | None = None
 
 
 class ReplayAnswer(StrictModel):
-    """Where the recording is that is shown; all null = a live camera is shown."""
+    """Position of the recording on display; all null = a live camera is shown."""
 
-    recording: str | None = Field(description="Null = what the node sends is shown, be it a recording too.")
+    recording: str | None = Field(
+        description="null = the node's own frames are shown (which may come from a recording)."
+    )
     position_s: float | None = None
     duration_s: float | None = None
     playing: bool | None = None
@@ -212,7 +221,7 @@ class ReplayAnswer(StrictModel):
 @router.get("")
 @in_pool("recordings")
 def list_recordings(shared: Shared) -> list[RecordingAnswer]:
-    """List all recordings, those that grow first, then the newest first."""
+    """List all recordings: those in progress first, then newest first."""
     growing = shared.recording_sessions.running()
     names = {session.id for session in growing}
     stored = [RecordingAnswer.stored(recording) for recording in shared.recordings.all(growing=names)]
@@ -226,7 +235,7 @@ def start_recording(
     response: Response,
     wanted: Annotated[NewRecording, AS_SENT, Body(examples=[{"name": "two-lamps", "duration_s": 20}])],
 ) -> RecordingAnswer:
-    """Begin to record a node, with the active scene attached; events tell how far it is."""
+    """Start recording a node, with the active scene attached; events report the progress."""
     order = checked(NewRecording, wanted, "the recording")
     active = shared.store.scenes.active()
     scene = None if active is None else active.document
@@ -246,7 +255,7 @@ async def upload_recording(
     response: Response,
     name: Annotated[str, Query(max_length=1000, description="Name of the file.", examples=["desk.mcap"])],
 ) -> RecordingAnswer:
-    """Upload an .mcap recording, or a .zip of a dataset folder, as the body of the request.
+    """Upload an .mcap recording, or a .zip of a dataset folder, as the request body.
 
     It is recognised by its content and read once in a process of its own, with limits of memory, time and disk. It is
     kept under the name of the file, with a number where that is taken.
@@ -268,7 +277,7 @@ async def upload_recording(
 @router.get("/{recording_id}", responses=responses(404))
 @in_pool("recordings")
 def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
-    """Return what is known of a recording."""
+    """Return the facts of a recording."""
     growing = _growing(shared, recording_id)
     return (
         RecordingAnswer.stored(shared.recordings.get(recording_id))
@@ -280,7 +289,7 @@ def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
 @router.post("/{recording_id}/stop", responses=responses(404, 409, 422))
 @in_pool("recordings")
 def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
-    """End a recording; 409 where no frame had come, so that there is none."""
+    """Stop a recording; 409 if no frame had arrived, so that nothing was recorded."""
     shared.recording_sessions.stop(recording_id)
     return RecordingAnswer.stored(shared.recordings.get(recording_id))
 
@@ -288,7 +297,7 @@ def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer
 @router.post("/{recording_id}/recover", responses=responses(404, 409, 422))
 @in_pool("recordings")
 def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
-    """Mend an interrupted recording: all frames that can be read, finished."""
+    """Recover an interrupted recording: keep all frames that can be read, and finish the file."""
     require_at_rest(shared, recording_id)
     return RecordingAnswer.stored(shared.recordings.recover(recording_id))
 
@@ -300,7 +309,7 @@ def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAns
 )
 @in_pool("recordings")
 def download_recording(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
-    """Download the .mcap file; ranges of it too."""
+    """Download the .mcap file; ranges are supported."""
     require_at_rest(shared, recording_id)
     recording = shared.recordings.get(recording_id)
     if recording.state == "interrupted":
@@ -324,7 +333,7 @@ def recording_poster(shared: Shared, recording_id: RecordingId) -> StoredFileRes
 @router.delete("/{recording_id}", status_code=204, responses=responses(404, 409))
 @in_pool("recordings")
 def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
-    """Delete a recording for good; not one that grows or is shown."""
+    """Delete a recording permanently, unless it is in progress or on display."""
     require_at_rest(shared, recording_id)
     if shared.replay.recording == recording_id:
         raise ConflictError(f"{recording_id} is being replayed; go back to live, then delete it.")
@@ -335,7 +344,7 @@ def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
 @replay_router.get("", responses=responses(503))
 @in_pool("replay")
 def get_replay(shared: Shared) -> ReplayAnswer:
-    """Return which recording is shown and where it is; without one, where the node's own recording is."""
+    """Return which recording is shown and its position; without one, the position in the node's own recording."""
     return replay_answer(shared.replay.position())
 
 
@@ -347,7 +356,7 @@ def start_replay(
         NewReplay, AS_SENT, Body(examples=[{"recording": "two-lamps", "position_s": 2.5, "loop": True}])
     ],
 ) -> ReplayAnswer:
-    """Show a recording instead of the live nodes, or of the recording that is shown."""
+    """Show a recording instead of the live nodes or of the current recording."""
     new = checked(NewReplay, wanted, "the replay")
     require_at_rest(shared, new.recording)
     recording = shared.recordings.get(new.recording)
@@ -361,7 +370,7 @@ def change_replay(
     shared: Shared,
     change: Annotated[ReplayChange, AS_SENT, Body(examples=[{"position_s": 4.2, "playing": False}])],
 ) -> ReplayAnswer:
-    """Seek, step from frame to frame, pause, go on, play slower or faster: what `GET /replay` returns."""
+    """Seek, step frame by frame, pause, resume, or change the speed of the recording that `GET /replay` returns."""
     wanted = checked(ReplayChange, change, "the change")
     return replay_answer(shared.replay.change(**dict(wanted)))
 

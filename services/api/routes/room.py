@@ -24,7 +24,7 @@ ROUTERS = (router,)
 )
 @in_pool("render server")
 def room(shared: Shared) -> Response:
-    """Return the real scene as the render server has it: a mesh with the newest picture on what that shows.
+    """Return the render server's model of the real scene: a mesh textured with the newest picture.
 
     Metres, y up (the world's z). Objects and lights are not in it.
     """

@@ -27,7 +27,7 @@ from deltalight.services.storage.faults import ConflictError, NotFoundError
 router = APIRouter(tags=["rooms"])
 ROUTERS = (router,)
 
-NO_DIRECTORY = "The directory of rooms does not answer, or (with Retry-After) too many requests wait for it."
+NO_DIRECTORY = "The directory of rooms does not respond, or (with Retry-After) has too many pending requests."
 SILENT = "The render server does not answer yet."
 
 
@@ -37,26 +37,29 @@ class RoomScene(BaseModel):
     id: str
     name: str
     revision: int
-    method: str = Field(description="How the real scene is relit.")
+    method: str = Field(description="The relighting method.")
 
 
 class RoomAnswer(BaseModel):
-    """A room: whose frames it shows, with which scene, and how it is doing."""
+    """A room: its nodes, its scene and its state."""
 
-    name: str = Field(description="In addresses: `/rooms/NAME/...` is every route, for this room.")
+    name: str = Field(description="Name in URLs: every route also exists as `/rooms/NAME/...` for this room.")
     title: str = Field(description="For people.")
     state: RoomState = Field(
-        description="`waiting` for a slot, or drained; `starting`; `running`; `failed` until it is started again."
+        description="`waiting` (for a slot, or drained), `starting`, `running`, or `failed` until it is "
+        "restarted."
     )
-    why: str = Field(description="Why it waits, failed, or shows nothing; else empty.")
+    why: str = Field(description="Why the room is waiting, failed, or shows nothing; else empty.")
     nodes: list[str] = Field(description="Its sensor nodes.")
     scene: RoomScene | None
-    slot: str | None = Field(description="Where its render server runs; null = nowhere, or a single room.")
-    moving_to: str | None = Field(description="The slot in which its next render server starts.")
-    epoch: int | None = Field(description="Grows with each start of its render server.")
-    restarts: int = Field(description="How often its render server was lost and placed again.")
+    slot: str | None = Field(
+        description="Slot in which its render server runs; null = none, or a single room."
+    )
+    moving_to: str | None = Field(description="Slot in which its next render server will start.")
+    epoch: int | None = Field(description="Increases with each start of its render server.")
+    restarts: int = Field(description="How often its render server was lost and replaced.")
     frames_per_s: float | None = Field(description="Of its pictures.")
-    last_frame_s: float | None = Field(description="Seconds since its newest picture came.")
+    last_frame_s: float | None = Field(description="Seconds since its newest picture arrived.")
 
 
 class RoomsAnswer(BaseModel):
@@ -64,20 +67,20 @@ class RoomsAnswer(BaseModel):
 
     rooms: list[RoomAnswer]
     slots: list[SlotStatus] = Field(description="Empty for a single room.")
-    can_move: bool = Field(description="Whether rooms can be drained, started and moved here.")
+    can_move: bool = Field(description="Whether this installation can drain, start and move rooms.")
 
 
 class HostAnswer(BaseModel):
     """A host that renders."""
 
     name: str
-    drained: bool = Field(description="Whether no room starts on it.")
-    slots: int = Field(description="How many rooms it can render at once; 0 = it is away.")
-    rooms: list[str] = Field(description="Which rooms it renders.")
+    drained: bool = Field(description="Whether it is drained: no room starts there.")
+    slots: int = Field(description="Number of rooms that it can render at once; 0 = it is not connected.")
+    rooms: list[str] = Field(description="Rooms that it renders.")
 
 
 class MoveOrder(BaseModel):
-    """Where to move a room."""
+    """Slot to move a room to."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -113,7 +116,7 @@ def get_room(rooms: AllRooms, room: RoomName) -> RoomAnswer:
 @router.post("/rooms/{room}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def drain_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
-    """End the room's render server until it is started again; its slot is free for rooms that wait."""
+    """Stop the room's render server until it is started again; waiting rooms can use its slot."""
     del shared
     return _commanded(rooms, DRAIN, room)
 
@@ -121,7 +124,7 @@ def drain_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
 @router.post("/rooms/{room}/start", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def start_room(shared: Shared, rooms: AllRooms, room: RoomName) -> RoomAnswer:
-    """Start a room that was drained or has failed."""
+    """Start a room that was drained or that failed."""
     del shared
     return _commanded(rooms, START, room)
 
@@ -134,21 +137,21 @@ def move_room(
     room: RoomName,
     order: Annotated[MoveOrder, Body(examples=[{"slot": "slot-2"}])],
 ) -> RoomAnswer:
-    """Move the room to another slot; it is shown from where it was until its pictures come from there."""
+    """Move the room to another slot; the old slot keeps rendering it until the new one sends pictures."""
     del shared
     return _commanded(rooms, MOVE, room, order.slot)
 
 
 @router.get("/hosts")
 def list_hosts(rooms: AllRooms) -> list[HostAnswer]:
-    """List the hosts whose slots rooms run in; empty for a single room."""
+    """List the hosts that provide slots; empty for a single room."""
     return _hosts(_answer(rooms).slots)
 
 
 @router.post("/hosts/{host}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def drain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
-    """Move the host's rooms to others, one after another; those without a slot there end and wait.
+    """Move the host's rooms to other hosts, one after another; rooms without a slot there stop and wait.
 
     It stays drained over restarts, until that is deleted.
     """
@@ -161,7 +164,7 @@ def drain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
 @router.delete("/hosts/{host}/drain", responses={**responses(404, 409), **unavailable(NO_DIRECTORY)})
 @in_pool("render server")
 def undrain_host(shared: Shared, rooms: AllRooms, host: HostName) -> HostAnswer:
-    """Let rooms start on the host again."""
+    """Allow rooms to start on the host again."""
     del shared
     return _host(_ordered(rooms, lambda directory: directory.host_command(UNDRAIN_HOST, host)), host)
 

@@ -60,7 +60,7 @@ SceneId = Annotated[str, Path(description="The scene's `id`.", examples=["4f0c2a
 RevisionNumber = Annotated[int, Path(ge=1, lt=1 << 63)]
 # `path`: an id may contain slashes.
 ObjectId = Annotated[str, Path(description="The object's `id`.", examples=["knot"])]
-Index = Annotated[int, Path(ge=0, le=63, description="Place among the manual lights, from 0.")]
+Index = Annotated[int, Path(ge=0, le=63, description="Index among the manual lights, from 0.")]
 CHANGE_PROBLEMS = responses(400, 404, 409, 422)
 MAX_ENTRIES = 200
 LONGEST_WHAT = 200  # characters of what a revision says of itself
@@ -89,7 +89,7 @@ def list_scenes(shared: Shared) -> list[SceneSummary]:
     "/scenes", status_code=201, responses=responses(400, 409, 415, 422), openapi_extra=DOCUMENT_BODY
 )
 def create_scene(shared: Shared, document: SentDocument, response: Response) -> SceneAnswer:
-    """Make a scene of a document (an exported one too); assets are named by digest or uploaded name."""
+    """Create a scene from a document, such as an exported one; it refers to assets by digest or uploaded name."""
     scene = shared.store.scenes.create(document)
     response.headers["Location"] = f"/api/v1/scenes/{scene.head.id}"
     return shared.answer(scene, response, changed=True)
@@ -97,7 +97,7 @@ def create_scene(shared: Shared, document: SentDocument, response: Response) -> 
 
 @scenes_router.get("/active-scene", responses=responses(404))
 def active_scene(shared: Shared, response: Response) -> SceneAnswer:
-    """Return the scene that is rendered."""
+    """Return the active scene."""
     scene = shared.store.scenes.active()
     if scene is None:
         raise NotFoundError("no scene is active; activate one of the scenes.")
@@ -114,7 +114,7 @@ def get_scene(shared: Shared, scene_id: SceneId, response: Response) -> SceneAns
 def replace_scene(
     shared: Shared, scene_id: SceneId, document: SceneBody, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
-    """Put another document in place of a scene's; a `revision` in it counts as If-Match."""
+    """Replace a scene's document; a `revision` in it counts as If-Match."""
     precondition = with_revision_of(document, precondition)
     return shared.change(scene_id, replace_document(document), "document replaced", precondition, response)
 
@@ -149,7 +149,7 @@ def export_document(
         Literal["json", "yaml"], Query(alias="format", description="How it is written.")
     ] = "json",
 ) -> Response:
-    """Return the document alone, as a file to keep or to import."""
+    """Return only the document, as a file to keep or to import."""
     document = shared.store.scenes.get(scene_id).document
     name = f"scene-{scene_id}-{document.revision}"
     return document_file(document, name, as_yaml=kind == "yaml")
@@ -164,7 +164,7 @@ def list_revisions(
     ] = None,
     limit: Annotated[int, Query(ge=1, le=MAX_ENTRIES, description="At most so many.")] = 50,
 ) -> list[RevisionEntry]:
-    """List the changes of a scene, the newest first."""
+    """List the changes of a scene, newest first."""
     return [RevisionEntry.of(each) for each in shared.store.scenes.history(scene_id, before, limit)]
 
 
@@ -178,13 +178,13 @@ def get_revision(
 
 @scenes_router.post("/scenes/{scene_id}/undo", responses=responses(400, 404, 409))
 def undo(shared: Shared, scene_id: SceneId, response: Response, if_match: ExpectedRevision) -> SceneAnswer:
-    """Take the last change back, by a new revision."""
+    """Undo the last change, by a new revision."""
     return shared.answer(shared.store.scenes.undo(scene_id, if_match), response, changed=True)
 
 
 @scenes_router.post("/scenes/{scene_id}/redo", responses=responses(400, 404, 409))
 def redo(shared: Shared, scene_id: SceneId, response: Response, if_match: ExpectedRevision) -> SceneAnswer:
-    """Make the change again that undo took back."""
+    """Redo the change that was undone last."""
     return shared.answer(shared.store.scenes.redo(scene_id, if_match), response, changed=True)
 
 
@@ -197,7 +197,7 @@ def duplicate(
         str | None, Query(max_length=200, description="Title of the copy; default: `... (copy)`.")
     ] = None,
 ) -> SceneAnswer:
-    """Make a copy of a scene."""
+    """Copy a scene."""
     scene = shared.store.scenes.duplicate(scene_id, name)
     response.headers["Location"] = f"/api/v1/scenes/{scene.head.id}"
     return shared.answer(scene, response, changed=True)
@@ -246,7 +246,7 @@ def put_object(
     response: Response,
     precondition: IfUnchanged,
 ) -> SceneAnswer:
-    """Put another object in place of one."""
+    """Replace an object."""
     edit = replace_object(object_id, item)
     name = _named(item, "id", object_id)
     what = f"{object_id} replaced" if name == object_id else f"{object_id} renamed to {name}"
@@ -263,7 +263,7 @@ def change_object(
     response: Response,
     precondition: IfUnchanged,
 ) -> SceneAnswer:
-    """Change keys of an object: its pose, its material, whether it is seen."""
+    """Change keys of an object, such as its pose, its material or its visibility."""
     edit = patch_object(object_id, patch)
     return shared.change(scene_id, edit, _changed(object_id, patch), precondition, response)
 
@@ -272,7 +272,7 @@ def change_object(
 def delete_object(
     shared: Shared, scene_id: SceneId, object_id: ObjectId, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
-    """Take an object out of the scene; undo brings it back."""
+    """Remove an object from the scene; undo restores it."""
     edit = remove_object(object_id)
     return shared.change(scene_id, edit, f"{object_id} removed", precondition, response)
 
@@ -287,7 +287,7 @@ def list_lights(shared: Shared, scene_id: SceneId) -> list[ManualLight]:
 def create_light(
     shared: Shared, scene_id: SceneId, light: LightBody, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
-    """Add a manual light after the others; it shines in mode `manual`."""
+    """Append a manual light; it is used in mode `manual`."""
     what = f"{_named(light, 'type', 'a')} light added"
     return shared.change(scene_id, add_light(light), what, precondition, response)
 
@@ -310,7 +310,7 @@ def put_light(
     response: Response,
     precondition: IfUnchanged,
 ) -> SceneAnswer:
-    """Put another manual light in place of one."""
+    """Replace a manual light."""
     return shared.change(
         scene_id, replace_light(index, light), f"light {index + 1} replaced", precondition, response
     )
@@ -326,7 +326,7 @@ def change_light(
     response: Response,
     precondition: IfUnchanged,
 ) -> SceneAnswer:
-    """Change keys of a manual light; for another `type` put a whole one in its place."""
+    """Change keys of a manual light; to change its `type`, replace it with PUT."""
     return shared.change(
         scene_id, patch_light(index, patch), _changed(f"light {index + 1}", patch), precondition, response
     )
@@ -336,7 +336,7 @@ def change_light(
 def delete_light(
     shared: Shared, scene_id: SceneId, index: Index, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
-    """Take a manual light out; those after it move up, and undo brings it back."""
+    """Remove a manual light; those after it move up, and undo restores it."""
     return shared.change(scene_id, remove_light(index), f"light {index + 1} removed", precondition, response)
 
 

@@ -16,17 +16,17 @@ ROUTERS = (router,)
 
 
 class ShelfAnswer(BaseModel):
-    """An object of the shelf."""
+    """A ready-made object."""
 
     name: str = Field(examples=["chrome-ball"])
-    label: str = Field(description="Its name for people.", examples=["Chrome ball"])
-    file_name: str = Field(description="Name of the asset that it becomes.", examples=["Chrome ball.glb"])
-    clip: str | None = Field(description="Clip that it should play; null where nothing moves.")
+    label: str = Field(description="Name to display.", examples=["Chrome ball"])
+    file_name: str = Field(description="Name of the resulting asset.", examples=["Chrome ball.glb"])
+    clip: str | None = Field(description="Clip to play; null if it has none.")
 
 
 @router.get("")
 def list_shelf() -> list[ShelfAnswer]:
-    """List the objects that every service has: a few models, and shapes of plain materials."""
+    """List the ready-made objects that every service has: a few models, and simple shapes."""
     return [
         ShelfAnswer(name=each.name, label=each.label, file_name=each.file_name, clip=each.clip)
         for each in SHELF.values()
@@ -40,6 +40,6 @@ def take_from_shelf(
     response: Response,
     item: Annotated[str, Path(description="Its `name`.", examples=["chrome-ball"])],
 ) -> AssetAnswer:
-    """Make an asset of an object of the shelf, to be named by scenes; 200 where it is there already."""
+    """Create an asset from a ready-made object, for use in scenes; 200 if it already exists."""
     asset, is_new = shared.store.assets.take_from_shelf(item)
     return announced(shared, asset, response, is_new=is_new)

@@ -50,7 +50,9 @@ class WantedPicture(StrictModel):
 
     name: Name = Field(description="Its file is called NAME.png.")
     view: str = Field(default="composite", description=f"One of {', '.join(VIEWS)}.")
-    method: Method | None = Field(default=None, description="Relit by this one; null = as the scene says.")
+    method: Method | None = Field(
+        default=None, description="Method to relight with; null = as the scene says."
+    )
 
     @model_validator(mode="after")
     def _check(self) -> "WantedPicture":
@@ -67,10 +69,10 @@ class NewSnapshot(StrictModel):
         min_length=1,
         max_length=MAX_PICTURES,
         fail_fast=True,
-        description="All of one and the same frame.",
+        description="Pictures to take, all of the same frame.",
     )
     camera: Name | None = Field(
-        default=None, description="Whose frame, by its node's name; null = the first camera's."
+        default=None, description="Name of the camera's node; null = the first camera."
     )
     exr: StrictBool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
 
@@ -84,7 +86,7 @@ class NewSnapshot(StrictModel):
 
 @router.get("")
 def list_snapshots(shared: Shared) -> list[SnapshotFacts]:
-    """List all snapshots, the newest first."""
+    """List all snapshots, newest first."""
     return shared.snapshots.all()
 
 
@@ -99,7 +101,7 @@ def take_snapshot(
         Body(examples=[{"pictures": [{"name": "paper", "method": {"name": "dvct", "operator": "paper"}}]}]),
     ],
 ) -> SnapshotFacts:
-    """Render the newest frame as each picture says, and keep the files."""
+    """Render the newest frame as specified for each picture, and keep the files."""
     order = checked(NewSnapshot, wanted, "the snapshot")
     shared.live.require(order.camera)
     taken = shared.snapshots.add(lambda name, folder: _taken(shared, name, folder, order))
@@ -110,7 +112,7 @@ def take_snapshot(
 
 @router.get("/{snapshot_id}", responses=responses(404))
 def get_snapshot(shared: Shared, snapshot_id: SnapshotId) -> SnapshotFacts:
-    """Return what is known of a snapshot."""
+    """Return the facts of a snapshot."""
     return shared.snapshots.get(snapshot_id)
 
 
@@ -121,7 +123,7 @@ def get_snapshot(shared: Shared, snapshot_id: SnapshotId) -> SnapshotFacts:
 )
 @in_pool("thumbnails")
 def snapshot_before_after(shared: Shared, snapshot_id: SnapshotId) -> Response:
-    """Return a moving picture in which a line divides the camera's picture from the composite."""
+    """Return an animation in which a moving line divides the camera's picture from the composite."""
     before, after = (_picture(shared.snapshots.file(snapshot_id, f"{view}.png")) for view in BEFORE_AFTER)
     return Response(before_after_gif(before, after), media_type="image/gif", headers=UNCHANGING)
 
@@ -133,7 +135,7 @@ def snapshot_before_after(shared: Shared, snapshot_id: SnapshotId) -> Response:
 )
 @in_pool("thumbnails")
 def snapshot_before_after_video(shared: Shared, snapshot_id: SnapshotId) -> Response:
-    """Return the same as a video (H.264) of a few seconds, in full size. The package `av` makes it."""
+    """Return the same as a full-size video (H.264) of a few seconds; needs the package `av`."""
     before, after = (_picture(shared.snapshots.file(snapshot_id, f"{view}.png")) for view in BEFORE_AFTER)
     with TemporaryDirectory(prefix=".video-", dir=shared.store.folder) as folder:
         path = FilePath(folder) / "before-after.mp4"
@@ -157,7 +159,7 @@ def snapshot_file(
 
 @router.delete("/{snapshot_id}", status_code=204, responses=responses(404))
 def delete_snapshot(shared: Shared, snapshot_id: SnapshotId) -> None:
-    """Delete a snapshot for good."""
+    """Delete a snapshot permanently."""
     shared.snapshots.remove(snapshot_id)
     shared.events.publish("snapshot", {"id": snapshot_id, "deleted": True})
 

@@ -27,73 +27,78 @@ ROUTERS = (state_router, nodes_router)
 
 
 class StreamState(BaseModel):
-    """Whether pictures come."""
+    """Whether pictures arrive."""
 
     status: Literal["waiting", "ok", "stale"] = Field(
-        description="`waiting` = none came yet; `stale` = none for two seconds."
+        description="`waiting` = no picture yet; `stale` = none for two seconds."
     )
     frame_id: int | None = Field(description="Of the newest.")
-    last_frame_s: float | None = Field(description="Seconds since it came.")
+    last_frame_s: float | None = Field(description="Seconds since it arrived.")
     frames_per_s: float | None
 
 
 class Health(BaseModel):
     """Whether the service works; it needs no token."""
 
-    status: Literal["ok", "degraded"] = Field(description="`degraded` = the render server does not answer.")
+    status: Literal["ok", "degraded"] = Field(description="`degraded` = the render server does not respond.")
     render_server: Literal["answers", "silent"]
     stream: StreamState
     version: str
 
 
 class CameraState(BaseModel):
-    """A camera whose pictures the render server makes, and its newest picture here."""
+    """A camera whose frames the render server renders, and its newest picture."""
 
     name: str = Field(description="Its node's.")
     status: CameraStatus = Field(
-        description="`live`, or why it is left out: it is `silent`, sees `other_board` than the first one, or its "
-        "frames are of `other_time`."
+        description="`live`, or why the camera is left out: it is `silent`, sees a different board from the first "
+        "camera (`other_board`), or its frames are from a different time (`other_time`)."
     )
-    frame_id: int | None = Field(description="Of its newest picture.")
-    last_frame_s: float | None = Field(description="Seconds since that came.")
+    frame_id: int | None = Field(description="Number of its newest frame.")
+    last_frame_s: float | None = Field(description="Seconds since its newest picture arrived.")
     frames_per_s: float | None
 
 
 class State(BaseModel):
-    """How the render server and the nodes are doing."""
+    """State of the render server and the nodes."""
 
     render_server: Literal["answers", "silent"]
-    picture: PictureState | None = Field(description="What became of the active scene's newest revision.")
+    picture: PictureState | None = Field(description="State of the active scene's newest revision.")
     cameras: list[CameraState] = Field(
-        description="The room's, in the order of their first frames: names for `camera` of other routes."
+        description="The room's cameras, in the order of their first frames; their names are values for `camera` "
+        "in other routes."
     )
-    has_fisheye: bool = Field(description="Whether light of a fish-eye camera has come.")
-    processes: list[ProcessAnswer] = Field(description="Nodes and render server, as they report each second.")
+    has_fisheye: bool = Field(description="Whether a fish-eye camera is sending light.")
+    processes: list[ProcessAnswer] = Field(description="Reports of nodes and render server, one per second.")
     refused: dict[str, int] = Field(description="Requests refused since the start, by kind of problem.")
 
 
 class Settings(BaseModel):
-    """What a client needs to know of the service's settings."""
+    """Settings of the service that a client needs to know."""
 
     version: str
     needs_token: bool
     upload_limit_bytes: int
     requests_per_s: float
-    has_poster: bool = Field(description="Whether `/poster.jpg` stands for the live picture until it comes.")
-    has_poster_before: bool = Field(description="Whether `/poster-before.jpg` is the camera's picture of it.")
-    live_codecs: list[LiveCodec] = Field(description="What `WS /live` sends pictures as, for the asking.")
-    no_h264: str | None = Field(description="Why `h264` is not among them; null where it is.")
-    no_whep: str | None = Field(description="Why `POST /whep` gives no pictures; null where it does.")
+    has_poster: bool = Field(
+        description="Whether `/poster.jpg` is available as a placeholder until the first live picture."
+    )
+    has_poster_before: bool = Field(
+        description="Whether `/poster-before.jpg` has the camera's picture of the same frame."
+    )
+    live_codecs: list[LiveCodec] = Field(description="Codecs that `WS /live` offers.")
+    no_h264: str | None = Field(description="Why `h264` is not offered; null if it is.")
+    no_whep: str | None = Field(description="Why `POST /whep` is not available; null if it is.")
 
 
 class NodeAnswer(ProcessAnswer):
     """A node or render server, with its clock and its delays."""
 
     kind: Literal["node", "render_server"]
-    clock_offset_ms: float = Field(description="What is added to its times to have the render server's.")
+    clock_offset_ms: float = Field(description="Offset from its clock to the render server's.")
     delays_ms: dict[str, float] = Field(
-        description="`report`: its newest report's way here. Of a render server also, of the newest picture: "
-        "`capture_to_server`, `rendering` (waiting included), `server_to_api`."
+        description="`report`: delay of its newest report. For a render server also the delays of the newest "
+        "picture: `capture_to_server`, `rendering` (including waiting), `server_to_api`."
     )
 
 
@@ -111,7 +116,7 @@ def health(shared: Shared) -> Health:
 
 @state_router.get("/ready", responses=unavailable("The storage, the render server or a picture is missing."))
 def ready(shared: Shared, rooms: AllRooms) -> Health:
-    """Whether storage, render server and newest picture are there: for what chooses among web processes.
+    """Whether storage, render server and a recent picture are available: for load balancers.
 
     With a directory of rooms: whether storage and directory are, because rooms may wait.
     """
@@ -131,7 +136,7 @@ def ready(shared: Shared, rooms: AllRooms) -> Health:
 
 @state_router.get("/state")
 def state(shared: Shared) -> State:
-    """Rates, drops, delays and remarks of the processes."""
+    """State, rates, drops and delays of the processes."""
     delivery = shared.link.newest_delivery
     return State(
         render_server=_server(shared),
@@ -145,7 +150,7 @@ def state(shared: Shared) -> State:
 
 @state_router.get("/metrics", response_class=PlainTextResponse)
 def metrics(shared: Shared, rooms: AllRooms) -> Response:
-    """Measurements for Prometheus: of a room, and of what all rooms have in common."""
+    """Metrics for Prometheus: those of a room, and those that all rooms share."""
     return Response(shared.metrics.text() + rooms.metrics.text(), media_type=MEDIA_TYPE)
 
 
@@ -167,7 +172,7 @@ def settings(shared: Shared) -> Settings:
 
 @nodes_router.get("/nodes")
 def list_nodes(shared: Shared) -> list[NodeAnswer]:
-    """List the nodes and render servers that are heard: state, rates, losses, clock, delays."""
+    """List the nodes and render servers that report: state, rates, losses, clock, delays."""
     frame = shared.live.newest
     server = shared.server_name if frame is None else shared.live.server_of(frame.message)
     return [_node(report, frame, server) for report in shared.watch.reports()]
@@ -176,7 +181,7 @@ def list_nodes(shared: Shared) -> list[NodeAnswer]:
 @nodes_router.get("/cameras", responses=responses(503))
 @in_pool("cameras")
 def list_cameras(shared: Shared) -> CamerasAnswer:
-    """List the cameras that are attached to this host, and what keeps others from being found."""
+    """List the cameras attached to this host, and why others were not found."""
     return shared.cameras.find()
 
 

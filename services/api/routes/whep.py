@@ -34,7 +34,7 @@ SessionId = Annotated[str, Path(pattern="^[A-Za-z0-9_-]{1,64}$", description="Fr
     status_code=201,
     response_class=Response,
     openapi_extra=SDP_BODY,
-    responses={**responses(404, 415), **unavailable("There is no WHEP here (extra `whep`)."), **SDP_ANSWER},
+    responses={**responses(404, 415), **unavailable("WHEP is not available (extra `whep`)."), **SDP_ANSWER},
 )
 async def open_whep(
     shared: Shared, request: Request, view: WantedView = None, camera: WantedCamera = None
@@ -57,13 +57,13 @@ async def open_whep(
 
 @router.options("/whep", status_code=204, include_in_schema=False)
 async def describe_whep() -> Response:
-    """Say what is taken here."""
+    """Say which methods this route accepts."""
     return Response(status_code=204, headers={"Allow": "OPTIONS, POST", "Accept-Post": SDP_TYPE})
 
 
 @router.delete("/whep/{session_id}", response_class=Response, responses=responses(404))
 async def end_whep(shared: Shared, session_id: SessionId) -> Response:
-    """End a session of WHEP."""
+    """End a WHEP session."""
     await shared.whep.end(session_id)
     return Response()
 

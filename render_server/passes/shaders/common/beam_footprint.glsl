@@ -5,12 +5,26 @@
 
 // Where a beam may light the picture: the first and last column and row, of pixels if `sharp`, else of texels of the
 // reduced grid. `layer`: REAL_LAYER or OBJECT_LAYER, -1 nowhere.
-struct BeamPlace { ivec2 low; ivec2 high; int layer; int sharp; ivec2 unused; };
+struct BeamPlace { ivec2 low; ivec2 high; int layer; int sharp; };
 
+// Two texels a beam: low and high, layer and sharp.
 #ifdef FINDS_PLACES
-layout(std430) writeonly buffer BeamPlaces { BeamPlace places[]; };
+layout(rgba16i) writeonly uniform iimage2D beam_places;
+
+void put_place(uint i, BeamPlace place) {
+    ivec2 at = texel_of_beam(i, 2);
+    imageStore(beam_places, at, ivec4(place.low, place.high));
+    imageStore(beam_places, at + ivec2(1, 0), ivec4(place.layer, place.sharp, 0, 0));
+}
 #else
-layout(std430) readonly buffer BeamPlaces { BeamPlace places[]; };
+layout(rgba16i) readonly uniform iimage2D beam_places;
+
+ivec4 bounds_of_beam(uint i) { return imageLoad(beam_places, texel_of_beam(i, 2)); }
+
+BeamPlace place_of_beam(uint i) {
+    ivec4 bounds = bounds_of_beam(i), kind = imageLoad(beam_places, texel_of_beam(i, 2) + ivec2(1, 0));
+    return BeamPlace(bounds.xy, bounds.zw, kind.x, kind.y);
+}
 #endif
 
 const float LONGEST = 4.0;   // limit of a slanted footprint, in radii of the beam

@@ -5,7 +5,7 @@
 int light_of_view(int view) {
     int i = 0;
     for (; i < light_count - 1; ++i) {
-        ivec4 views = lights[i].views;
+        ivec4 views = listed_light(i).views;
         bool real = view >= views.x && view < views.x + views.y;
         if (real || (view >= views.z && view < views.z + views.w)) break;
     }
@@ -72,7 +72,7 @@ Hit first_hit(sampler2D map, int first, int count, vec3 p) {
     Hit hit;
     hit.present = false;
     if (count == 0) return hit;
-    hit.view = light_views[view_containing(first, count, p)];
+    hit.view = listed_view(view_containing(first, count, p));
     vec3 v = (hit.view.view_from_world * vec4(p, 1.0)).xyz;
     if (v.z <= 0.0 && hit.view.range.z < 0.5) return hit;   // parallel rays also come from in front of the view
     hit.ray_depth = v.z;

@@ -15,6 +15,16 @@ struct Light {
     vec4 map_v;
     ivec4 views;   // first view and count in the real atlas, first and count in the virtual atlas
 };
+// A row each, the bits of floats and integers: an image, because software renderers load buffers lane by lane, number by number.
+layout(rgba32ui) readonly uniform uimage2D light_rows;
+
+vec4 light_column(int i, int column) { return uintBitsToFloat(imageLoad(light_rows, ivec2(column, i))); }
+
+Light listed_light(int i) {
+    return Light(light_column(i, 0), light_column(i, 1), light_column(i, 2), light_column(i, 3), light_column(i, 4), light_column(i, 5),
+        light_column(i, 6), light_column(i, 7), light_column(i, 8), ivec4(imageLoad(light_rows, ivec2(9, i))));
+}
+
 const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0;   // kinds
 // Of the scene's lights. llvmpipe executes what one kind needs for every light, so that a scene without it does without.
 #pragma switch bool has_rectangles

@@ -10,8 +10,16 @@ struct LightView {
     vec4 front;             // plane (world) in front of which the light shines
 };
 
-layout(std430) readonly buffer Lights { Light lights[]; };
-layout(std430) readonly buffer LightViews { LightView light_views[]; };
+// A row each, as those of lights.
+layout(rgba32ui) readonly uniform uimage2D light_view_rows;
+
+vec4 view_column(int i, int column) { return uintBitsToFloat(imageLoad(light_view_rows, ivec2(column, i))); }
+
+LightView listed_view(int i) {
+    mat4 view_from_world = mat4(view_column(i, 0), view_column(i, 1), view_column(i, 2), view_column(i, 3));
+    return LightView(view_from_world, view_column(i, 4), view_column(i, 5), view_column(i, 6));
+}
+
 uniform sampler2D real_light_depth;
 uniform sampler2D virtual_light_depth;
 uniform sampler2D caster_distance;   // of virtual_light_depth: squared, in cells of CASTER_CELL x CASTER_CELL texels
@@ -153,7 +161,7 @@ vec2 light_sample(Spread k, int j, int count) {
 
 int view_containing(int first, int count, vec3 p) {
     for (int i = first; i < first + count - 1; ++i) {
-        LightView view = light_views[i];
+        LightView view = listed_view(i);
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
         if (v.z > 0.0 && all(lessThanEqual(abs(lateral(view, v)), vec2(view.tile.w)))) return i;
     }
@@ -206,7 +214,7 @@ Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, vec3
     Occluder o;
     o.present = false;
     if (count == 0) return o;
-    o.view = light_views[view_containing(first, count, p)];
+    o.view = listed_view(view_containing(first, count, p));
     o.receiver = receiver_at(o.view, p, n, bias);
     // The rise of a tilted surface within a texel of the map must not block it either.
     float texel = 2.0 * o.view.tile.w / o.view.tile.z * (o.view.range.z > 0.5 ? 1.0 : o.receiver.depth);
@@ -252,7 +260,7 @@ bool object_may_block(Light light, vec3 p, float bias, bool in_box) {
     bool found = false;
     int j = light.views.z, end = light.views.z + light.views.w;
     if (j < end) do {
-        LightView view = light_views[j];
+        LightView view = listed_view(j);
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
         if (v.z - bias <= view.range.x) continue;
         vec2 s = lateral(view, v);
@@ -267,8 +275,8 @@ bool object_may_block(Light light, vec3 p, float bias, bool in_box) {
 // The same of all lights.
 bool object_may_shadow(vec3 p, float bias, bool in_box) {
     for (int i = 0; i < light_count; ++i) {
-        vec2 shown = mirror_fraction(lights[i], p);
-        if (shown.x != shown.y || object_may_block(lights[i], p, bias, in_box)) return true;
+        vec2 shown = mirror_fraction(listed_light(i), p);
+        if (shown.x != shown.y || object_may_block(listed_light(i), p, bias, in_box)) return true;
     }
     return false;
 }
@@ -279,7 +287,7 @@ bool object_may_block_sphere(Light light, vec3 p, float radius, float bias) {
     bool found = false;
     int j = light.views.z, end = light.views.z + light.views.w;
     if (j < end) do {
-        LightView view = light_views[j];
+        LightView view = listed_view(j);
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
         float deepest = v.z + radius, nearest = v.z - radius;
         if (deepest - bias <= view.range.x) continue;
@@ -297,7 +305,7 @@ bool object_may_block_sphere(Light light, vec3 p, float radius, float bias) {
 bool object_may_shadow_sphere(vec3 p, float radius, float bias) {
     if (has_rectangles || has_mirror_images) return true;
     for (int i = 0; i < light_count; ++i)
-        if (object_may_block_sphere(lights[i], p, radius, bias)) return true;
+        if (object_may_block_sphere(listed_light(i), p, radius, bias)) return true;
     return false;
 }
 
@@ -373,7 +381,7 @@ vec3 arriving(Light light, vec3 p, vec2 seen, float beam_alpha) {
 #ifdef TINTED_SHADOWS
     vec4 sum = vec4(0.0);
     if (light.views.w > 0 && seen.x > seen.y)
-        sum = let_through(light, light_views[view_containing(light.views.z, light.views.w, p)], p, beam_alpha);
+        sum = let_through(light, listed_view(view_containing(light.views.z, light.views.w, p)), p, beam_alpha);
     return vec3(seen.y) + max(seen.x - seen.y, 0.0) * sum.rgb / max(sum.a, 1.0);
 #else
     return vec3(seen.y);

@@ -29,12 +29,12 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
     int i = 0;
     if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
         vec3 l; float radius;
-        vec3 across = light_at(lights[i], p, n, l, radius);
+        vec3 across = light_at(listed_light(i), p, n, l, radius);
         float cosine = dot(n, l);
         if (cosine <= 0.0) continue;
         vec3 lifted = p + normal_offset * n;
-        vec2 fraction = visibility(lights[i], lifted, n, 3.0 * noise_sigma * depth * depth, 0.0);
-        vec3 seen = arriving(lights[i], lifted, fraction, beam_alpha);
+        vec2 fraction = visibility(listed_light(i), lifted, n, 3.0 * noise_sigma * depth * depth, 0.0);
+        vec3 seen = arriving(listed_light(i), lifted, fraction, beam_alpha);
         sum += across * seen * response_times_cosine(n, v, l, cosine, m, radius);
     } while (++i < light_count);
     return sum;

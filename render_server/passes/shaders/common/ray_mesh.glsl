@@ -4,14 +4,25 @@
 #pragma switch CUTOUTS
 
 struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first triangle << 3 | count, or -1
-layout(std430) readonly buffer Nodes { Node nodes[]; };
-layout(std430) readonly buffer Faces { vec4 faces[]; };           // 3 a triangle: corner, 2 edges; w: rows of vertices (bits)
+// Of textures, because software renderers load buffers lane by lane, number by number. Their bits are floats and integers.
+layout(rgba32ui) readonly uniform uimage2D bvh_nodes;   // 2 texels a node, in rows one after the other
+layout(rgba32ui) readonly uniform uimage2D bvh_faces;   // 3 a triangle: corner, 2 edges; w: rows of vertices
 layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/triangle_mesh.py)
 
 const int VERTEX_FLOATS = 12;
+const int BVH_WIDTH = 1024;   // texels of a row
 const float EDGE = 1e-5;   // barycentric: overlap of neighbours, so that no ray slips between them
 
 const float PLACES = 4096.0;   // of a blended triangle's edge, each there or not
+
+ivec2 texel_of_row(int i) { return ivec2(i & (BVH_WIDTH - 1), i / BVH_WIDTH); }
+
+Node node_at(int i) {
+    uvec4 low = imageLoad(bvh_nodes, texel_of_row(2 * i)), high = imageLoad(bvh_nodes, texel_of_row(2 * i + 1));
+    return Node(uintBitsToFloat(low.xyz), int(low.w), uintBitsToFloat(high.xyz), int(high.w));
+}
+
+vec4 face_at(int i) { return uintBitsToFloat(imageLoad(bvh_faces, texel_of_row(i))); }
 
 struct Ray { vec3 from; vec3 direction; };   // direction: unit length
 
@@ -29,7 +40,7 @@ bool meets_box(vec3 low, vec3 high, vec3 from, vec3 inverse, float limit) {
 #ifdef CUTOUTS
 // Whether a triangle's material is not there, at the barycentric place of corners 1 and 2.
 bool is_open_at(int at, vec2 place) {
-    ivec3 rows = VERTEX_FLOATS * floatBitsToInt(vec3(faces[3 * at].w, faces[3 * at + 1].w, faces[3 * at + 2].w));
+    ivec3 rows = VERTEX_FLOATS * floatBitsToInt(vec3(face_at(3 * at).w, face_at(3 * at + 1).w, face_at(3 * at + 2).w));
     vec3 weights = vec3(1.0 - place.x - place.y, place);
     vec2 uv = vec2(0.0);
     for (int k = 0; k < 3; ++k) uv += weights[k] * vec2(vertices[rows[k] + 6], vertices[rows[k] + 7]);
@@ -40,8 +51,8 @@ bool is_open_at(int at, vec2 place) {
 
 // Moeller and Trumbore 1997, both sides.
 void meet_triangle(int at, Ray ray, inout MeshHit hit) {
-    vec3 corner = faces[3 * at].xyz;
-    vec3 e1 = faces[3 * at + 1].xyz, e2 = faces[3 * at + 2].xyz;
+    vec3 corner = face_at(3 * at).xyz;
+    vec3 e1 = face_at(3 * at + 1).xyz, e2 = face_at(3 * at + 2).xyz;
     vec3 p = cross(ray.direction, e2);
     float det = dot(e1, p);
     if (det == 0.0) return;
@@ -62,9 +73,9 @@ MeshHit hit_before(Ray ray, float limit, bool any_hit) {
     vec3 safe = mix(ray.direction, vec3(1e-12), lessThan(abs(ray.direction), vec3(1e-12)));
     vec3 inverse = 1.0 / safe;
     MeshHit hit = MeshHit(limit, -1, vec2(0.0));
-    int count = nodes[0].skip;
+    int count = node_at(0).skip;
     for (int i = 0; i < count && !(any_hit && hit.triangle >= 0);) {
-        Node node = nodes[i];
+        Node node = node_at(i);
         bool met = meets_box(node.low, node.high, ray.from, inverse, hit.distance);
         int last = met && node.leaf >= 0 ? (node.leaf >> 3) + (node.leaf & 7) : 0;
         for (int j = node.leaf >> 3; j < last; ++j) meet_triangle(j, ray, hit);
@@ -92,7 +103,7 @@ vec3 vertex_vector(ivec3 rows, int column, vec3 weights) {
 // The surface at a hit, its normal facing the ray's origin as the raster's faces the camera.
 MeshSurface surface_of(MeshHit hit, Ray ray) {
     int at = 3 * hit.triangle;
-    ivec3 rows = floatBitsToInt(vec3(faces[at].w, faces[at + 1].w, faces[at + 2].w));
+    ivec3 rows = floatBitsToInt(vec3(face_at(at).w, face_at(at + 1).w, face_at(at + 2).w));
     vec3 weights = vec3(1.0 - hit.place.x - hit.place.y, hit.place);
     int material = int(vertices[rows.x * VERTEX_FLOATS + 11]);
     vec3 corner = vertex_vector(rows, 0, vec3(1.0, 0.0, 0.0));

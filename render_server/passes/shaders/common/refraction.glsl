@@ -9,9 +9,9 @@ const float THINNEST = 1e-6;     // m: the same, at least
 // `size`: of the footprint there, m.
 Interface interface_at(MeshHit hit, Ray ray, float size) {
     int at = 3 * hit.triangle;
-    ivec3 rows = floatBitsToInt(vec3(faces[at].w, faces[at + 1].w, faces[at + 2].w));
+    ivec3 rows = floatBitsToInt(vec3(face_at(at).w, face_at(at + 1).w, face_at(at + 2).w));
     vec3 weights = vec3(1.0 - hit.place.x - hit.place.y, hit.place);
-    vec3 face = normalize(cross(faces[at + 1].xyz, faces[at + 2].xyz));
+    vec3 face = normalize(cross(face_at(at + 1).xyz, face_at(at + 2).xyz));
     if (dot(face, ray.direction) > 0.0) face = -face;
     vec3 normal = vertex_vector(rows, 3, weights);
     if (dot(normal, face) < 0.0) normal = -normal;
@@ -61,5 +61,5 @@ vec3 kept_over(int medium, float path) { return medium < 0 ? vec3(1.0) : exp(-ma
 bool is_transparent(int material) { return materials[material].emission.a > 0.0 && materials[material].base_color.a < 1.0; }
 
 int material_of_triangle(int triangle) {
-    return int(vertices[floatBitsToInt(faces[3 * triangle].w) * VERTEX_FLOATS + 11]);
+    return int(vertices[floatBitsToInt(face_at(3 * triangle).w) * VERTEX_FLOATS + 11]);
 }

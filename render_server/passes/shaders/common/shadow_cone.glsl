@@ -30,7 +30,7 @@ ShadowCone shadow_cone(Light light, vec3 p, vec3 n) {
 // Whether any shadow cone from p meets the objects.
 bool object_meets_cone(vec3 p, vec3 n) {
     for (int i = 0; i < light_count; ++i) {
-        vec2 interval = shadow_cone(lights[i], p, n).interval;
+        vec2 interval = shadow_cone(listed_light(i), p, n).interval;
         if (interval.x < interval.y) return true;
     }
     return false;
@@ -44,7 +44,7 @@ bool object_meets_cone_of_sphere(vec3 p, float radius) {
     if (has_rectangles || has_mirror_images) return true;
     vec3 q = volume_coordinate(p);
     for (int i = 0; i < light_count; ++i) {
-        Light light = lights[i];
+        Light light = listed_light(i);
         bool distant = light.place.w == DIRECTIONAL;
         vec3 way = distant ? -light.place.xyz : volume_coordinate(light.place.xyz) - q;
         float far = length(way), slack = radius / voxel_edge + 2.0 * SHADOW_START + OFF_CONE;

@@ -13,7 +13,7 @@ export interface paths {
         };
         /**
          * Active Scene
-         * @description Return the scene that is rendered.
+         * @description Return the active scene.
          */
         readonly get: operations["active_scene"];
         readonly put?: never;
@@ -33,13 +33,13 @@ export interface paths {
         };
         /**
          * List Assets
-         * @description List all assets, the newest first.
+         * @description List all assets, newest first.
          */
         readonly get: operations["list_assets"];
         readonly put?: never;
         /**
          * Upload Asset
-         * @description Upload a mesh, map or precomputed material as the body of the request; 200 where the content is there already.
+         * @description Upload a mesh, map or precomputed material as the request body; 200 if the content already exists.
          *
          *     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
          *     A .zip of one glTF and its files is kept as one .glb.
@@ -60,14 +60,14 @@ export interface paths {
         };
         /**
          * Get Asset
-         * @description Return what is known of an asset.
+         * @description Return the facts of an asset.
          */
         readonly get: operations["get_asset"];
         readonly put?: never;
         readonly post?: never;
         /**
          * Delete Asset
-         * @description Delete an asset that no scene uses, now or in a revision that undo may bring back.
+         * @description Delete an asset that no scene uses, currently or in a revision that undo can restore.
          */
         readonly delete: operations["delete_asset"];
         readonly options?: never;
@@ -104,7 +104,7 @@ export interface paths {
         };
         /**
          * Thumbnail
-         * @description Return a picture of a mesh, map or material, 256 x 256 pixels on a transparent ground.
+         * @description Return a thumbnail of a mesh, map or material: 256 x 256 pixels on a transparent background.
          */
         readonly get: operations["thumbnail"];
         readonly put?: never;
@@ -124,7 +124,7 @@ export interface paths {
         };
         /**
          * List Cameras
-         * @description List the cameras that are attached to this host, and what keeps others from being found.
+         * @description List the cameras attached to this host, and why others were not found.
          */
         readonly get: operations["list_cameras"];
         readonly put?: never;
@@ -144,7 +144,7 @@ export interface paths {
         };
         /**
          * Fisheye
-         * @description Return what the fish-eye camera sees: the size of its picture, and the places of the lights in it.
+         * @description Return what the fish-eye camera sees: the size of its picture and the positions of the lights in it.
          */
         readonly get: operations["fisheye"];
         readonly put?: never;
@@ -204,7 +204,7 @@ export interface paths {
         };
         /**
          * List Hosts
-         * @description List the hosts whose slots rooms run in; empty for a single room.
+         * @description List the hosts that provide slots; empty for a single room.
          */
         readonly get: operations["list_hosts"];
         readonly put?: never;
@@ -226,14 +226,14 @@ export interface paths {
         readonly put?: never;
         /**
          * Drain Host
-         * @description Move the host's rooms to others, one after another; those without a slot there end and wait.
+         * @description Move the host's rooms to other hosts, one after another; rooms without a slot there stop and wait.
          *
          *     It stays drained over restarts, until that is deleted.
          */
         readonly post: operations["drain_host"];
         /**
          * Undrain Host
-         * @description Let rooms start on the host again.
+         * @description Allow rooms to start on the host again.
          */
         readonly delete: operations["undrain_host"];
         readonly options?: never;
@@ -272,7 +272,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Pick
-         * @description Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on.
+         * @description Return what a pixel of the newest composite shows: where to put an object, or which object was clicked.
          */
         readonly post: operations["pick"];
         readonly delete?: never;
@@ -290,7 +290,7 @@ export interface paths {
         };
         /**
          * Room
-         * @description Return the real scene as the render server has it: a mesh with the newest picture on what that shows.
+         * @description Return the render server's model of the real scene: a mesh textured with the newest picture.
          *
          *     Metres, y up (the world's z). Objects and lights are not in it.
          */
@@ -312,7 +312,7 @@ export interface paths {
         };
         /**
          * Metrics
-         * @description Measurements for Prometheus: of a room, and of what all rooms have in common.
+         * @description Metrics for Prometheus: those of a room, and those that all rooms share.
          */
         readonly get: operations["metrics"];
         readonly put?: never;
@@ -332,7 +332,7 @@ export interface paths {
         };
         /**
          * List Nodes
-         * @description List the nodes and render servers that are heard: state, rates, losses, clock, delays.
+         * @description List the nodes and render servers that report: state, rates, losses, clock, delays.
          */
         readonly get: operations["list_nodes"];
         readonly put?: never;
@@ -352,7 +352,7 @@ export interface paths {
         };
         /**
          * Poster Before
-         * @description Return the camera's own picture of the poster's frame; `/settings` says whether there is one.
+         * @description Return the camera's own picture of the still's frame; `/settings` says whether there is one.
          */
         readonly get: operations["poster_before"];
         readonly put?: never;
@@ -372,7 +372,7 @@ export interface paths {
         };
         /**
          * Poster
-         * @description Return the still that stands for the live picture until it comes; `/settings` says whether there is one.
+         * @description Return the still that is shown until the first live picture; `/settings` says whether there is one.
          */
         readonly get: operations["poster"];
         readonly put?: never;
@@ -392,7 +392,7 @@ export interface paths {
         };
         /**
          * Ready
-         * @description Whether storage, render server and newest picture are there: for what chooses among web processes.
+         * @description Whether storage, render server and a recent picture are available: for load balancers.
          *
          *     With a directory of rooms: whether storage and directory are, because rooms may wait.
          */
@@ -414,13 +414,13 @@ export interface paths {
         };
         /**
          * List Recordings
-         * @description List all recordings, those that grow first, then the newest first.
+         * @description List all recordings: those in progress first, then newest first.
          */
         readonly get: operations["list_recordings"];
         readonly put?: never;
         /**
          * Start Recording
-         * @description Begin to record a node, with the active scene attached; events tell how far it is.
+         * @description Start recording a node, with the active scene attached; events report the progress.
          */
         readonly post: operations["start_recording"];
         readonly delete?: never;
@@ -440,7 +440,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Upload Recording
-         * @description Upload an .mcap recording, or a .zip of a dataset folder, as the body of the request.
+         * @description Upload an .mcap recording, or a .zip of a dataset folder, as the request body.
          *
          *     It is recognised by its content and read once in a process of its own, with limits of memory, time and disk. It is
          *     kept under the name of the file, with a number where that is taken.
@@ -461,14 +461,14 @@ export interface paths {
         };
         /**
          * Get Recording
-         * @description Return what is known of a recording.
+         * @description Return the facts of a recording.
          */
         readonly get: operations["get_recording"];
         readonly put?: never;
         readonly post?: never;
         /**
          * Delete Recording
-         * @description Delete a recording for good; not one that grows or is shown.
+         * @description Delete a recording permanently, unless it is in progress or on display.
          */
         readonly delete: operations["delete_recording"];
         readonly options?: never;
@@ -485,7 +485,7 @@ export interface paths {
         };
         /**
          * Download Recording
-         * @description Download the .mcap file; ranges of it too.
+         * @description Download the .mcap file; ranges are supported.
          */
         readonly get: operations["download_recording"];
         readonly put?: never;
@@ -527,7 +527,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Recover Recording
-         * @description Mend an interrupted recording: all frames that can be read, finished.
+         * @description Recover an interrupted recording: keep all frames that can be read, and finish the file.
          */
         readonly post: operations["recover_recording"];
         readonly delete?: never;
@@ -547,7 +547,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Stop Recording
-         * @description End a recording; 409 where no frame had come, so that there is none.
+         * @description Stop a recording; 409 if no frame had arrived, so that nothing was recorded.
          */
         readonly post: operations["stop_recording"];
         readonly delete?: never;
@@ -565,20 +565,20 @@ export interface paths {
         };
         /**
          * Get Recording Video
-         * @description Return whether the video of the relit pictures is there, or how far it is.
+         * @description Return whether the video of the relit pictures is available, or its progress.
          */
         readonly get: operations["get_recording_video"];
         readonly put?: never;
         /**
          * Make Recording Video
-         * @description Make a video of the relit pictures that were recorded along (H.264), in the background, and keep it.
+         * @description Encode the recorded relit pictures as a video (H.264) in the background, and keep it.
          *
          *     The package `av` makes it (extra `video`).
          */
         readonly post: operations["make_recording_video"];
         /**
          * Delete Recording Video
-         * @description Stop the making of a video, or delete it; the recording stays.
+         * @description Stop encoding a video, or delete it; the recording stays.
          */
         readonly delete: operations["delete_recording_video"];
         readonly options?: never;
@@ -595,7 +595,7 @@ export interface paths {
         };
         /**
          * Recording Video
-         * @description Download the video of the relit pictures; ranges of it too.
+         * @description Download the video of the relit pictures; ranges are supported.
          *
          *     Where it is not there, it is begun. 503 with `Retry-After` comes instead if it takes longer than some seconds.
          */
@@ -617,12 +617,12 @@ export interface paths {
         };
         /**
          * Get Replay
-         * @description Return which recording is shown and where it is; without one, where the node's own recording is.
+         * @description Return which recording is shown and its position; without one, the position in the node's own recording.
          */
         readonly get: operations["get_replay"];
         /**
          * Start Replay
-         * @description Show a recording instead of the live nodes, or of the recording that is shown.
+         * @description Show a recording instead of the live nodes or of the current recording.
          */
         readonly put: operations["start_replay"];
         readonly post?: never;
@@ -635,7 +635,7 @@ export interface paths {
         readonly head?: never;
         /**
          * Change Replay
-         * @description Seek, step from frame to frame, pause, go on, play slower or faster: what `GET /replay` returns.
+         * @description Seek, step frame by frame, pause, resume, or change the speed of the recording that `GET /replay` returns.
          */
         readonly patch: operations["change_replay"];
         readonly trace?: never;
@@ -691,7 +691,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Drain Room
-         * @description End the room's render server until it is started again; its slot is free for rooms that wait.
+         * @description Stop the room's render server until it is started again; waiting rooms can use its slot.
          */
         readonly post: operations["drain_room"];
         readonly delete?: never;
@@ -711,7 +711,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Move Room
-         * @description Move the room to another slot; it is shown from where it was until its pictures come from there.
+         * @description Move the room to another slot; the old slot keeps rendering it until the new one sends pictures.
          */
         readonly post: operations["move_room"];
         readonly delete?: never;
@@ -731,7 +731,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Start Room
-         * @description Start a room that was drained or has failed.
+         * @description Start a room that was drained or that failed.
          */
         readonly post: operations["start_room"];
         readonly delete?: never;
@@ -755,7 +755,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Create Scene
-         * @description Make a scene of a document (an exported one too); assets are named by digest or uploaded name.
+         * @description Create a scene from a document, such as an exported one; it refers to assets by digest or uploaded name.
          */
         readonly post: operations["create_scene"];
         readonly delete?: never;
@@ -778,7 +778,7 @@ export interface paths {
         readonly get: operations["get_scene"];
         /**
          * Replace Scene
-         * @description Put another document in place of a scene's; a `revision` in it counts as If-Match.
+         * @description Replace a scene's document; a `revision` in it counts as If-Match.
          */
         readonly put: operations["replace_scene"];
         readonly post?: never;
@@ -825,7 +825,7 @@ export interface paths {
         };
         /**
          * Export Document
-         * @description Return the document alone, as a file to keep or to import.
+         * @description Return only the document, as a file to keep or to import.
          */
         readonly get: operations["export_document"];
         readonly put?: never;
@@ -847,7 +847,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Duplicate
-         * @description Make a copy of a scene.
+         * @description Copy a scene.
          */
         readonly post: operations["duplicate"];
         readonly delete?: never;
@@ -890,7 +890,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Create Light
-         * @description Add a manual light after the others; it shines in mode `manual`.
+         * @description Append a manual light; it is used in mode `manual`.
          */
         readonly post: operations["create_light"];
         readonly delete?: never;
@@ -913,20 +913,20 @@ export interface paths {
         readonly get: operations["get_light"];
         /**
          * Put Light
-         * @description Put another manual light in place of one.
+         * @description Replace a manual light.
          */
         readonly put: operations["put_light"];
         readonly post?: never;
         /**
          * Delete Light
-         * @description Take a manual light out; those after it move up, and undo brings it back.
+         * @description Remove a manual light; those after it move up, and undo restores it.
          */
         readonly delete: operations["delete_light"];
         readonly options?: never;
         readonly head?: never;
         /**
          * Change Light
-         * @description Change keys of a manual light; for another `type` put a whole one in its place.
+         * @description Change keys of a manual light; to change its `type`, replace it with PUT.
          */
         readonly patch: operations["change_light"];
         readonly trace?: never;
@@ -988,20 +988,20 @@ export interface paths {
         readonly get: operations["get_object"];
         /**
          * Put Object
-         * @description Put another object in place of one.
+         * @description Replace an object.
          */
         readonly put: operations["put_object"];
         readonly post?: never;
         /**
          * Delete Object
-         * @description Take an object out of the scene; undo brings it back.
+         * @description Remove an object from the scene; undo restores it.
          */
         readonly delete: operations["delete_object"];
         readonly options?: never;
         readonly head?: never;
         /**
          * Change Object
-         * @description Change keys of an object: its pose, its material, whether it is seen.
+         * @description Change keys of an object, such as its pose, its material or its visibility.
          */
         readonly patch: operations["change_object"];
         readonly trace?: never;
@@ -1055,7 +1055,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Redo
-         * @description Make the change again that undo took back.
+         * @description Redo the change that was undone last.
          */
         readonly post: operations["redo"];
         readonly delete?: never;
@@ -1073,7 +1073,7 @@ export interface paths {
         };
         /**
          * List Revisions
-         * @description List the changes of a scene, the newest first.
+         * @description List the changes of a scene, newest first.
          */
         readonly get: operations["list_revisions"];
         readonly put?: never;
@@ -1134,7 +1134,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Undo
-         * @description Take the last change back, by a new revision.
+         * @description Undo the last change, by a new revision.
          */
         readonly post: operations["undo"];
         readonly delete?: never;
@@ -1172,7 +1172,7 @@ export interface paths {
         };
         /**
          * List Shelf
-         * @description List the objects that every service has: a few models, and shapes of plain materials.
+         * @description List the ready-made objects that every service has: a few models, and simple shapes.
          */
         readonly get: operations["list_shelf"];
         readonly put?: never;
@@ -1194,7 +1194,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Take From Shelf
-         * @description Make an asset of an object of the shelf, to be named by scenes; 200 where it is there already.
+         * @description Create an asset from a ready-made object, for use in scenes; 200 if it already exists.
          */
         readonly post: operations["take_from_shelf"];
         readonly delete?: never;
@@ -1212,13 +1212,13 @@ export interface paths {
         };
         /**
          * List Snapshots
-         * @description List all snapshots, the newest first.
+         * @description List all snapshots, newest first.
          */
         readonly get: operations["list_snapshots"];
         readonly put?: never;
         /**
          * Take Snapshot
-         * @description Render the newest frame as each picture says, and keep the files.
+         * @description Render the newest frame as specified for each picture, and keep the files.
          */
         readonly post: operations["take_snapshot"];
         readonly delete?: never;
@@ -1236,14 +1236,14 @@ export interface paths {
         };
         /**
          * Get Snapshot
-         * @description Return what is known of a snapshot.
+         * @description Return the facts of a snapshot.
          */
         readonly get: operations["get_snapshot"];
         readonly put?: never;
         readonly post?: never;
         /**
          * Delete Snapshot
-         * @description Delete a snapshot for good.
+         * @description Delete a snapshot permanently.
          */
         readonly delete: operations["delete_snapshot"];
         readonly options?: never;
@@ -1260,7 +1260,7 @@ export interface paths {
         };
         /**
          * Snapshot Before After
-         * @description Return a moving picture in which a line divides the camera's picture from the composite.
+         * @description Return an animation in which a moving line divides the camera's picture from the composite.
          */
         readonly get: operations["snapshot_before_after"];
         readonly put?: never;
@@ -1280,7 +1280,7 @@ export interface paths {
         };
         /**
          * Snapshot Before After Video
-         * @description Return the same as a video (H.264) of a few seconds, in full size. The package `av` makes it.
+         * @description Return the same as a full-size video (H.264) of a few seconds; needs the package `av`.
          */
         readonly get: operations["snapshot_before_after_video"];
         readonly put?: never;
@@ -1320,7 +1320,7 @@ export interface paths {
         };
         /**
          * State
-         * @description Rates, drops, delays and remarks of the processes.
+         * @description State, rates, drops and delays of the processes.
          */
         readonly get: operations["state"];
         readonly put?: never;
@@ -1342,7 +1342,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Create Ticket
-         * @description Get a ticket with the caller's role, for addresses that cannot carry a token: WebSockets and pictures.
+         * @description Get a ticket with the caller's role, for requests that cannot carry a token: WebSockets and pictures.
          */
         readonly post: operations["create_ticket"];
         readonly delete?: never;
@@ -1385,7 +1385,7 @@ export interface paths {
         readonly post?: never;
         /**
          * End Whep
-         * @description End a session of WHEP.
+         * @description End a WHEP session.
          */
         readonly delete: operations["end_whep"];
         readonly options?: never;
@@ -1404,7 +1404,7 @@ export interface components {
         readonly AmbientLight: {
             /**
              * Color Linear
-             * @description Linear R G B that multiplies the strength.
+             * @description Linear RGB colour that multiplies the strength.
              * @default [
              *       1,
              *       1,
@@ -1441,7 +1441,7 @@ export interface components {
             readonly clip?: number | string | null;
             /**
              * Loop
-             * @description Begin again at the end; false = hold the ends.
+             * @description Start again at the end; false = hold the first and last pose.
              * @default true
              */
             readonly loop: boolean;
@@ -1453,7 +1453,7 @@ export interface components {
             readonly offset_s: number;
             /**
              * Speed
-             * @description Clip seconds per second; 0 holds it at `offset_s`, below 0 plays it backwards.
+             * @description Playback speed, clip seconds per second; 0 holds the clip at `offset_s`, negative values play it backwards.
              * @default 1
              */
             readonly speed: number;
@@ -1465,20 +1465,20 @@ export interface components {
         readonly AroofMethod: {
             /**
              * Caustics
-             * @description What smooth objects reflect of the lights falls on other surfaces as beams; false = nowhere.
+             * @description Smooth objects reflect the lights onto other surfaces as caustics; false = not at all.
              * @default true
              */
             readonly caustics: boolean;
             /**
              * Composition
-             * @description How the delta meets the picture.
+             * @description How the change of light is applied to the picture.
              * @default ratio
              * @enum {string}
              */
             readonly composition: "ratio" | "additive";
             /**
              * Indirect
-             * @description Objects also reflect light onto what is around them (radiance transfer field).
+             * @description Objects also reflect light onto their surroundings (radiance transfer field).
              * @default true
              */
             readonly indirect: boolean;
@@ -1490,27 +1490,27 @@ export interface components {
             readonly name: "aroof";
             /**
              * Near Light
-             * @description What the camera sees around an object counts as light there, or the environment map alone.
+             * @description Light around an object comes from what the camera sees there, or only from the environment map.
              * @default measured
              * @enum {string}
              */
             readonly near_light: "measured" | "none";
             /**
              * Quality
-             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @description Quality that a moving picture gives up for speed (docs/speed.md): `live` most, `balanced` some, `best` none.
              * @default best
              * @enum {string}
              */
             readonly quality: "live" | "balanced" | "best";
             /**
              * Rays
-             * @description Rays from each sample over the whole sphere; more take longer once.
+             * @description Rays from each sample over the whole sphere; more make the precomputation longer.
              * @default 256
              */
             readonly rays: number;
             /**
              * Reach
-             * @description How far the outermost shell reaches from the object's middle, in radii of the sphere around it.
+             * @description Extent of the outermost shell from the object's centre, in radii of its bounding sphere.
              * @default 8
              */
             readonly reach: number;
@@ -1522,41 +1522,41 @@ export interface components {
             readonly resolution: number;
             /**
              * Rsm Size
-             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 on a GPU, 512 in software.
              */
             readonly rsm_size?: number | null;
             /**
              * Screen Space
-             * @description Smooth objects reflect what the picture shows; false = the surroundings alone.
+             * @description Smooth objects reflect the camera's picture where it shows the spot; false = only the surroundings.
              * @default true
              */
             readonly screen_space: boolean;
             /**
              * Sh Order
-             * @description Bands of spherical harmonics of what an object hides: 9, 16 or 25 coefficients per sample.
+             * @description Bands of spherical harmonics for an object's occlusion: 9, 16 or 25 coefficients per sample.
              * @default 4
              */
             readonly sh_order: number;
             /**
              * Shading Scale
-             * @description Fields are read at 1/scale of the picture; null = 2 on a GPU, 4 in software.
+             * @description Fields are sampled at 1/scale of the picture's size; null = 2 on a GPU, 4 in software.
              */
             readonly shading_scale?: (1 | 2 | 4) | null;
             /**
              * Shadow Samples
-             * @description Samples of a light's area for soft shadows.
+             * @description Samples per area light, for soft shadows.
              * @default 16
              */
             readonly shadow_samples: number;
             /**
              * Shells
-             * @description Grids of samples around an object, each within the next.
+             * @description Nested grids (shells) of samples around an object.
              * @default 4
              */
             readonly shells: number;
             /**
              * Triangle Budget
-             * @description Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
+             * @description Maximum triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
              */
             readonly triangle_budget?: number | null;
         };
@@ -1567,7 +1567,7 @@ export interface components {
         readonly AssetAnswer: {
             /**
              * Asset
-             * @description How scene documents name it.
+             * @description Reference to use in scene documents.
              * @example sha256:2c26b46b68ffc68f...
              */
             readonly asset: string;
@@ -1605,7 +1605,7 @@ export interface components {
             readonly kind: "mesh" | "map" | "material";
             /**
              * Names
-             * @description Names under which it was uploaded.
+             * @description File names under which it was uploaded.
              */
             readonly names: readonly string[];
             /** Size Bytes */
@@ -1659,7 +1659,7 @@ export interface components {
             readonly details: string;
             /**
              * Hint
-             * @description What keeps it from being opened, and what to do; else empty.
+             * @description Why it cannot be opened and what to do; else empty.
              */
             readonly hint: string;
             /**
@@ -1671,26 +1671,26 @@ export interface components {
             readonly name: string;
             /**
              * Source
-             * @description What opens it, as `node --source` takes it.
+             * @description Source that opens it, as for `node --source`.
              * @example uvc:0
              */
             readonly source: string;
         };
         /**
          * CameraState
-         * @description A camera whose pictures the render server makes, and its newest picture here.
+         * @description A camera whose frames the render server renders, and its newest picture.
          */
         readonly CameraState: {
             /**
              * Frame Id
-             * @description Of its newest picture.
+             * @description Number of its newest frame.
              */
             readonly frame_id: number | null;
             /** Frames Per S */
             readonly frames_per_s: number | null;
             /**
              * Last Frame S
-             * @description Seconds since that came.
+             * @description Seconds since its newest picture arrived.
              */
             readonly last_frame_s: number | null;
             /**
@@ -1700,7 +1700,7 @@ export interface components {
             readonly name: string;
             /**
              * Status
-             * @description `live`, or why it is left out: it is `silent`, sees `other_board` than the first one, or its frames are of `other_time`.
+             * @description `live`, or why the camera is left out: it is `silent`, sees a different board from the first camera (`other_board`), or its frames are from a different time (`other_time`).
              * @enum {string}
              */
             readonly status: "live" | "silent" | "other_board" | "other_time";
@@ -1714,20 +1714,20 @@ export interface components {
             readonly cameras: readonly components["schemas"]["CameraAnswer"][];
             /**
              * Missing
-             * @description Kinds of which none was found, and why.
+             * @description Kinds of camera that were not found, and why.
              */
             readonly missing: readonly components["schemas"]["MissingCameras"][];
         };
         /**
          * Check
-         * @description One thing that relighting needs.
+         * @description One requirement for relighting.
          */
         readonly Check: {
             /** Is There */
             readonly is_there: boolean;
             /**
              * Text
-             * @description What there is, or what to do without.
+             * @description What is available, or what to do if it is not.
              */
             readonly text: string;
             /**
@@ -1743,44 +1743,44 @@ export interface components {
         readonly DifferentialMethod: {
             /**
              * Bounces
-             * @description Gathers of light from voxel to voxel, after the light that the camera measured and the lights' own; 0 = direct and unoccluded ambient only (exact operator).
+             * @description Bounces of light from voxel to voxel, in addition to the light that the camera measured and the direct light; 0 = direct and unoccluded ambient light only (exact operator).
              * @default 1
              */
             readonly bounces: number;
             /**
              * Composition
-             * @description How the difference meets the picture.
+             * @description How the change of light is applied to the picture.
              * @default ratio
              * @enum {string}
              */
             readonly composition: "ratio" | "additive";
             /**
              * Cone Count
-             * @description Diffuse cones of the exact operator.
+             * @description Diffuse cones per pixel (exact operator).
              * @default 16
              */
             readonly cone_count: number;
             /**
              * Cone Scale
-             * @description Cones are traced at 1/scale of the picture; null = 2 on a GPU, 4 in software.
+             * @description Cones are traced at 1/scale of the picture's size; null = 2 on a GPU, 4 in software.
              */
             readonly cone_scale?: (1 | 2 | 4) | null;
             /**
              * Coverage
-             * @description Of the exact operator: what a cone meets adds up to a wall, or blocks front to back.
+             * @description Exact operator: how a cone accumulates coverage: summed, or multiplied front to back.
              * @default summed
              * @enum {string}
              */
             readonly coverage: "summed" | "multiplied";
             /**
              * Far Volume
-             * @description Of the exact operator: cones meet the real scene beyond the volume too.
+             * @description Exact operator: cones also see the real scene beyond the volume.
              * @default true
              */
             readonly far_volume: boolean;
             /**
              * Memory Budget Mb
-             * @description Greatest memory of the volumes, MB; beyond it rendering is refused.
+             * @description Memory limit of the volumes, MB; beyond it, rendering is refused.
              * @default 4096
              */
             readonly memory_budget_mb: number;
@@ -1792,50 +1792,50 @@ export interface components {
             readonly name: "differential";
             /**
              * Quality
-             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @description Quality that a moving picture gives up for speed (docs/speed.md): `live` most, `balanced` some, `best` none.
              * @default best
              * @enum {string}
              */
             readonly quality: "live" | "balanced" | "best";
             /**
              * Radiance
-             * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
+             * @description Exact operator: radiance of real surfaces, as the camera measures it or as the lights predict it.
              * @default measured
              * @enum {string}
              */
             readonly radiance: "measured" | "predicted";
             /**
              * Reflections
-             * @description Of the exact operator: objects in smooth real surfaces by rays, or by cones.
+             * @description Exact operator: smooth real surfaces reflect objects by rays or by cones.
              * @default rays
              * @enum {string}
              */
             readonly reflections: "rays" | "cones";
             /**
              * Rsm Size
-             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 on a GPU, 512 in software.
              */
             readonly rsm_size?: number | null;
             /**
              * Screen Space
-             * @description Of the exact operator: smooth objects reflect what the picture shows; false = voxels alone.
+             * @description Exact operator: smooth objects reflect the camera's picture where it shows the spot; false = voxels only.
              * @default true
              */
             readonly screen_space: boolean;
             /**
              * Shadow Samples
-             * @description Samples of a light's area for soft shadows.
+             * @description Samples per area light, for soft shadows.
              * @default 16
              */
             readonly shadow_samples: number;
             /**
              * Triangle Budget
-             * @description Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
+             * @description Maximum triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
              */
             readonly triangle_budget?: number | null;
             /**
              * Volume Edge M
-             * @description Edge of the volume, metres; null = twice the objects' longest edge.
+             * @description Edge length of the volume, metres; null = twice the longest edge of the objects.
              */
             readonly volume_edge_m?: number | null;
             /**
@@ -1845,7 +1845,7 @@ export interface components {
             readonly volume_size?: number | null;
             /**
              * Voxels
-             * @description Of the exact operator: six one-sided directions per voxel, or one for all (as in the paper).
+             * @description Exact operator: six directional values per voxel, or one isotropic value (as in the paper).
              * @default directional
              * @enum {string}
              */
@@ -1864,7 +1864,7 @@ export interface components {
             readonly angular_radius_deg: number;
             /**
              * Color Linear
-             * @description Linear R G B that multiplies the strength.
+             * @description Linear RGB colour that multiplies the strength.
              * @default [
              *       1,
              *       1,
@@ -1878,7 +1878,7 @@ export interface components {
             ];
             /**
              * Direction
-             * @description The way the light travels, world; normalised.
+             * @description Direction in which the light travels, world axes; normalised.
              * @default [
              *       0,
              *       0,
@@ -1892,7 +1892,7 @@ export interface components {
             ];
             /**
              * Irradiance
-             * @description Irradiance across the beam, camera units.
+             * @description Irradiance perpendicular to the beam, camera units.
              * @default 1
              */
             readonly irradiance: number;
@@ -1910,47 +1910,47 @@ export interface components {
         readonly DlpvMethod: {
             /**
              * Ambient
-             * @description Surfaces in the volume keep off light from the surroundings, or none does; null = blocked, open for paper.
+             * @description Whether surfaces in the volume block light from the surroundings; null = blocked, open for paper.
              */
             readonly ambient?: ("blocked" | "open") | null;
             /**
              * Bounces
-             * @description How often surfaces reflect what the volume brought them; null = 2, 0 for paper.
+             * @description Bounces: how often surfaces reflect the light that reaches them through the volume; null = 2, 0 for paper.
              */
             readonly bounces?: number | null;
             /**
              * Caustics
-             * @description What smooth objects reflect of the lights falls on other surfaces as beams, or is injected into the volume; null = beams, the volume for paper.
+             * @description Smooth objects reflect the lights onto other surfaces as caustics, or their reflected light is injected into the volume; null = caustics, the volume for paper.
              */
             readonly caustics?: boolean | null;
             /**
              * Composition
-             * @description How the delta meets the picture; null = ratio, additive for paper.
+             * @description How the change of light is applied to the picture; null = ratio, additive for paper.
              */
             readonly composition?: ("ratio" | "additive") | null;
             /**
              * Damping
-             * @description How strongly light that grows towards the back of a surface is damped, 0 = not; null = 0, 1 for paper.
+             * @description How strongly light that increases behind a surface is damped; 0 = not at all; null = 0, 1 for paper.
              */
             readonly damping?: number | null;
             /**
              * Direct Filter
-             * @description Of shadow lobe: direct light is averaged over cubes that reach so many cells to each side, which softens shadows and makes them lighter; null = 0.
+             * @description Shadow lobe: radius, in cells, of the cube over which direct light is averaged, which softens and lightens shadows; null = 0.
              */
             readonly direct_filter?: number | null;
             /**
              * Direct Steps
-             * @description Of shadow lobe: steps of direct light after injection; they soften and deepen shadows. null = 5 ([P2] fig. 7); 0 = none.
+             * @description Shadow lobe: propagation steps of direct light after injection, which soften and deepen shadows; null = 5 ([P2] fig. 7), 0 = none.
              */
             readonly direct_steps?: number | null;
             /**
              * Direct Volume Size
-             * @description Of shadow lobe: cells along each edge of the volume of direct light; null = volume_size.
+             * @description Shadow lobe: cells along each edge of the volume of direct light; null = volume_size.
              */
             readonly direct_volume_size?: number | null;
             /**
              * Geometry Volume
-             * @description Surfaces block light between cells; null = yes, no for paper.
+             * @description Whether surfaces block light between cells; null = yes, no for paper.
              */
             readonly geometry_volume?: boolean | null;
             /**
@@ -1961,82 +1961,82 @@ export interface components {
             readonly name: "dlpv";
             /**
              * Objects Steps
-             * @description Of operator paper: steps in the volume that lights the objects; null = as steps.
+             * @description Operator paper: propagation steps in the volume that lights the objects; null = as in `steps`.
              */
             readonly objects_steps?: number | null;
             /**
              * Objects Volume Size
-             * @description Of operator paper: cells along each edge of the volume that lights the objects; null = volume_size.
+             * @description Operator paper: cells along each edge of the volume that lights the objects; null = volume_size.
              */
             readonly objects_volume_size?: number | null;
             /**
              * Operator
-             * @description Two volumes, with and without objects, subtracted; or one volume of the change, as printed in the paper. Settings that are null follow it.
+             * @description The difference of two volumes, with and without objects; or one volume of the change, as printed in the paper. It sets the defaults of settings that are null.
              * @default difference
              * @enum {string}
              */
             readonly operator: "difference" | "paper";
             /**
              * Propagation
-             * @description What a cell keeps of light that enters it: its direction, or lobes about the faces that it reaches; null = moments, lobes for paper.
+             * @description How a cell stores the light that enters it: as moments of its direction, or as lobes about the faces that it reaches; null = moments, lobes for paper.
              */
             readonly propagation?: ("moments" | "lobes") | null;
             /**
              * Quality
-             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @description Quality that a moving picture gives up for speed (docs/speed.md): `live` most, `balanced` some, `best` none.
              * @default best
              * @enum {string}
              */
             readonly quality: "live" | "balanced" | "best";
             /**
              * Query Scale
-             * @description The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.
+             * @description The volume is sampled at 1/scale of the picture's size; null = 2 on a GPU, 4 in software.
              */
             readonly query_scale?: (1 | 2 | 4) | null;
             /**
              * Reflections
-             * @description Objects in smooth real surfaces by rays, or not at all; null = rays, none for paper.
+             * @description Whether smooth real surfaces reflect objects, by rays; null = rays, none for paper.
              */
             readonly reflections?: ("rays" | "none") | null;
             /**
              * Rsm Size
-             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 on a GPU, 512 in software.
              */
             readonly rsm_size?: number | null;
             /**
              * Screen Space
-             * @description Smooth objects reflect what the picture shows, or the surroundings alone; null = the picture, the surroundings for paper.
+             * @description Smooth objects reflect the camera's picture where it shows the spot, or only the surroundings; null = the picture, the surroundings for paper.
              */
             readonly screen_space?: boolean | null;
             /**
              * Shadow
-             * @description Shadows of lights from shadow maps, or as negative light in the volume; null = map, lobe for paper.
+             * @description Shadows from shadow maps, or as negative light in the volume; null = map, lobe for paper.
              */
             readonly shadow?: ("map" | "lobe") | null;
             /**
              * Shadow Samples
-             * @description Samples of a light's area for soft shadows.
+             * @description Samples per area light, for soft shadows.
              * @default 16
              */
             readonly shadow_samples: number;
             /**
              * Steps
-             * @description Steps of propagation, a cell each; null = cells per edge. The result depends on their number.
+             * @description Propagation steps, one cell each; null = as many as cells along an edge. The result depends on their number.
              */
             readonly steps?: number | null;
             /**
              * Triangle Budget
-             * @description Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
+             * @description Maximum triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
              */
             readonly triangle_budget?: number | null;
             /**
              * Volume Edge M
-             * @description Edge of the volume, metres; null = twice the objects' longest edge.
+             * @description Edge length of the volume, metres; null = twice the longest edge of the objects.
              */
             readonly volume_edge_m?: number | null;
             /**
              * Volume Size
-             * @description Cells along each edge; more make it costlier, not better.
+             * @description Cells along each edge; more cells cost more without improving the picture.
              * @default 32
              */
             readonly volume_size: number;
@@ -2048,54 +2048,54 @@ export interface components {
         readonly DvctMethod: {
             /**
              * Bounces
-             * @description Gathers of light from voxel to voxel, after the light that the camera measured and the lights' own; 0 = direct and unoccluded ambient only (exact operator).
+             * @description Bounces of light from voxel to voxel, in addition to the light that the camera measured and the direct light; 0 = direct and unoccluded ambient light only (exact operator).
              * @default 1
              */
             readonly bounces: number;
             /**
              * Caustics
-             * @description Of the exact operator: what smooth objects reflect of the lights falls on other surfaces as beams; false = it is spread evenly, as if they were matt.
+             * @description Exact operator: smooth objects reflect the lights onto other surfaces as caustics; false = diffusely, as if they were matte.
              * @default true
              */
             readonly caustics: boolean;
             /**
              * Composition
-             * @description How the delta meets the picture; null = ratio for exact, additive for paper.
+             * @description How the change of light is applied to the picture; null = ratio for exact, additive for paper.
              */
             readonly composition?: ("ratio" | "additive") | null;
             /**
              * Cone Count
-             * @description Diffuse cones of the exact operator.
+             * @description Diffuse cones per pixel (exact operator).
              * @default 16
              */
             readonly cone_count: number;
             /**
              * Cone Scale
-             * @description Cones are traced at 1/scale of the picture; null = 2 on a GPU, 4 in software.
+             * @description Cones are traced at 1/scale of the picture's size; null = 2 on a GPU, 4 in software.
              */
             readonly cone_scale?: (1 | 2 | 4) | null;
             /**
              * Coverage
-             * @description Of the exact operator: what a cone meets adds up to a wall, or blocks front to back.
+             * @description Exact operator: how a cone accumulates coverage: summed, or multiplied front to back.
              * @default summed
              * @enum {string}
              */
             readonly coverage: "summed" | "multiplied";
             /**
              * Far Volume
-             * @description Of the exact operator: cones meet the real scene beyond the volume too.
+             * @description Exact operator: cones also see the real scene beyond the volume.
              * @default true
              */
             readonly far_volume: boolean;
             /**
              * Memory Budget Mb
-             * @description Greatest memory of the volumes, MB; beyond it rendering is refused.
+             * @description Memory limit of the volumes, MB; beyond it, rendering is refused.
              * @default 4096
              */
             readonly memory_budget_mb: number;
             /**
              * Mirrored Lights
-             * @description Of the exact operator: smooth declared planes throw the lights back at what stands before them.
+             * @description Exact operator: smooth declared planes reflect the lights onto what stands in front of them.
              * @default true
              */
             readonly mirrored_lights: boolean;
@@ -2114,55 +2114,55 @@ export interface components {
             readonly operator: "exact" | "paper";
             /**
              * Quality
-             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @description Quality that a moving picture gives up for speed (docs/speed.md): `live` most, `balanced` some, `best` none.
              * @default best
              * @enum {string}
              */
             readonly quality: "live" | "balanced" | "best";
             /**
              * Radiance
-             * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
+             * @description Exact operator: radiance of real surfaces, as the camera measures it or as the lights predict it.
              * @default measured
              * @enum {string}
              */
             readonly radiance: "measured" | "predicted";
             /**
              * Reflections
-             * @description Of the exact operator: objects in smooth real surfaces by rays, or by cones.
+             * @description Exact operator: smooth real surfaces reflect objects by rays or by cones.
              * @default rays
              * @enum {string}
              */
             readonly reflections: "rays" | "cones";
             /**
              * Rsm Size
-             * @description Texels along each edge of a shadow map; null = 1024 GPU, 512 software.
+             * @description Texels along each edge of a shadow map; null = 1024 on a GPU, 512 in software.
              */
             readonly rsm_size?: number | null;
             /**
              * Screen Space
-             * @description Of the exact operator: smooth objects reflect what the picture shows; false = voxels alone.
+             * @description Exact operator: smooth objects reflect the camera's picture where it shows the spot; false = voxels only.
              * @default true
              */
             readonly screen_space: boolean;
             /**
              * Shadow
-             * @description Shadows from shadow maps, or from shadow cones; null = map for exact, cone for paper.
+             * @description Shadows from shadow maps or from shadow cones; null = map for exact, cone for paper.
              */
             readonly shadow?: ("map" | "cone") | null;
             /**
              * Shadow Samples
-             * @description Samples of a light's area for soft shadows.
+             * @description Samples per area light, for soft shadows.
              * @default 16
              */
             readonly shadow_samples: number;
             /**
              * Triangle Budget
-             * @description Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
+             * @description Maximum triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.
              */
             readonly triangle_budget?: number | null;
             /**
              * Volume Edge M
-             * @description Edge of the volume, metres; null = twice the objects' longest edge.
+             * @description Edge length of the volume, metres; null = twice the longest edge of the objects.
              */
             readonly volume_edge_m?: number | null;
             /**
@@ -2172,7 +2172,7 @@ export interface components {
             readonly volume_size?: number | null;
             /**
              * Voxels
-             * @description Of the exact operator: six one-sided directions per voxel, or one for all (as in the paper).
+             * @description Exact operator: six directional values per voxel, or one isotropic value (as in the paper).
              * @default directional
              * @enum {string}
              */
@@ -2185,7 +2185,7 @@ export interface components {
         readonly EnvironmentLights: {
             /**
              * Intensity
-             * @description Factor on the map's radiance.
+             * @description Factor that multiplies the map's radiance.
              * @default 1
              */
             readonly intensity: number;
@@ -2217,12 +2217,12 @@ export interface components {
         };
         /**
          * FisheyeAnswer
-         * @description The fish-eye picture's size and the lights in it; a light that it does not show is left out.
+         * @description The size of the fish-eye picture and the lights visible in it.
          */
         readonly FisheyeAnswer: {
             /**
              * Clipped Share
-             * @description Of what it sees, what was too bright to be measured.
+             * @description Fraction of the visible area that was too bright to measure.
              */
             readonly clipped_share: number;
             /** Height */
@@ -2231,17 +2231,17 @@ export interface components {
             readonly lights: readonly components["schemas"]["FisheyeLight"][];
             /**
              * Node
-             * @description The node that sees it.
+             * @description Node of the fish-eye camera.
              */
             readonly node: string;
             /**
              * Seen Ns
-             * @description When it was taken, ns since 1970 by the node's clock.
+             * @description Capture time, ns since 1970 by the node's clock.
              */
             readonly seen_ns: number;
             /**
              * Width
-             * @description Of the picture, pixels.
+             * @description Size of the picture, pixels.
              */
             readonly width: number;
         };
@@ -2252,7 +2252,7 @@ export interface components {
         readonly FisheyeLight: {
             /**
              * Color Linear
-             * @description R G B, linear; the largest is 1.
+             * @description Linear RGB; the largest component is 1.
              */
             readonly color_linear: readonly [
                 number,
@@ -2261,12 +2261,12 @@ export interface components {
             ];
             /**
              * Id
-             * @description Of a light that is followed over time; else null.
+             * @description Id of a light that is tracked over time; else null.
              */
             readonly id: number | null;
             /**
              * Irradiance
-             * @description On a surface that faces it, camera units.
+             * @description Irradiance on a surface facing it, camera units.
              */
             readonly irradiance: readonly [
                 number,
@@ -2275,7 +2275,7 @@ export interface components {
             ];
             /**
              * Radius Px
-             * @description Greatest distance of its outline from its middle.
+             * @description Greatest distance of its outline from its centre, pixels.
              */
             readonly radius_px: number;
             /**
@@ -2286,7 +2286,7 @@ export interface components {
             readonly type: string;
             /**
              * X
-             * @description Of its middle, pixels of the picture.
+             * @description Position of its centre, in pixels of the picture.
              */
             readonly x: number;
             /** Y */
@@ -2305,26 +2305,26 @@ export interface components {
             readonly count: number;
             /**
              * Distance M
-             * @description Distance of the lights from the fish-eye camera, metres; `far` = as the sun; `auto` = from how light falls off over the board's paper, far where none is seen.
+             * @description Distance of the lights from the fish-eye camera, metres; `far` = distant like the sun; `auto` = from the falloff of light over the board's paper, or far if no paper is visible.
              * @default auto
              */
             readonly distance_m: ("auto" | "far") | number;
             /**
              * Smoothing S
-             * @description Time constant with which lights follow what the fish-eye camera sees, seconds; 0 = at once.
+             * @description Time constant with which lights follow the fish-eye picture, seconds; 0 = at once.
              * @default 0.5
              */
             readonly smoothing_s: number;
             /**
              * Split
-             * @description Cut only what outshines its surroundings, or (as in the papers) the whole map.
+             * @description Extract only lights that outshine their surroundings, or (as in the papers) split the whole map into lights.
              * @default peaks
              * @enum {string}
              */
             readonly split: "peaks" | "all";
             /**
              * Threshold
-             * @description Luminance above which light is cut out, as a multiple of the map's mean (split peaks).
+             * @description Luminance above which a light is extracted, as a multiple of the map's mean (split peaks).
              * @default 4
              */
             readonly threshold: number;
@@ -2341,7 +2341,7 @@ export interface components {
             readonly render_server: "answers" | "silent";
             /**
              * Status
-             * @description `degraded` = the render server does not answer.
+             * @description `degraded` = the render server does not respond.
              * @enum {string}
              */
             readonly status: "ok" | "degraded";
@@ -2356,19 +2356,19 @@ export interface components {
         readonly HostAnswer: {
             /**
              * Drained
-             * @description Whether no room starts on it.
+             * @description Whether it is drained: no room starts there.
              */
             readonly drained: boolean;
             /** Name */
             readonly name: string;
             /**
              * Rooms
-             * @description Which rooms it renders.
+             * @description Rooms that it renders.
              */
             readonly rooms: readonly string[];
             /**
              * Slots
-             * @description How many rooms it can render at once; 0 = it is away.
+             * @description Number of rooms that it can render at once; 0 = it is not connected.
              */
             readonly slots: number;
         };
@@ -2393,7 +2393,7 @@ export interface components {
             readonly mode: "fisheye" | "tracked" | "manual" | "environment";
             /**
              * Registration
-             * @description Factor R G B on all lights, or `auto` = from the picture; null = auto for fisheye and environment, 1 1 1 for manual and tracked.
+             * @description RGB factor on all lights, or `auto` = estimated from the picture; null = auto for fisheye and environment, 1 1 1 for manual and tracked.
              */
             readonly registration?: ("auto" | readonly [
                 number,
@@ -2402,7 +2402,7 @@ export interface components {
             ]) | null;
             /**
              * Surroundings
-             * @description Modes manual and tracked: light of what neither the camera nor the lights show. Walls, table and floor go on beyond the picture; elsewhere it is the mean of the ground below the horizon and above it more towards what is seen there, as strong as the board's paper tells where board.yaml gives its white_albedo. Or none.
+             * @description Modes manual and tracked: light from surroundings that are neither in the picture nor set as lights. `auto` continues walls, table and floor beyond the picture and fills the rest with the mean of the visible ground and, above the horizon, of what is visible there; its strength comes from the board's paper if board.yaml gives white_albedo. `none` = no such light.
              * @default auto
              * @enum {string}
              */
@@ -2430,7 +2430,7 @@ export interface components {
             readonly height: number;
             /**
              * Matrix
-             * @description Intrinsics, row by row.
+             * @description Intrinsic matrix, row by row.
              */
             readonly matrix: readonly number[];
             /** Width */
@@ -2443,25 +2443,25 @@ export interface components {
         readonly LiveHeader: {
             /**
              * Age Ms
-             * @description Time since the picture's capture.
+             * @description Time since the frame was captured.
              */
             readonly age_ms: number;
-            /** @description What projects points of the camera's space onto this picture. */
+            /** @description Matrix that projects points in camera space onto this picture. */
             readonly camera: components["schemas"]["LiveCamera"];
             /**
              * Capture Ns
-             * @description When it was captured, ns since 1970 by the node's clock.
+             * @description Capture time, ns since 1970 by the node's clock.
              */
             readonly capture_ns: number;
             /**
              * Codec
-             * @description What the picture is coded as: `jpeg`, or H.264 by its name in RFC 6381, such as `avc1.64001e`.
+             * @description Codec of the picture: `jpeg`, or H.264 as in RFC 6381, such as `avc1.64001e`.
              * @default jpeg
              */
             readonly codec: string;
             /**
              * Drops
-             * @description What was lost before, by cause.
+             * @description Frames lost so far, by cause.
              */
             readonly drops: {
                 readonly [key: string]: number;
@@ -2473,86 +2473,86 @@ export interface components {
             readonly frame_id: number;
             /**
              * Frames Per S
-             * @description Rate at which pictures come; null before the second.
+             * @description Rate of pictures; null before the second one.
              */
             readonly frames_per_s: number | null;
             /**
              * Keyframe
-             * @description Whether it is decoded without those before it. The header of one that is not leaves out what is as in the message before.
+             * @description Whether it decodes without the pictures before it (a keyframe). The header of any other picture omits what has not changed since the previous message.
              * @default true
              */
             readonly keyframe: boolean;
             /**
              * Lights
-             * @description What it was lit with.
+             * @description Lights used for the picture.
              */
             readonly lights: readonly {
                 readonly [key: string]: unknown;
             }[];
             /**
              * Node
-             * @description The node whose camera it is of, where the room has several; else null.
+             * @description Node of the camera, if the room has several; else null.
              * @default null
              */
             readonly node: string | null;
             /**
              * Number
-             * @description Counts the pictures that came.
+             * @description Number of pictures so far.
              */
             readonly number: number;
             /**
              * Pass Times Ms
-             * @description Where its time went.
+             * @description Time of each pass.
              */
             readonly pass_times_ms: {
                 readonly [key: string]: number;
             };
             /**
              * Quality
-             * @description The quality that it was rendered in; null: nothing was rendered.
+             * @description Quality at which it was rendered; null = nothing was rendered.
              */
             readonly quality: ("live" | "balanced" | "best") | null;
             /**
              * Render Ms
-             * @description From the frame's arrival at the renderer to its picture, waiting included.
+             * @description Time from the frame's arrival at the renderer to its picture, including waiting.
              */
             readonly render_ms: number;
             /** Renderer */
             readonly renderer: string;
             /**
              * Reused Pass Times Ms
-             * @description Passes whose results it uses again, with the times of their last run.
+             * @description Passes whose results were reused, with the times of their last run.
              */
             readonly reused_pass_times_ms: {
                 readonly [key: string]: number;
             };
             /**
              * Scale
-             * @description Fraction of its width and height that was rendered, and then enlarged.
+             * @description Fraction of the width and height that was rendered, then upscaled.
              */
             readonly scale: number;
-            /** @description null where another program set the server's scene. */
+            /** @description null if another program set the server's scene. */
             readonly scene: components["schemas"]["ShownScene"] | null;
             /**
              * Skipped
-             * @description Pictures that this viewer was too slow for.
+             * @description Pictures skipped because this viewer was too slow.
              */
             readonly skipped: number;
             /**
              * Status
-             * @description `no_pose`: the camera's picture as it is.
+             * @description `no_pose` = the camera's picture, unchanged.
              * @enum {string}
              */
             readonly status: "ok" | "no_pose";
             /**
              * View
-             * @description What it shows: the view that was asked for, or until there is a picture of it the scene's own.
+             * @description View in the picture: the requested one, or the scene's own until the first picture of that view.
              * @enum {string}
              */
             readonly view: "composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera";
             /**
              * World From Camera
-             * @description null without a pose.
+             * @description null if there is no pose.
              */
             readonly world_from_camera: readonly [
                 readonly [
@@ -2588,7 +2588,7 @@ export interface components {
         readonly Material: {
             /**
              * Attenuation Color
-             * @description Colour that white light has after `attenuation_distance_m` inside, linear R G B, 0..1.
+             * @description Colour of white light after `attenuation_distance_m` inside the object, linear RGB, 0..1.
              * @default [
              *       1,
              *       1,
@@ -2602,12 +2602,12 @@ export interface components {
             ];
             /**
              * Attenuation Distance M
-             * @description Path inside after which light has `attenuation_color`, metres. null = clear.
+             * @description Path length inside the object after which white light has `attenuation_color`, metres; null = clear.
              */
             readonly attenuation_distance_m?: number | null;
             /**
              * Base Color
-             * @description Linear R G B reflectance, 0..1.
+             * @description Linear RGB reflectance, 0..1.
              * @default [
              *       0.8,
              *       0.8,
@@ -2621,7 +2621,7 @@ export interface components {
             ];
             /**
              * Emission
-             * @description Emitted radiance, linear R G B, camera units.
+             * @description Emitted radiance, linear RGB, camera units.
              * @default [
              *       0,
              *       0,
@@ -2658,13 +2658,13 @@ export interface components {
             readonly specular: number;
             /**
              * Thin Walled
-             * @description true = a sheet without thickness, which bends no light; false = a solid body.
+             * @description true = a sheet without thickness, which does not refract; false = a solid body.
              * @default false
              */
             readonly thin_walled: boolean;
             /**
              * Transmission
-             * @description Share of the light that enters the surface and passes through it, 0..1; the rest is diffuse. Each surface that light passes multiplies it by base_color. Refraction is by ior, or as specular has it.
+             * @description Fraction of the light entering the surface that is transmitted, 0..1; the rest is diffuse. Each surface that light passes through multiplies it by base_color. Refraction follows ior, or else specular.
              * @default 0
              */
             readonly transmission: number;
@@ -2699,7 +2699,7 @@ export interface components {
         };
         /**
          * MoveOrder
-         * @description Where to move a room.
+         * @description Slot to move a room to.
          */
         readonly MoveOrder: {
             /**
@@ -2715,23 +2715,23 @@ export interface components {
         readonly NewRecording: {
             /**
              * Composites
-             * @description Keep the relit pictures too, beside the frames, for `video.mp4`.
+             * @description Also keep the relit pictures, for `video.mp4`.
              * @default false
              */
             readonly composites: boolean;
             /**
              * Duration S
-             * @description Ends so long after the first frame; null = by stop.
+             * @description Duration from the first frame; null = until stopped.
              */
             readonly duration_s?: number | null;
             /**
              * Name
-             * @description Letters, digits, dashes, underscores; null = the time.
+             * @description Letters, digits, dashes and underscores; null = the current time.
              */
             readonly name?: string | null;
             /**
              * Node
-             * @description Which node; null = the one whose picture comes first.
+             * @description Node to record; null = the first one to send a picture.
              */
             readonly node?: string | null;
         };
@@ -2742,7 +2742,7 @@ export interface components {
         readonly NewReplay: {
             /**
              * Loop
-             * @description Begin again at the end; else it stays there, paused.
+             * @description Start again at the end; false = stay there, paused.
              * @default true
              */
             readonly loop: boolean;
@@ -2753,13 +2753,13 @@ export interface components {
             readonly playing: boolean;
             /**
              * Position S
-             * @description From the recording's first frame.
+             * @description Position from the recording's first frame.
              * @default 0
              */
             readonly position_s: number;
             /**
              * Rate
-             * @description Recorded seconds a second.
+             * @description Playback speed: recorded seconds per second.
              * @default 1
              */
             readonly rate: number;
@@ -2777,7 +2777,7 @@ export interface components {
         readonly NewSnapshot: {
             /**
              * Camera
-             * @description Whose frame, by its node's name; null = the first camera's.
+             * @description Name of the camera's node; null = the first camera.
              */
             readonly camera?: string | null;
             /**
@@ -2788,7 +2788,7 @@ export interface components {
             readonly exr: boolean;
             /**
              * Pictures
-             * @description All of one and the same frame.
+             * @description Pictures to take, all of the same frame.
              * @default [
              *       {
              *         "name": "camera",
@@ -2833,22 +2833,22 @@ export interface components {
         readonly NodeAnswer: {
             /**
              * Age S
-             * @description Seconds since it said so.
+             * @description Seconds since it reported this.
              */
             readonly age_s: number;
             /**
              * Clock Bound Ms
-             * @description Greatest error of its clock against the server's; null = not compared.
+             * @description Upper bound of its clock error against the server's; null = not compared.
              */
             readonly clock_bound_ms: number | null;
             /**
              * Clock Offset Ms
-             * @description What is added to its times to have the render server's.
+             * @description Offset from its clock to the render server's.
              */
             readonly clock_offset_ms: number;
             /**
              * Delays Ms
-             * @description `report`: its newest report's way here. Of a render server also, of the newest picture: `capture_to_server`, `rendering` (waiting included), `server_to_api`.
+             * @description `report`: delay of its newest report. For a render server also the delays of the newest picture: `capture_to_server`, `rendering` (including waiting), `server_to_api`.
              */
             readonly delays_ms: {
                 readonly [key: string]: number;
@@ -2857,7 +2857,7 @@ export interface components {
             readonly detail: string;
             /**
              * Drops
-             * @description What was lost since its start, by cause.
+             * @description Losses since its start, by cause.
              */
             readonly drops: {
                 readonly [key: string]: number;
@@ -2895,7 +2895,7 @@ export interface components {
             readonly name: "none";
             /**
              * Quality
-             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @description Quality that a moving picture gives up for speed (docs/speed.md): `live` most, `balanced` some, `best` none.
              * @default best
              * @enum {string}
              */
@@ -2908,25 +2908,25 @@ export interface components {
         readonly Output: {
             /**
              * Antialiasing
-             * @description Smooth the edges of virtual objects.
+             * @description Antialias the edges of virtual objects.
              * @default false
              */
             readonly antialiasing: boolean;
             /**
              * Bloom
-             * @description Share of the light of what changes that the lens scatters around it; 0 = none.
+             * @description Bloom: fraction of the changed light that the lens scatters around it; 0 = none.
              * @default 0
              */
             readonly bloom: number;
             /**
              * Camera Artifacts
-             * @description Put the camera's noise, sharpness, vignetting, JPEG compression and motion blur on the virtual part, as its frames show them.
+             * @description Add the camera's noise, blur, vignetting, JPEG artefacts and motion blur, measured from its frames, to the virtual part of the picture.
              * @default false
              */
             readonly camera_artifacts: boolean;
             /**
              * Frame Budget Ms
-             * @description What a frame may take while something moves, ms: quality, then the size at which it is rendered give way (docs/speed.md); null = no limit.
+             * @description Time limit for a frame while something moves, ms: first the quality is lowered, then the rendered size (docs/speed.md); null = no limit.
              */
             readonly frame_budget_ms?: number | null;
             /**
@@ -2936,20 +2936,20 @@ export interface components {
             readonly height?: number | null;
             /**
              * Matting Px
-             * @description Pixels from real things in front of objects within which hair and fingers that depth does not show are found by colour; 0 = edges alone.
+             * @description Width, in pixels, of the band along real objects in front of virtual ones in which colour recovers hair and fingers that depth misses; 0 = only edges are refined.
              * @default 0
              */
             readonly matting_px: number;
             /**
              * Tone
-             * @description The camera's own response, or ACES.
+             * @description The camera's own response, or the ACES tone curve.
              * @default camera
              * @enum {string}
              */
             readonly tone: "camera" | "aces";
             /**
              * View
-             * @description The picture, or a look inside.
+             * @description What the picture shows: the finished picture, or an inside view.
              * @default composite
              * @enum {string}
              */
@@ -2967,12 +2967,12 @@ export interface components {
         readonly Pick: {
             /**
              * Distance M
-             * @description From the camera; null for nothing.
+             * @description Distance from the camera; null if there is no surface.
              */
             readonly distance_m: number | null;
             /**
              * Frame Id
-             * @description The frame that was looked at.
+             * @description The frame that was examined.
              */
             readonly frame_id: number;
             /**
@@ -2982,7 +2982,7 @@ export interface components {
             readonly kind: "real" | "object" | "nothing";
             /**
              * Normal
-             * @description Its unit normal; null where unknown.
+             * @description Its unit normal; null if unknown.
              */
             readonly normal: readonly [
                 number,
@@ -2996,7 +2996,7 @@ export interface components {
             readonly object: string | null;
             /**
              * Point M
-             * @description Where the surface is; null for nothing.
+             * @description Point on the surface; null if there is none.
              */
             readonly point_m: readonly [
                 number,
@@ -3016,12 +3016,12 @@ export interface components {
             readonly detail: string;
             /**
              * Revision
-             * @description The revision that this is said of.
+             * @description The revision that this describes.
              */
             readonly revision: number;
             /**
              * State
-             * @description `shown` = from the next frame on; `pending` = the render server has not taken it yet, and the event `picture` tells when it has; `refused` = it cannot render this and shows what it had; `superseded` = a newer change was made before the server had taken this one, and is shown in its place.
+             * @description `shown` = from the next frame on; `pending` = the render server has not accepted it yet, and the event `picture` reports when it has; `refused` = it cannot render this and keeps showing the previous revision; `superseded` = a newer change was made before the server accepted this one, and is shown in its place.
              * @enum {string}
              */
             readonly state: "shown" | "pending" | "refused" | "superseded";
@@ -3033,22 +3033,22 @@ export interface components {
         readonly Pixel: {
             /**
              * Camera
-             * @description Whose picture, by its node's name; null = the first camera's.
+             * @description Name of the camera's node; null = the first camera.
              */
             readonly camera?: string | null;
             /**
              * Ignore
-             * @description Id of an object to look through, at the real scene behind it: one that is being dragged.
+             * @description Id of an object to ignore, such as the one being dragged, to pick the real scene behind it.
              */
             readonly ignore?: string | null;
             /**
              * X
-             * @description To the right; the first pixel's centre is 0.
+             * @description Pixels to the right; the centre of the first pixel is 0.
              */
             readonly x: number;
             /**
              * Y
-             * @description Down; the first pixel's centre is 0.
+             * @description Pixels down; the centre of the first pixel is 0.
              */
             readonly y: number;
         };
@@ -3059,7 +3059,7 @@ export interface components {
         readonly PlaneRegion: {
             /**
              * Normal
-             * @description The plane's normal, world; it is normalised.
+             * @description Normal of the plane, world axes; normalised on loading.
              * @default [
              *       0,
              *       0,
@@ -3073,7 +3073,7 @@ export interface components {
             ];
             /**
              * Point M
-             * @description A point of the plane, world, metres.
+             * @description A point on the plane, world, metres.
              * @default [
              *       0,
              *       0,
@@ -3087,7 +3087,7 @@ export interface components {
             ];
             /**
              * Tolerance M
-             * @description Greatest distance from the plane, metres.
+             * @description Maximum distance from the plane, metres.
              * @default 0.01
              */
             readonly tolerance_m: number;
@@ -3099,7 +3099,7 @@ export interface components {
         readonly Pose: {
             /**
              * Rotation Wxyz
-             * @description Rotation as a quaternion w, x, y, z; it is normalised.
+             * @description Rotation as a quaternion w, x, y, z; normalised on loading.
              * @default [
              *       1,
              *       0,
@@ -3152,13 +3152,13 @@ export interface components {
         readonly Problem: {
             /**
              * Detail
-             * @description One sentence for people.
+             * @description One sentence for the user.
              * @example the scene is at revision 7 and the change was made to 5; get it and change it again.
              */
             readonly detail: string;
             /**
              * Revision
-             * @description With stale-revision: the newest revision.
+             * @description The newest revision; only with `stale-revision`.
              */
             readonly revision?: number | null;
             /**
@@ -3175,7 +3175,7 @@ export interface components {
             readonly title: string;
             /**
              * Type
-             * @description Kind of the problem, for programs.
+             * @description Kind of problem, for programs.
              * @example urn:deltalight:problem:stale-revision
              */
             readonly type: string;
@@ -3187,19 +3187,19 @@ export interface components {
         readonly ProcessAnswer: {
             /**
              * Age S
-             * @description Seconds since it said so.
+             * @description Seconds since it reported this.
              */
             readonly age_s: number;
             /**
              * Clock Bound Ms
-             * @description Greatest error of its clock against the server's; null = not compared.
+             * @description Upper bound of its clock error against the server's; null = not compared.
              */
             readonly clock_bound_ms: number | null;
             /** Detail */
             readonly detail: string;
             /**
              * Drops
-             * @description What was lost since its start, by cause.
+             * @description Losses since its start, by cause.
              */
             readonly drops: {
                 readonly [key: string]: number;
@@ -3226,46 +3226,46 @@ export interface components {
         readonly RealScene: {
             /**
              * Geometry
-             * @description `depth` (of each frame), `fused`, or a given model.
+             * @description `depth` (each frame's own), `fused` (over all frames), or a given model.
              * @default depth
              */
             readonly geometry: ("depth" | "fused") | components["schemas"]["ModelGeometry"];
             /**
              * Surfaces
-             * @description First match wins; the rest is diffuse.
+             * @description The first match wins; all other surfaces are diffuse.
              * @default []
              */
             readonly surfaces: readonly components["schemas"]["Surface"][];
             /**
              * Unseen Albedo
-             * @description Albedo of surfaces of a model or of fused depth that the camera does not see now; null = as it saw them before, else as their surroundings. A number makes each picture independent of earlier ones.
+             * @description Albedo of surfaces, of a model or of fused depth, that the camera does not currently see; null = as last seen, or else that of their surroundings. A number makes each picture independent of earlier ones.
              */
             readonly unseen_albedo?: number | null;
         };
         /**
          * RecordingAnswer
-         * @description A recording, finished or growing.
+         * @description A recording, finished or in progress.
          */
         readonly RecordingAnswer: {
             /**
              * Changed
              * Format: date-time
-             * @description When it was finished; while it grows: when it was begun.
+             * @description When it was finished; while recording, when it was started.
              */
             readonly changed: string;
             /**
              * Checklist
-             * @description What relighting needs; empty while it grows.
+             * @description Requirements for relighting; empty while recording.
              */
             readonly checklist: readonly components["schemas"]["Check"][];
             /**
              * Composites
-             * @description Relit pictures that were recorded along.
+             * @description Number of relit pictures in it.
              */
             readonly composites: number;
             /**
              * Detail
-             * @description What keeps it from growing, or from being read; else empty.
+             * @description Why it cannot grow or be read; else empty.
              */
             readonly detail: string;
             /** Duration S */
@@ -3276,32 +3276,32 @@ export interface components {
             readonly frames_per_s: number | null;
             /**
              * Id
-             * @description Its name, also in addresses.
+             * @description Its name, also in URLs.
              * @example take-20261121-101500
              */
             readonly id: string;
             /**
              * Lost
-             * @description What never came, by stream; known while it grows.
+             * @description Missing messages, by stream; known while recording.
              */
             readonly lost: {
                 readonly [key: string]: number;
             };
             /**
              * Notes
-             * @description What else is to be known of it.
+             * @description Further notes.
              */
             readonly notes: readonly string[];
             /**
              * Scene
-             * @description Title of the attached scene, empty for one without; null = none.
+             * @description Title of the attached scene, empty if untitled; null = no scene.
              */
             readonly scene: string | null;
             /** Size Bytes */
             readonly size_bytes: number;
             /**
              * State
-             * @description `waiting` = no frame has come yet; `interrupted` = its recorder was killed: recover it.
+             * @description `waiting` = no frame has arrived yet; `interrupted` = its recorder was killed: recover it.
              * @enum {string}
              */
             readonly state: "waiting" | "recording" | "finished" | "interrupted";
@@ -3317,7 +3317,7 @@ export interface components {
         readonly RectangleLight: {
             /**
              * Axis U M
-             * @description First edge, whole length, world, metres.
+             * @description First edge at full length, world axes, metres.
              * @default [
              *       0.5,
              *       0,
@@ -3331,7 +3331,7 @@ export interface components {
             ];
             /**
              * Axis V M
-             * @description Second edge, whole length, world, metres.
+             * @description Second edge at full length, world axes, metres.
              * @default [
              *       0,
              *       -0.5,
@@ -3345,7 +3345,7 @@ export interface components {
             ];
             /**
              * Color Linear
-             * @description Linear R G B that multiplies the strength.
+             * @description Linear RGB colour that multiplies the strength.
              * @default [
              *       1,
              *       1,
@@ -3373,7 +3373,7 @@ export interface components {
             ];
             /**
              * Radiance
-             * @description Radiance of the shining side, camera units.
+             * @description Radiance of the emitting side, camera units.
              * @default 1
              */
             readonly radiance: number;
@@ -3401,7 +3401,7 @@ export interface components {
         };
         /**
          * ReplayAnswer
-         * @description Where the recording is that is shown; all null = a live camera is shown.
+         * @description Position of the recording on display; all null = a live camera is shown.
          */
         readonly ReplayAnswer: {
             /** Duration S */
@@ -3416,13 +3416,13 @@ export interface components {
             readonly rate?: number | null;
             /**
              * Recording
-             * @description Null = what the node sends is shown, be it a recording too.
+             * @description null = the node's own frames are shown (which may come from a recording).
              */
             readonly recording: string | null;
         };
         /**
          * ReplayChange
-         * @description What is to be otherwise; the rest stays.
+         * @description What to change; everything else stays as it is.
          */
         readonly ReplayChange: {
             /** Playing */
@@ -3433,7 +3433,7 @@ export interface components {
             readonly rate?: number | null;
             /**
              * Step Frames
-             * @description Frames on, or back: `1` is the next one.
+             * @description Frames to step forward, or back if negative.
              */
             readonly step_frames?: number | null;
         };
@@ -3449,12 +3449,12 @@ export interface components {
             readonly at: string;
             /**
              * Gesture
-             * @description Changes in a row with the same one are undone together.
+             * @description Consecutive changes with the same id are undone together.
              */
             readonly gesture: string | null;
             /**
              * Name
-             * @description Title of the scene then.
+             * @description Title of the scene at that revision.
              */
             readonly name: string;
             /** Revision */
@@ -3468,12 +3468,12 @@ export interface components {
         };
         /**
          * RoomAnswer
-         * @description A room: whose frames it shows, with which scene, and how it is doing.
+         * @description A room: its nodes, its scene and its state.
          */
         readonly RoomAnswer: {
             /**
              * Epoch
-             * @description Grows with each start of its render server.
+             * @description Increases with each start of its render server.
              */
             readonly epoch: number | null;
             /**
@@ -3483,17 +3483,17 @@ export interface components {
             readonly frames_per_s: number | null;
             /**
              * Last Frame S
-             * @description Seconds since its newest picture came.
+             * @description Seconds since its newest picture arrived.
              */
             readonly last_frame_s: number | null;
             /**
              * Moving To
-             * @description The slot in which its next render server starts.
+             * @description Slot in which its next render server will start.
              */
             readonly moving_to: string | null;
             /**
              * Name
-             * @description In addresses: `/rooms/NAME/...` is every route, for this room.
+             * @description Name in URLs: every route also exists as `/rooms/NAME/...` for this room.
              */
             readonly name: string;
             /**
@@ -3503,18 +3503,18 @@ export interface components {
             readonly nodes: readonly string[];
             /**
              * Restarts
-             * @description How often its render server was lost and placed again.
+             * @description How often its render server was lost and replaced.
              */
             readonly restarts: number;
             readonly scene: components["schemas"]["RoomScene"] | null;
             /**
              * Slot
-             * @description Where its render server runs; null = nowhere, or a single room.
+             * @description Slot in which its render server runs; null = none, or a single room.
              */
             readonly slot: string | null;
             /**
              * State
-             * @description `waiting` for a slot, or drained; `starting`; `running`; `failed` until it is started again.
+             * @description `waiting` (for a slot, or drained), `starting`, `running`, or `failed` until it is restarted.
              * @enum {string}
              */
             readonly state: "waiting" | "starting" | "running" | "failed";
@@ -3525,7 +3525,7 @@ export interface components {
             readonly title: string;
             /**
              * Why
-             * @description Why it waits, failed, or shows nothing; else empty.
+             * @description Why the room is waiting, failed, or shows nothing; else empty.
              */
             readonly why: string;
         };
@@ -3538,7 +3538,7 @@ export interface components {
             readonly id: string;
             /**
              * Method
-             * @description How the real scene is relit.
+             * @description The relighting method.
              */
             readonly method: string;
             /** Name */
@@ -3553,7 +3553,7 @@ export interface components {
         readonly RoomsAnswer: {
             /**
              * Can Move
-             * @description Whether rooms can be drained, started and moved here.
+             * @description Whether this installation can drain, start and move rooms.
              */
             readonly can_move: boolean;
             /** Rooms */
@@ -3571,7 +3571,7 @@ export interface components {
         readonly SceneAnswer: {
             /**
              * Active
-             * @description Whether it is the scene that is rendered.
+             * @description Whether this scene is being rendered.
              */
             readonly active: boolean;
             /** Can Redo */
@@ -3604,7 +3604,7 @@ export interface components {
             readonly revision: number;
             /**
              * What
-             * @description The change that made this revision.
+             * @description The change that created this revision.
              */
             readonly what: string;
         };
@@ -3625,7 +3625,7 @@ export interface components {
             readonly method?: components["schemas"]["DvctMethod"] | components["schemas"]["DlpvMethod"] | components["schemas"]["AroofMethod"] | components["schemas"]["DifferentialMethod"] | components["schemas"]["NoneMethod"];
             /**
              * Name
-             * @description Title for people.
+             * @description Title to display.
              * @default
              */
             readonly name: string;
@@ -3639,7 +3639,7 @@ export interface components {
             readonly real?: components["schemas"]["RealScene"];
             /**
              * Revision
-             * @description Counts up with every change.
+             * @description Increases with every change.
              * @default 0
              */
             readonly revision: number;
@@ -3650,7 +3650,7 @@ export interface components {
          * @description A virtual object.
          */
         readonly SceneObject: {
-            /** @description How a glTF asset's clip is played; null = as `rigid` says. */
+            /** @description How to play a glTF asset's clip; null = as `rigid` says. */
             readonly animation?: components["schemas"]["Animation"] | null;
             /**
              * Asset
@@ -3678,7 +3678,7 @@ export interface components {
             readonly pose?: components["schemas"]["Pose"];
             /**
              * Rigid
-             * @description true = the asset as it rests (its transfer may be precomputed), unless `animation` is given; false = it plays its first clip, if it has one.
+             * @description true = the asset in its rest pose (its transfer may be precomputed), unless `animation` is given; false = it plays its first clip, if it has one.
              * @default true
              */
             readonly rigid: boolean;
@@ -3689,7 +3689,7 @@ export interface components {
             readonly up_axis?: ("y" | "z") | null;
             /**
              * Visible
-             * @description Whether the object takes part at all.
+             * @description Whether the object is rendered and affects the light.
              * @default true
              */
             readonly visible: boolean;
@@ -3701,7 +3701,7 @@ export interface components {
         readonly SceneSummary: {
             /**
              * Active
-             * @description Whether it is the scene that is rendered.
+             * @description Whether this scene is being rendered.
              */
             readonly active: boolean;
             /**
@@ -3722,7 +3722,7 @@ export interface components {
             readonly id: string;
             /**
              * Name
-             * @description Title for people.
+             * @description Title to display.
              */
             readonly name: string;
             /**
@@ -3733,34 +3733,34 @@ export interface components {
         };
         /**
          * Settings
-         * @description What a client needs to know of the service's settings.
+         * @description Settings of the service that a client needs to know.
          */
         readonly Settings: {
             /**
              * Has Poster
-             * @description Whether `/poster.jpg` stands for the live picture until it comes.
+             * @description Whether `/poster.jpg` is available as a placeholder until the first live picture.
              */
             readonly has_poster: boolean;
             /**
              * Has Poster Before
-             * @description Whether `/poster-before.jpg` is the camera's picture of it.
+             * @description Whether `/poster-before.jpg` has the camera's picture of the same frame.
              */
             readonly has_poster_before: boolean;
             /**
              * Live Codecs
-             * @description What `WS /live` sends pictures as, for the asking.
+             * @description Codecs that `WS /live` offers.
              */
             readonly live_codecs: readonly ("jpeg" | "h264")[];
             /** Needs Token */
             readonly needs_token: boolean;
             /**
              * No H264
-             * @description Why `h264` is not among them; null where it is.
+             * @description Why `h264` is not offered; null if it is.
              */
             readonly no_h264: string | null;
             /**
              * No Whep
-             * @description Why `POST /whep` gives no pictures; null where it does.
+             * @description Why `POST /whep` is not available; null if it is.
              */
             readonly no_whep: string | null;
             /** Requests Per S */
@@ -3777,61 +3777,61 @@ export interface components {
         readonly Shading: {
             /**
              * Bounces
-             * @description Of precomputed: times that light goes on from an object to itself.
+             * @description precomputed: bounces of light between parts of the same object.
              * @default 2
              */
             readonly bounces: number;
             /**
              * Coefficients
-             * @description Of precomputed: spherical harmonics of the light that objects keep off themselves.
+             * @description precomputed: coefficients of spherical harmonics for self-occlusion.
              * @default 9
              * @enum {integer}
              */
             readonly coefficients: 9 | 16;
             /**
              * Name
-             * @description As the method does (auto, volume), or by a map of all light around the objects alone (image_based, docs/method.md 6.6), where rigid objects may have their own shadows and bounced light precomputed (precomputed, docs/method.md 6.5).
+             * @description By the method's own light transport (auto, volume), or only from a map of all the light around the objects (image_based, docs/method.md 6.6), optionally with precomputed self-shadowing and interreflection for rigid objects (precomputed, docs/method.md 6.5).
              * @default auto
              * @enum {string}
              */
             readonly name: "auto" | "volume" | "image_based" | "precomputed";
             /**
              * Occlusion Radius M
-             * @description Of image_based: objects keep light off themselves within this distance, metres, and less up to twice of it; 0 = not at all, null = the longest edge of the largest object.
+             * @description image_based: distance within which objects occlude themselves, metres; the effect fades out up to twice that distance. 0 = no self-occlusion, null = the longest edge of the largest object.
              */
             readonly occlusion_radius_m?: number | null;
             /**
              * Rays
-             * @description Of precomputed: rays over the sphere around each vertex; more = less noise, longer, once.
+             * @description precomputed: rays over the sphere around each vertex; more give less noise and a longer precomputation.
              * @default 1024
              */
             readonly rays: number;
             /**
              * Samples
-             * @description Of image_based and precomputed: samples per pixel of what a surface mirrors.
+             * @description image_based and precomputed: specular samples per pixel.
              * @default 40
              */
             readonly samples: number;
         };
         /**
          * ShelfAnswer
-         * @description An object of the shelf.
+         * @description A ready-made object.
          */
         readonly ShelfAnswer: {
             /**
              * Clip
-             * @description Clip that it should play; null where nothing moves.
+             * @description Clip to play; null if it has none.
              */
             readonly clip: string | null;
             /**
              * File Name
-             * @description Name of the asset that it becomes.
+             * @description Name of the resulting asset.
              * @example Chrome ball.glb
              */
             readonly file_name: string;
             /**
              * Label
-             * @description Its name for people.
+             * @description Name to display.
              * @example Chrome ball
              */
             readonly label: string;
@@ -3858,25 +3858,25 @@ export interface components {
         readonly SlotStatus: {
             /**
              * Device
-             * @description On which it renders.
+             * @description Device on which it renders.
              */
             readonly device: string;
             /**
              * Drained
-             * @description Whether its host is drained, so that no room starts in it.
+             * @description Whether its host is drained, so that no room starts there.
              * @default false
              */
             readonly drained: boolean;
             /**
              * Host
-             * @description Whose device it is.
+             * @description Host of the device.
              */
             readonly host: string;
             /** Name */
             readonly name: string;
             /**
              * Room
-             * @description Which room is in it; null = free.
+             * @description Room in this slot; null = free.
              */
             readonly room: string | null;
         };
@@ -3896,7 +3896,7 @@ export interface components {
             readonly frame_id: number;
             /**
              * Id
-             * @description Its name in addresses.
+             * @description Its name in URLs.
              * @example 20261121-101500-3fa2c1
              */
             readonly id: string;
@@ -3904,12 +3904,12 @@ export interface components {
             readonly pictures: readonly components["schemas"]["SnapshotPicture"][];
             /**
              * Recording
-             * @description The recording that was shown; null = live.
+             * @description The recording on display; null = live.
              */
             readonly recording: string | null;
             /**
              * Scene Id
-             * @description The scene that was active; null = none was.
+             * @description The active scene; null = none.
              */
             readonly scene_id: string | null;
             /** Scene Revision */
@@ -3933,7 +3933,7 @@ export interface components {
             readonly detail: string;
             /**
              * File
-             * @description Name of its file; null where it could not be rendered.
+             * @description Name of its file; null if it could not be rendered.
              */
             readonly file: string | null;
             /** Method */
@@ -3950,7 +3950,7 @@ export interface components {
         readonly SphereLight: {
             /**
              * Color Linear
-             * @description Linear R G B that multiplies the strength.
+             * @description Linear RGB colour that multiplies the strength.
              * @default [
              *       1,
              *       1,
@@ -3984,7 +3984,7 @@ export interface components {
             ];
             /**
              * Radius M
-             * @description Radius of the lamp, metres; 0 = point.
+             * @description Radius of the lamp, metres; 0 = a point light.
              * @default 0.05
              */
             readonly radius_m: number;
@@ -4002,19 +4002,19 @@ export interface components {
         readonly SpotLight: {
             /**
              * Angle Deg
-             * @description Full opening angle of the cone, degrees; no light beyond.
+             * @description Full opening angle of the cone, degrees; there is no light outside.
              * @default 60
              */
             readonly angle_deg: number;
             /**
              * Blend
-             * @description Share of the half angle, at its outer end, over which the light falls to zero, 0..1.
+             * @description Fraction of the half angle, at its outer end, over which the light falls to zero, 0..1.
              * @default 0.15
              */
             readonly blend: number;
             /**
              * Color Linear
-             * @description Linear R G B that multiplies the strength.
+             * @description Linear RGB colour that multiplies the strength.
              * @default [
              *       1,
              *       1,
@@ -4028,7 +4028,7 @@ export interface components {
             ];
             /**
              * Direction
-             * @description The cone's axis as light travels; normalised.
+             * @description Axis of the cone, in the direction in which the light travels; normalised.
              * @default [
              *       0,
              *       0,
@@ -4062,7 +4062,7 @@ export interface components {
             ];
             /**
              * Radius M
-             * @description Radius of the lamp, metres; 0 = point.
+             * @description Radius of the lamp, metres; 0 = a point light.
              * @default 0.05
              */
             readonly radius_m: number;
@@ -4075,24 +4075,24 @@ export interface components {
         };
         /**
          * State
-         * @description How the render server and the nodes are doing.
+         * @description State of the render server and the nodes.
          */
         readonly State: {
             /**
              * Cameras
-             * @description The room's, in the order of their first frames: names for `camera` of other routes.
+             * @description The room's cameras, in the order of their first frames; their names are values for `camera` in other routes.
              */
             readonly cameras: readonly components["schemas"]["CameraState"][];
             /**
              * Has Fisheye
-             * @description Whether light of a fish-eye camera has come.
+             * @description Whether a fish-eye camera is sending light.
              */
             readonly has_fisheye: boolean;
-            /** @description What became of the active scene's newest revision. */
+            /** @description State of the active scene's newest revision. */
             readonly picture: components["schemas"]["PictureState"] | null;
             /**
              * Processes
-             * @description Nodes and render server, as they report each second.
+             * @description Reports of nodes and render server, one per second.
              */
             readonly processes: readonly components["schemas"]["ProcessAnswer"][];
             /**
@@ -4110,7 +4110,7 @@ export interface components {
         };
         /**
          * Stream
-         * @description What one stream of a recording holds.
+         * @description The contents of one stream of a recording.
          */
         readonly Stream: {
             /** Messages */
@@ -4123,7 +4123,7 @@ export interface components {
         };
         /**
          * StreamState
-         * @description Whether pictures come.
+         * @description Whether pictures arrive.
          */
         readonly StreamState: {
             /**
@@ -4135,12 +4135,12 @@ export interface components {
             readonly frames_per_s: number | null;
             /**
              * Last Frame S
-             * @description Seconds since it came.
+             * @description Seconds since it arrived.
              */
             readonly last_frame_s: number | null;
             /**
              * Status
-             * @description `waiting` = none came yet; `stale` = none for two seconds.
+             * @description `waiting` = no picture yet; `stale` = none for two seconds.
              * @enum {string}
              */
             readonly status: "waiting" | "ok" | "stale";
@@ -4152,7 +4152,7 @@ export interface components {
         readonly Surface: {
             /**
              * Albedo
-             * @description Linear R G B, 0..1 (F0 where metallic); null = measured from the picture.
+             * @description Linear RGB, 0..1 (F0 where metallic); null = measured from the picture.
              */
             readonly albedo?: readonly [
                 number,
@@ -4181,18 +4181,18 @@ export interface components {
         };
         /**
          * TicketAnswer
-         * @description A ticket for one address.
+         * @description A ticket for one URL.
          */
         readonly TicketAnswer: {
             /**
              * Expires S
-             * @description Seconds within which it lets in, once.
+             * @description Seconds for which it is valid, for one use.
              * @example 30
              */
             readonly expires_s: number;
             /**
              * Ticket
-             * @description To be added to the address as `?ticket=...`.
+             * @description Ticket to add to the URL as `?ticket=...`.
              */
             readonly ticket: string;
         };
@@ -4203,7 +4203,7 @@ export interface components {
         readonly TrackedLamp: {
             /**
              * Color Linear
-             * @description Linear R G B that multiplies the strength.
+             * @description Linear RGB colour that multiplies the strength.
              * @default [
              *       1,
              *       1,
@@ -4223,12 +4223,12 @@ export interface components {
             readonly intensity: number;
             /**
              * Marker
-             * @description Id of the lamp's marker, one of board.yaml's `lamp_markers`.
+             * @description Id of the lamp's marker, one of the `lamp_markers` in board.yaml.
              */
             readonly marker: number;
             /**
              * Offset M
-             * @description The bulb in the marker's frame, metres: +x right, +y up the marker, +z out of it.
+             * @description Position of the bulb in the marker's frame, metres: +x right, +y up the marker, +z out of it.
              * @default [
              *       0,
              *       0,
@@ -4242,7 +4242,7 @@ export interface components {
             ];
             /**
              * Radius M
-             * @description Radius of the lamp, metres; 0 = point.
+             * @description Radius of the lamp, metres; 0 = a point light.
              * @default 0.05
              */
             readonly radius_m: number;
@@ -4254,13 +4254,13 @@ export interface components {
         readonly VideoAnswer: {
             /**
              * Detail
-             * @description Why it could not be made; else empty.
+             * @description Why it failed; else empty.
              * @default
              */
             readonly detail: string;
             /**
              * Progress
-             * @description Share of the frames that are in it.
+             * @description Fraction of the frames encoded so far.
              */
             readonly progress: number;
             /**
@@ -4276,7 +4276,7 @@ export interface components {
         readonly WantedPicture: {
             /**
              * Method
-             * @description Relit by this one; null = as the scene says.
+             * @description Method to relight with; null = as the scene says.
              */
             readonly method?: (components["schemas"]["DvctMethod"] | components["schemas"]["DlpvMethod"] | components["schemas"]["AroofMethod"] | components["schemas"]["DifferentialMethod"] | components["schemas"]["NoneMethod"]) | null;
             /**
@@ -4563,7 +4563,7 @@ export interface operations {
             };
         };
         readonly responses: {
-            /** @description The same content was there already. */
+            /** @description The same content already exists. */
             readonly 200: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -5575,7 +5575,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The directory of rooms does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -5679,7 +5679,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The directory of rooms does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -5693,9 +5693,9 @@ export interface operations {
     readonly live_picture: {
         readonly parameters: {
             readonly query?: {
-                /** @description What to look at; without, the scene's own `output.view`. */
+                /** @description View to return; default: the scene's `output.view`. */
                 readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
-                /** @description Whose picture, by its node's name; without, the first camera's. */
+                /** @description Name of the camera's node; default: the first camera. */
                 readonly camera?: string | null;
             };
             readonly header?: never;
@@ -5776,7 +5776,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description No picture has come from the render server yet. */
+            /** @description No picture has arrived from the render server yet. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -5872,7 +5872,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -5964,7 +5964,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -8386,7 +8386,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The directory of rooms does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -8494,7 +8494,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The directory of rooms does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -8598,7 +8598,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The directory of rooms does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The directory of rooms does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -8897,9 +8897,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -9010,7 +9010,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -9115,9 +9115,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -9617,9 +9617,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -9730,9 +9730,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -9940,9 +9940,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -10056,7 +10056,7 @@ export interface operations {
             readonly path: {
                 /** @description The scene's `id`. */
                 readonly scene_id: string;
-                /** @description Place among the manual lights, from 0. */
+                /** @description Index among the manual lights, from 0. */
                 readonly index: number;
             };
             readonly cookie?: never;
@@ -10150,15 +10150,15 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
                 /** @description The scene's `id`. */
                 readonly scene_id: string;
-                /** @description Place among the manual lights, from 0. */
+                /** @description Index among the manual lights, from 0. */
                 readonly index: number;
             };
             readonly cookie?: never;
@@ -10265,15 +10265,15 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
                 /** @description The scene's `id`. */
                 readonly scene_id: string;
-                /** @description Place among the manual lights, from 0. */
+                /** @description Index among the manual lights, from 0. */
                 readonly index: number;
             };
             readonly cookie?: never;
@@ -10376,15 +10376,15 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
                 /** @description The scene's `id`. */
                 readonly scene_id: string;
-                /** @description Place among the manual lights, from 0. */
+                /** @description Index among the manual lights, from 0. */
                 readonly index: number;
             };
             readonly cookie?: never;
@@ -10588,9 +10588,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -10701,9 +10701,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -10911,9 +10911,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -11121,9 +11121,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -11236,9 +11236,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -11347,9 +11347,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -11559,9 +11559,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -11672,9 +11672,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -11882,9 +11882,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -11995,9 +11995,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -12110,7 +12110,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -12508,9 +12508,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -12621,9 +12621,9 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Any id; changes in a row with the same one are undone together. */
+                /** @description Any id; consecutive changes with the same id are undone together. */
                 readonly "Deltalight-Gesture"?: string | null;
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -12736,7 +12736,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                /** @description Revision that the change is made to, such as "7"; another one is refused with 409. */
+                /** @description Revision that the change is based on, such as "7"; if it is not the current one, the change is refused with 409. */
                 readonly "if-match"?: string | null;
             };
             readonly path: {
@@ -13017,7 +13017,7 @@ export interface operations {
         };
         readonly requestBody?: never;
         readonly responses: {
-            /** @description The same content was there already. */
+            /** @description The same content already exists. */
             readonly 200: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -13295,7 +13295,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not answer, or (with Retry-After) too many requests wait for it. */
+            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -13951,9 +13951,9 @@ export interface operations {
     readonly open_whep: {
         readonly parameters: {
             readonly query?: {
-                /** @description What to look at; without, the scene's own `output.view`. */
+                /** @description View to return; default: the scene's `output.view`. */
                 readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
-                /** @description Whose picture, by its node's name; without, the first camera's. */
+                /** @description Name of the camera's node; default: the first camera. */
                 readonly camera?: string | null;
             };
             readonly header?: never;
@@ -14048,7 +14048,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description There is no WHEP here (extra `whep`). */
+            /** @description WHEP is not available (extra `whep`). */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;

@@ -18,7 +18,7 @@ const OWN: readonly MethodText[] = [
   {
     name: "dvct",
     title: "Voxel cone tracing",
-    help: "The best picture: contact shadows, bounced light with sharp borders, and reflections in shiny surfaces. The cost grows with the picture.",
+    help: "The best picture: contact shadows, sharp bounced light, and reflections in shiny surfaces. The cost grows with the size of the picture.",
     schema: "DvctMethod",
     main: ["quality", "operator", "volume_size", "bounces", "caustics"],
   },
@@ -39,14 +39,14 @@ const OWN: readonly MethodText[] = [
   {
     name: "differential",
     title: "Differential rendering",
-    help: "Two full solutions, subtracted. The reference for the others, and the slowest.",
+    help: "The difference of two full solutions. The reference for the other methods, and the slowest.",
     schema: "DifferentialMethod",
     main: ["quality", "volume_size", "bounces"],
   },
   {
     name: "none",
     title: "No relighting",
-    help: "Objects are drawn and the real scene is left as the camera saw it. Shows what relighting is worth.",
+    help: "Objects are drawn, and the real scene stays as the camera saw it. Shows what relighting adds.",
     schema: "NoneMethod",
     main: ["quality"],
   },

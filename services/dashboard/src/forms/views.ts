@@ -8,16 +8,16 @@ interface ViewText {
 
 export const VIEWS: readonly ViewText[] = [
   { value: "composite", label: "Picture", help: "The finished picture." },
-  { value: "effects", label: "Effects", help: "Objects and the change of light on mid grey." },
+  { value: "effects", label: "Effects", help: "Objects and the change of light on a mid-grey background." },
   {
     value: "delta",
     label: "Change of light",
-    help: "Light gained in its own colour, light lost in red, amplified four times.",
+    help: "Added light in its own colour and lost light in red, amplified four times.",
   },
   {
     value: "error",
     label: "Error of the paper",
-    help: "What the operator printed in the paper gets wrong: red to yellow too dark, blue to white too bright. Black with other methods.",
+    help: "Error of the operator printed in the paper: red to yellow is too dark, blue to white too bright. Black with other methods.",
   },
   { value: "volume", label: "Volume", help: "The lit voxels or cells." },
   {

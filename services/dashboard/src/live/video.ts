@@ -3,7 +3,7 @@ import { signal } from "@preact/signals";
 import type { LiveHeader } from "../api/types";
 
 /** Why pictures come as JPEG; null while they come as H.264. */
-export const noVideo = signal<string | null>("The page has not asked for H.264 yet.");
+export const noVideo = signal<string | null>("The page has not requested H.264 yet.");
 
 // High profile at level 4.0: up to 2048 x 1024 pixels. The service names what it really sends.
 const USUAL_CODEC = "avc1.640028";
@@ -12,7 +12,7 @@ const STUCK_MS = 3000;
 /** Whether this browser decodes a kind of H.264; else why not. */
 export async function videoProblem(codec = USUAL_CODEC): Promise<string | null> {
   if (typeof VideoDecoder === "undefined")
-    return isSecureContext ? "This browser has no WebCodecs." : "Browsers decode video only on https and localhost.";
+    return isSecureContext ? "This browser has no WebCodecs." : "Browsers decode video only on https or localhost.";
   const { supported } = await VideoDecoder.isConfigSupported(configOf(codec));
   return supported ? null : "This browser does not decode H.264.";
 }

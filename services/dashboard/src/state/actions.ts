@@ -86,7 +86,7 @@ export async function deleteScene(id: string): Promise<void> {
 
 export async function removeObject(id: string): Promise<void> {
   const removed = await change("DELETE", `/objects/${encodeURIComponent(id)}`);
-  if (removed) announce(`${id} removed. Undo brings it back.`);
+  if (removed) announce(`${id} removed. Undo restores it.`);
 }
 
 /** Put a copy of an object beside it, turned as it is. */
@@ -112,13 +112,13 @@ export async function placeObject(id: string, pixel: Pixel): Promise<void> {
     toast(
       found.object === id
         ? "Click next to the object, where it should stand."
-        : "No surface was found there. Click somewhere else.",
+        : "There is no surface there. Click somewhere else.",
     );
     return;
   }
   const normal = found.normal ?? UP;
   if (isTooSteep(normal)) {
-    toast("That surface is too steep to stand on. Click on a level one, or switch on Lean with surfaces.");
+    toast("That surface is too steep to stand on. Click a level one, or switch on Lean with surfaces.");
     return;
   }
   const pose = restingOn(item.pose, boundsByObject.value.get(id) ?? null, found.point_m, normal);
@@ -138,7 +138,7 @@ export async function replaceLight(index: number, light: Partial<ManualLight>): 
 export async function removeLight(index: number): Promise<void> {
   if (await change("DELETE", `/lights/manual/${index}`, undefined, { strict: true })) {
     selectLight(null);
-    announce("Light removed. Undo brings it back.");
+    announce("Light removed. Undo restores it.");
   }
 }
 

@@ -21,7 +21,7 @@ export async function pointAt(pixel: Pixel, radius: number): Promise<Vector> {
   const found = first?.kind === "object" && first.object ? await attempt(() => lookAt(pixel, first.object!)) : first;
   const point = standable(found);
   if (point) return point;
-  toast("There is no level surface there, so the object stands on the plane of the board.");
+  toast("There is no level surface there, so the object was placed on the plane of the board.");
   return found?.point_m ? beforeWall(found.point_m, found.normal, radius) : onBoard(pixel);
 }
 
@@ -35,7 +35,7 @@ export async function roomInMiddle(pose: Pose, bounds: Bounds | null): Promise<V
   const start = await startAt(view.value, centre(), pick);
   const found = start && (await roomNear(start, pose, bounds));
   if (found) return found;
-  toast("No free place was found, so the object stands in the middle of the picture. Drag it where you want it.");
+  toast("There is no free space, so the object was placed in the middle of the picture. Drag it where you want it.");
   return onBoard(centre());
 }
 
@@ -45,7 +45,9 @@ export async function roomBeside({ id, pose, frame }: SceneObject): Promise<Vect
   const foot = footOf(pose, bounds, UP);
   const found = frame === "world" ? await roomNear(foot, pose, bounds) : null;
   if (found) return found;
-  toast("No free place was found, so the copy stands beside the original at its height. Drag it where you want it.");
+  toast(
+    "There is no free space, so the copy was placed beside the original at the same height. Drag it where you want it.",
+  );
   return add(foot, [2 * footprintOf(pose, bounds).radius + GAP_M, 0, 0]);
 }
 

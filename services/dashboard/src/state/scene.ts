@@ -118,7 +118,7 @@ async function tellChange(fault: unknown): Promise<void> {
   await readScene();
   const what = served.value ? ` (${served.value.what}, revision ${served.value.revision})` : "";
   toast(
-    `Somebody else changed the scene first${what}. It has been reloaded; check it, then repeat your change.`,
+    `Somebody else changed the scene first${what}. The scene was reloaded; check it, then repeat your change.`,
     "error",
   );
 }

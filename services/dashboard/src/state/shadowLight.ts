@@ -15,7 +15,7 @@ import { tool, type Footing } from "./tools";
 /** The tip, once it was clicked. */
 export const shadowTip = signal<Footing | null>(null);
 
-const NO_SURFACE = "No real surface was found there. Click somewhere else.";
+const NO_SURFACE = "There is no real surface there. Click somewhere else.";
 
 /** Wait for the two clicks. */
 export function beginShadowLight(): void {
@@ -34,7 +34,9 @@ export async function takeShadowClick(pixel: Pixel): Promise<void> {
 async function addLightFrom(tip: Footing, thrower: Vector): Promise<void> {
   const direction = directionFrom(tip.point, thrower, tip.normal);
   if (!direction) {
-    toast("That point cannot cast this shadow: it lies behind the surface or at the tip. Click what casts it.");
+    toast(
+      "That point cannot cast this shadow: it lies behind the surface or at the tip. Click the point that casts it.",
+    );
     return;
   }
   tool.value = "move";
@@ -44,8 +46,7 @@ async function addLightFrom(tip: Footing, thrower: Vector): Promise<void> {
   if (!(await change("POST", "/lights/manual", light))) return;
   selectLight(index);
   announce("Light added along the shadow.");
-  if (irradiance === null)
-    toast("The shadow is too weak to tell how strong its light is. Set the strength under Lights.");
+  if (irradiance === null) toast("The shadow is too faint to estimate the strength of its light. Set it under Lights.");
 }
 
 /** By how much brighter the surface is beyond the tip than before it, in the picture that is shown. */

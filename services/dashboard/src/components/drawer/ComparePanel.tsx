@@ -73,7 +73,7 @@ function pictureOf(name: string, choice: Choice): WantedPicture {
 function sideOf(taken: Snapshot, name: string, choice: Choice): Side | null {
   const picture = taken.pictures.find((each) => each.name === name);
   if (picture?.file) return { label: labelOf(choice), path: `${API}/snapshots/${taken.id}/${picture.file}` };
-  toast(`${labelOf(choice)}: ${picture?.detail ?? "it could not be rendered."}`, "error");
+  toast(`${labelOf(choice)}: ${picture?.detail ?? "this picture could not be rendered."}`, "error");
   return null;
 }
 

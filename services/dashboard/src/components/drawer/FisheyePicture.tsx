@@ -17,7 +17,7 @@ export function FisheyePicture() {
       <article class="card fisheye-none" aria-label="Fish-eye camera">
         <Icon name="eye" />
         <p class="quiet small">
-          No fish-eye camera is sending. With one, the lights of the room are found automatically.
+          No fish-eye camera is sending. With one, Deltalight finds the lights of the room automatically.
         </p>
       </article>
     );
@@ -46,7 +46,7 @@ export function FisheyePicture() {
       <div class="small">
         <b>Fish-eye camera</b>
         <p class="quiet">{found} found</p>
-        <ol title="What each gives a surface that faces it; 1 is what the camera shows as white">
+        <ol title="Irradiance of each light on a surface facing it; the camera shows 1 as white">
           {seen.lights.map((light, index) => (
             <li key={index}>
               {index + 1}

@@ -30,7 +30,7 @@ export function HistoryPanel() {
           Redo
         </Button>
       </div>
-      <ol aria-label="Revisions, the newest first">
+      <ol aria-label="Revisions, newest first">
         {steps.value.slice(0, MOST).map((each) => (
           <Entry
             key={each.entry.revision}

@@ -29,7 +29,7 @@ export function PerformancePanel() {
       <figure class="plot-box wide">
         <figcaption>Renderer passes, ms</figcaption>
         <Plot
-          label="Time of each pass, stacked, milliseconds"
+          label="Time of each pass, stacked, in milliseconds"
           series={areas(names)}
           data={stackData(times, all, names)}
         />
@@ -39,7 +39,7 @@ export function PerformancePanel() {
         <figcaption title={DELAY_TIP}>
           Delay <b>{delayText(delay.value)}</b>
         </figcaption>
-        <Plot label="Delay, milliseconds" series={line("delay", "#f0a03c")} data={delayData(last.at)} />
+        <Plot label="Delay in milliseconds" series={line("delay", "#f0a03c")} data={delayData(last.at)} />
       </figure>
       <figure class="plot-box">
         <figcaption>

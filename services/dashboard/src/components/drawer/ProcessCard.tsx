@@ -1,6 +1,7 @@
 import { rate } from "../../live/picture";
 import { rateText, trimmed } from "../../math/units";
 import { isSilent, renderServerName, type Seen } from "../../state/processes";
+import { Sentence } from "../ui/Sentence";
 
 const RATE_NAMES: Readonly<Record<string, string>> = { fps: "frames", without_board: "frames without the board" };
 
@@ -15,7 +16,11 @@ export function ProcessCard({ seen }: { readonly seen: Seen }) {
         <h3>{report.name}</h3>
         <span class={`badge ${isSilent(seen) ? "bad" : report.state}`}>{isSilent(seen) ? "silent" : report.state}</span>
       </header>
-      {report.detail && <p class="quiet small">{report.detail}</p>}
+      {report.detail && (
+        <p class="quiet small">
+          <Sentence text={report.detail} />
+        </p>
+      )}
       <dl>
         {report.name === renderServerName.value && <Row name="frames" value={rateText(rate.value)} />}
         {rates.map(([name, each]) => (
@@ -30,7 +35,7 @@ export function ProcessCard({ seen }: { readonly seen: Seen }) {
         ))}
         <Row
           name="clock error"
-          value={report.clock_bound_ms == null ? "unknown" : `at most ${trimmed(report.clock_bound_ms, 2)} ms`}
+          value={report.clock_bound_ms == null ? "unknown" : `within ${trimmed(report.clock_bound_ms, 2)} ms`}
         />
       </dl>
     </article>

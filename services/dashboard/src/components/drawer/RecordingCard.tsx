@@ -17,6 +17,7 @@ import { download } from "../ui/download";
 import { Icon } from "../ui/Icon";
 import { Menu, type MenuEntry } from "../ui/Menu";
 import { SecureImage } from "../ui/SecureImage";
+import { Sentence } from "../ui/Sentence";
 
 export function RecordingCard({ recording }: { readonly recording: Recording }) {
   const mayChange = role.value === "control";
@@ -42,7 +43,9 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
       )}
       <div class="take-text">
         <h3 class="cut">{recording.id}</h3>
-        <p class="quiet small">{recording.detail || factsText(recording)}</p>
+        <p class="quiet small">
+          <Sentence text={recording.detail || factsText(recording)} />
+        </p>
         <Checklist recording={recording} />
         <VideoProgress id={recording.id} />
         <div class="row">

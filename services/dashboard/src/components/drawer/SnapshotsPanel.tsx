@@ -23,12 +23,12 @@ export function SnapshotsPanel() {
           {isBusy ? "Rendering…" : "Take a snapshot"}
         </Button>
         <Switch
-          label="Also as linear EXR"
+          label="Also save linear EXR"
           checked={withExr.value}
           onChange={(on) => (withExr.value = on)}
           disabled={role.value !== "control"}
         />
-        <p class="quiet small">One frame in every view, as PNG.</p>
+        <p class="quiet small">Saves one frame in every view, as PNG.</p>
       </div>
       {!isRead.value && <Skeleton />}
       {isRead.value && snapshots.value.length === 0 && (

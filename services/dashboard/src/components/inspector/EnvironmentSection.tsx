@@ -19,7 +19,7 @@ export function EnvironmentSection({ lights, disabled }: EnvironmentSectionProps
   const { map, rotation_deg, intensity } = lights.environment;
   return (
     <Section title="Environment map">
-      <Field label="Map" help="A panorama twice as wide as it is high. Upload .hdr or .exr files under Assets." inline>
+      <Field label="Map" help="A panorama, twice as wide as it is high. Upload .hdr or .exr files under Assets." inline>
         <Select
           label="Map"
           value={map ?? ""}

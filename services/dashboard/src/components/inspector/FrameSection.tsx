@@ -19,7 +19,7 @@ export function FrameSection({ item, disabled }: FrameSectionProps) {
     <Section title="Placement">
       <Field
         label="Anchor"
-        help="The board stays put. An object anchored to a marker moves with it, and is placed by numbers only."
+        help="Objects on the board stay put. An object on a marker moves with it, and can only be placed by its fields."
         inline
       >
         <Select
@@ -46,7 +46,7 @@ export function FrameSection({ item, disabled }: FrameSectionProps) {
           />
         </Field>
       )}
-      <Field label="Up axis" help="glTF files are y-up; other formats are taken as z-up." inline>
+      <Field label="Up axis" help="glTF files are y-up; other formats are assumed to be z-up." inline>
         <Select
           label="Up axis"
           value={item.up_axis ?? "auto"}

@@ -38,7 +38,7 @@ export function Guide() {
           <button type="button" disabled={!first} onClick={() => first && selectObject(first.id)}>
             Drag the object
           </button>
-          <span>Click it, then drag it or its arrows. Shadow and colour follow.</span>
+          <span>Click it, then drag it or its arrows. Its shadow and reflected colour follow.</span>
         </Step>
         <Step of="drop">
           <b>Drop a .glb onto the picture</b>
@@ -48,7 +48,7 @@ export function Guide() {
           <button type="button" onClick={() => (inspectorTab.value = "lights")}>
             Change the light
           </button>
-          <span>Colour, strength and position of each light. Or drag a shadow: its light follows.</span>
+          <span>Set the colour, strength and position of each light. Or drag a shadow, and its light follows.</span>
         </Step>
         {isMovable.value && (
           <Step of="camera">
@@ -60,7 +60,7 @@ export function Guide() {
           <button type="button" onClick={() => openDrawer("compare")}>
             Compare methods
           </button>
-          <span>One frame, two methods, and a split to drag.</span>
+          <span>See one frame rendered by two methods, with a split to drag.</span>
         </Step>
       </ol>
     </section>

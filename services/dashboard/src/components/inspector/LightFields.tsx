@@ -29,7 +29,13 @@ const STRENGTHS: readonly Strength[] = [
     max: 20,
     help: "Camera units times square metres: a surface at distance d gets intensity / d².",
   },
-  { key: "irradiance", label: "Irradiance", unit: "", max: 10, help: "Camera units, perpendicular to the beam." },
+  {
+    key: "irradiance",
+    label: "Irradiance",
+    unit: "",
+    max: 10,
+    help: "Camera units, measured perpendicular to the beam.",
+  },
   {
     key: "radiance",
     label: "Radiance",
@@ -88,7 +94,7 @@ export function LightFields({ light, onChange, onEnd, disabled }: LightFieldsPro
         </>
       )}
       {"radius_m" in light && (
-        <Field label="Radius" help="A larger lamp casts softer shadows." inline>
+        <Field label="Radius" help="Larger lamps cast softer shadows." inline>
           <NumberInput
             label="Radius"
             unit="m"
@@ -155,7 +161,7 @@ function DirectionFields({
       <SliderField
         label="Direction"
         unit="°"
-        help="Where the light comes from, as a bearing on the board: 0° is the right, 90° the top edge."
+        help="Direction that the light comes from, as an angle on the board: 0° is the right edge, 90° the top edge."
         value={bearing}
         onChange={(next) => onChange({ direction: directionFromAngles(next, height) })}
         min={-180}
@@ -167,7 +173,7 @@ function DirectionFields({
       <SliderField
         label="Elevation"
         unit="°"
-        help="Above the plane of the board; 90° is straight from above."
+        help="Angle above the plane of the board; 90° is directly overhead."
         value={height}
         onChange={(next) => onChange({ direction: directionFromAngles(bearing, next) })}
         min={-90}

@@ -64,7 +64,7 @@ function LightEditor({ index, light, disabled }: LightEditorProps) {
       </Field>
       {isOutOfSight(light) && (
         <p class="quiet small">
-          This light is outside the picture. Use its fields to move it, or drag a shadow that it casts.
+          This light is outside the picture. Move it with its fields, or drag a shadow that it casts.
         </p>
       )}
       <LightFields light={light} onChange={gesture.push} onEnd={gesture.end} disabled={disabled} />

@@ -26,8 +26,8 @@ const MODES: readonly Segment<Mode>[] = [
 ];
 const HELP: Readonly<Record<Mode, string>> = {
   manual: "Lights that you set by hand.",
-  fisheye: "What a fish-eye camera beside the objects sees, live.",
-  tracked: "Lamps that carry a marker, so that they can be moved.",
+  fisheye: "Live light, seen by a fish-eye camera beside the objects.",
+  tracked: "Lamps that carry a marker, so that you can move them.",
   environment: "A panorama of the surroundings (HDR or EXR).",
 };
 

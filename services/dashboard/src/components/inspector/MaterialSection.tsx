@@ -28,7 +28,11 @@ export function MaterialSection({ item, disabled }: MaterialSectionProps) {
   return (
     <Section title="Material">
       {measured.length > 0 && (
-        <Field label="Measured" help="Paints and texture maps of deltalight precompute, uploaded under Assets." inline>
+        <Field
+          label="Measured"
+          help="Paints and texture maps made by `deltalight precompute` and uploaded under Assets."
+          inline
+        >
           <Select
             label="Measured material"
             value={precomputed}
@@ -63,7 +67,7 @@ function MaterialFields({ item, material, disabled }: MaterialFieldsProps) {
   const shares = ["roughness", "metallic", "specular", "transmission"] as const;
   return (
     <>
-      <div class="presets" role="group" aria-label="Materials to begin with">
+      <div class="presets" role="group" aria-label="Material presets">
         {MATERIALS.map(({ label, material: change }) => (
           <Button
             key={label}

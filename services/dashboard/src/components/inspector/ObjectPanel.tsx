@@ -71,11 +71,11 @@ function ObjectHead({ item, mayChange }: { readonly item: SceneObject; readonly 
         />
       </div>
       <p class="quiet small">
-        {asset ? assetName(asset) : "Its file is missing"}
+        {asset ? assetName(asset) : "The file is missing"}
         {measures && `, ${measures}`}
       </p>
       <Button icon="place" disabled={!mayChange} onClick={() => (tool.value = "place")}>
-        {tool.value === "place" ? "Click in the picture to place it" : "Place on a surface"}
+        {tool.value === "place" ? "Click where it should stand" : "Place on a surface"}
       </Button>
     </section>
   );

@@ -39,7 +39,7 @@ export function PoseSection({ item, disabled }: PoseSectionProps) {
       <VectorInput
         label="Position"
         unit="m"
-        help="Of the object's origin, in the frame of the marker board: x right, y up the sheet, z out of the paper."
+        help="Position of the object's origin in the board's frame: x right, y up the sheet, z out of the paper."
         value={pose.translation_m}
         onChange={(translation_m) => push({ translation_m })}
         onEnd={gesture.end}
@@ -48,7 +48,7 @@ export function PoseSection({ item, disabled }: PoseSectionProps) {
       <VectorInput
         label="Rotation"
         unit="°"
-        help="Applied about x first, then y, then z; z is up."
+        help="Rotations about x, then y, then z; z is up."
         value={anglesFromQuaternion(pose.rotation_wxyz)}
         onChange={(angles) => push({ rotation_wxyz: quaternionFromAngles(angles) })}
         onEnd={gesture.end}
@@ -58,7 +58,7 @@ export function PoseSection({ item, disabled }: PoseSectionProps) {
       />
       <Field
         label="Lean with surfaces"
-        help="While you drag it over the picture or place it on a surface, the object tilts with slopes and walls. Otherwise it keeps its rotation, and stands only on surfaces that are not too steep."
+        help="On: the object tilts with slopes and walls as you drag or place it. Off: it keeps its rotation and stands only on surfaces that are not too steep."
         inline
       >
         <Switch

@@ -29,7 +29,7 @@ export function RealPanel() {
         <GeometryField geometry={real.geometry} disabled={disabled} />
         <Field
           label="Unseen albedo"
-          help="Albedo of surfaces that the camera does not see right now; automatic remembers what it saw."
+          help="Albedo of surfaces that the camera does not currently see. Automatic uses what it saw before."
           inline
         >
           <NumberInput
@@ -54,7 +54,7 @@ export function RealPanel() {
       ))}
       <div class="section">
         <p class="quiet small">
-          Real surfaces are assumed to be matte. Declare those that are not, such as a polished table.
+          Real surfaces are assumed to be matte. Declare those that are glossy, such as a polished table.
         </p>
         <Button icon="add" onClick={add} disabled={disabled || surfaces.length >= MOST_SURFACES}>
           Declare a surface
@@ -75,7 +75,7 @@ function GeometryField({ geometry, disabled }: { readonly geometry: unknown; rea
   const choose = (value: string) =>
     edit(partTarget("real"), { geometry: value === "depth" || value === "fused" ? value : { model: value } });
   return (
-    <Field label="Geometry" help="Each frame's own depth, depth gathered over all frames, or a given model." inline>
+    <Field label="Geometry" help="The depth of each frame, the fused depth of all frames, or a given model." inline>
       <Select
         label="Geometry"
         value={model ?? String(geometry)}

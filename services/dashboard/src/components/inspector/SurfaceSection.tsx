@@ -48,7 +48,7 @@ export function SurfaceSection({ index, surface, onChange, disabled }: SurfaceSe
             onChange={(normal) => setPlane({ normal })}
             disabled={disabled}
           />
-          <Field label="Thickness" help="Points closer to the plane than this belong to it." inline>
+          <Field label="Thickness" help="Points closer to the plane than this belong to the surface." inline>
             <NumberInput
               label="Thickness"
               unit="m"

@@ -70,7 +70,7 @@ function LampFields({ lamp, onChange, onEnd, disabled }: LampFieldsProps) {
   const common = { onEnd, disabled };
   return (
     <>
-      <Field label="Marker" help="One of the lamp markers in board.yaml." inline>
+      <Field label="Marker" help="Id of one of the lamp markers in board.yaml." inline>
         <NumberInput
           label="Marker"
           value={lamp.marker}
@@ -84,7 +84,7 @@ function LampFields({ lamp, onChange, onEnd, disabled }: LampFieldsProps) {
       <VectorInput
         label="Bulb"
         unit="m"
-        help="The bulb in the marker's frame: x right, y up the marker, z out of it."
+        help="Position of the bulb in the marker's frame: x right, y up the marker, z out of it."
         value={lamp.offset_m}
         onChange={(offset_m) => onChange({ offset_m })}
         {...common}

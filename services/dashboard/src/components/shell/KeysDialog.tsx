@@ -26,7 +26,7 @@ const GROUPS: readonly { readonly title: string; readonly keys: readonly (readon
       ["Arrows", "move the selection by 1 cm"],
       ["Page Up / Down", "move it up, down"],
       ["Shift / Alt", "with arrows: 10 cm, 1 mm"],
-      ["[ and ]", "turn by 15°"],
+      ["[ and ]", "rotate by 15°"],
       ["Tab", "next object or light"],
     ],
   },
@@ -45,8 +45,8 @@ const GROUPS: readonly { readonly title: string; readonly keys: readonly (readon
     keys: [
       ["1", "picture"],
       ["2 … 8", "effects, change of light, its error, volume, light's view, lights, camera"],
-      ["O", "room in 3-D; arrows turn it, + and − zoom"],
-      ["?", "this list"],
+      ["O", "room in 3-D; arrow keys orbit, + and − zoom"],
+      ["?", "show this list"],
     ],
   },
 ];

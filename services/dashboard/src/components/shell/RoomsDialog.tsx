@@ -21,6 +21,7 @@ import { Dialog } from "../ui/Dialog";
 import { Icon } from "../ui/Icon";
 import { LiveThumbnail } from "../ui/LiveThumbnail";
 import { Menu, type MenuEntry } from "../ui/Menu";
+import { Sentence } from "../ui/Sentence";
 
 const PERIOD_MS = 2000; // of rates; changes of state come as events
 
@@ -58,7 +59,7 @@ function Rooms() {
                   class="button"
                   onClick={() => void (host.drained ? undrainHost : drainHost)(host.name)}
                 >
-                  {host.drained ? "Take rooms" : "Drain"}
+                  {host.drained ? "Accept rooms" : "Drain"}
                 </button>
               )}
             </li>
@@ -86,10 +87,14 @@ function RoomCard({ room }: { readonly room: RoomAnswer }) {
         <span class={`badge ${room.state === "failed" ? "bad" : room.state}`}>{room.state}</span>
       </div>
       <p class="quiet small">{factsOf(room)}</p>
-      {room.why && <p class="small">{room.why}</p>}
+      {room.why && (
+        <p class="small">
+          <Sentence text={room.why} />
+        </p>
+      )}
       {entries.length > 0 && (
         <Menu label={`Where ${room.title} runs`} entries={entries}>
-          <Icon name="node" /> {room.moving_to ? `moves to ${room.moving_to}` : (room.slot ?? "nowhere")}
+          <Icon name="node" /> {room.moving_to ? `moving to ${room.moving_to}` : (room.slot ?? "not running")}
         </Menu>
       )}
     </article>
@@ -99,7 +104,7 @@ function RoomCard({ room }: { readonly room: RoomAnswer }) {
 function factsOf(room: RoomAnswer): string {
   const facts = [room.nodes.join(", "), room.scene?.method];
   if (room.state === "running") facts.push(rateText(room.frames_per_s));
-  if (room.restarts > 0) facts.push(`restarted ${room.restarts} times`);
+  if (room.restarts > 0) facts.push(room.restarts === 1 ? "restarted once" : `restarted ${room.restarts} times`);
   return facts.filter(Boolean).join(" · ");
 }
 

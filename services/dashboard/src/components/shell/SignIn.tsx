@@ -43,7 +43,8 @@ export function SignIn() {
           Sign in
         </Button>
         <p class="quiet small">
-          Create one with <code>deltalight api token NAME --role control</code>. It is kept until you close this tab.
+          Create one with <code>deltalight api token NAME --role control</code>. This page keeps it until you close the
+          tab.
         </p>
       </form>
     </main>

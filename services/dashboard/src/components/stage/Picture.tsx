@@ -84,7 +84,7 @@ export function Picture() {
         <CompareSlider />
         <PictureNotice />
         <ShadowHint />
-        {isDropping.value && <p class="drop-hint">Drop an object where it should stand, or a recording</p>}
+        {isDropping.value && <p class="drop-hint">Drop an object where it should stand, or drop a recording</p>}
       </div>
     </div>
   );

@@ -33,21 +33,23 @@ export function PictureNotice() {
     case "rendering":
       return <Working text={workText()} />;
     case "no-board":
-      return <Banner text="The marker board is not in view, so objects cannot be placed. Point the camera at it." />;
+      return (
+        <Banner text="The marker board is not in view, so objects cannot be placed. Point the camera at the board." />
+      );
     case "live":
       return <SceneNotice />;
   }
 }
 
-const STILL = "A still picture; the live one follows. ";
+const STILL = "This is a still; the live picture follows. ";
 const NOTHING_SENDS =
   "Neither a camera nor a recording is sending frames. Start one with `deltalight up --source CAMERA`, or replay a recording below.";
 const PREPARING =
-  "Frames are arriving, and the renderer is preparing its first picture. The first start on a machine can take a minute while shaders compile.";
-const SILENT = "The render server does not respond. Your changes are kept, and shown as soon as it does.";
-const STOPPED = "No new frames are coming from the camera. See Nodes below for what has stopped.";
+  "Frames are arriving, and the renderer is preparing its first picture. The first start on a machine can take a minute while the shaders compile.";
+const SILENT = "The render server does not respond. Your changes are kept, and will appear as soon as it does.";
+const STOPPED = "The camera sends no new frames. Nodes, below, shows what has stopped.";
 const NO_FISHEYE =
-  "This scene is lit by a fish-eye camera, and none is sending. Objects appear once one does; or choose another light under Lights.";
+  "This scene is lit by a fish-eye camera, and none is sending. Objects appear once one does. Or choose another light source under Lights.";
 
 /** Whether a picture will come by itself. */
 function isWorking(): boolean {

@@ -33,7 +33,7 @@ export function RoomView() {
         ref={canvas}
         id="stage"
         role="application"
-        aria-label="Room in 3-D: drag or arrow keys turn it, plus and minus zoom"
+        aria-label="Room in 3-D: drag or use the arrow keys to orbit, plus and minus to zoom"
         tabIndex={0}
         data-shown={notice.value === ""}
         onKeyDown={onKeyDown}
@@ -45,7 +45,7 @@ export function RoomView() {
       )}
       <div class="room-bar">
         <Button onClick={lookFromCamera}>Look from the camera</Button>
-        <Button onClick={() => room.current && void readSurfaces(room.current, notice)}>Read the room again</Button>
+        <Button onClick={() => room.current && void readSurfaces(room.current, notice)}>Update the room</Button>
       </div>
     </div>
   );
@@ -61,7 +61,7 @@ function openRoom(
   let close: (() => void) | null = null;
   let isGone = false;
   void load(canvas).then((loaded) => {
-    if (!loaded) notice.value = "This browser has no WebGL, which the room in 3-D needs.";
+    if (!loaded) notice.value = "The room in 3-D needs WebGL, which this browser does not have.";
     else if (isGone) loaded.dispose();
     else {
       room.current = loaded;

@@ -5,8 +5,8 @@ import { tool } from "../../state/tools";
 export function ShadowHint() {
   if (tool.value !== "shadow") return null;
   const text = shadowTip.value
-    ? "Now click the point of the real object that casts it. Esc cancels."
-    : "Click the tip of a shadow that the camera sees. Esc cancels.";
+    ? "Now click the point on the real object that casts it. Press Esc to cancel."
+    : "Click the tip of a shadow in the camera's picture. Press Esc to cancel.";
   return (
     <p class="drop-hint" role="status">
       {text}

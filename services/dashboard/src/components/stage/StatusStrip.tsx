@@ -31,10 +31,10 @@ export function StatusStrip() {
             tip={budgetText(sceneDocument.value?.output.frame_budget_ms)}
           />
           <Figure name="Dropped" value={String(droppedFrames(header.drops))} tip={dropText(header.drops)} />
-          <Figure name="Skipped" value={String(header.skipped)} tip="Frames this browser was too slow to show" />
+          <Figure name="Skipped" value={String(header.skipped)} tip="Frames that this browser was too slow to show" />
         </dl>
       )}
-      {deviation > STRONG && <span class="quiet">Wide lens: handles are exact only at their centre</span>}
+      {deviation > STRONG && <span class="quiet">Wide-angle lens: handles are exact only at their centre</span>}
       <span class="grow" />
       {uploads.value.map((each) => (
         <label class="upload" key={each.id}>
@@ -57,8 +57,8 @@ function Figure({ name, value, tip }: { readonly name: string; readonly value: s
 
 function budgetText(budget: number | null | undefined): string {
   return budget == null
-    ? "While something moves, quality is reduced as far as the method's setting allows"
-    : `While something moves, quality and then size are reduced to take ${milliseconds(budget)} per frame; at rest the picture has its best quality`;
+    ? "While something moves, quality is reduced as far as the method's settings allow"
+    : `While something moves, quality and then size are reduced to stay within ${milliseconds(budget)} per frame; at rest the picture has full quality`;
 }
 
 function dropText(drops: Readonly<Record<string, number>>): string {

@@ -59,7 +59,7 @@ async function load(canvas: HTMLCanvasElement | null, surface: HTMLElement | nul
     });
   } catch {
     toast(
-      "This browser has no WebGL, so the picture has no handles; drag the objects themselves, or use the arrow keys or the fields.",
+      "This browser has no WebGL, so the picture has no handles. Drag the objects themselves, or use the arrow keys or the fields.",
     );
     return null;
   }

@@ -23,8 +23,8 @@ interface Use {
 
 const USES: Readonly<Record<AssetAnswer["kind"], Use>> = {
   mesh: { label: "Add to the scene", verb: "Add", run: (asset) => addObject(asset) },
-  map: { label: "Light the scene with it", verb: "Light the scene with", run: lightWith },
-  material: { label: "Paint the selected object with it", verb: "Paint the selected object with", run: paintWith },
+  map: { label: "Use as environment light", verb: "Light the scene with", run: lightWith },
+  material: { label: "Apply to the selected object", verb: "Apply to the selected object:", run: paintWith },
 };
 
 interface AssetCardProps {
@@ -74,7 +74,7 @@ async function lightWith(asset: AssetAnswer): Promise<void> {
 async function paintWith(asset: AssetAnswer): Promise<void> {
   const id = selectedObjectId.value;
   if (id === null) {
-    toast("Select the object first that is to have this material.");
+    toast("First select the object that should get this material.");
     return;
   }
   await edit(objectTarget(id), { material: { precomputed: asset.asset } });

@@ -38,7 +38,7 @@ export function SceneTree() {
       <TreeGroup title="Lights" action={<AddLightButton />} empty={hasLights() ? null : "No lights."}>
         <LightItems />
       </TreeGroup>
-      <TreeGroup title="Real scene" empty={document ? null : "Comes with a scene."}>
+      <TreeGroup title="Real scene" empty={document ? null : "No scene is open."}>
         <TreeItem
           icon="room"
           label={geometryText(document?.real.geometry)}

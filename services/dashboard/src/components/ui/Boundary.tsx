@@ -15,7 +15,7 @@ export function Boundary({ name, children }: BoundaryProps) {
   return (
     <div class="empty" role="alert">
       <h3>{name} failed</h3>
-      <p>This is a bug in the page. The scene is safe, and everything else keeps working.</p>
+      <p>This is a bug in the page. Your scene is safe, and everything else keeps working.</p>
       <Button onClick={retry}>Try again</Button>
     </div>
   );

@@ -2,11 +2,12 @@ import type { ComponentChildren } from "preact";
 import { useId } from "preact/hooks";
 import { useSignal } from "@preact/signals";
 import { Icon } from "./Icon";
+import { Sentence } from "./Sentence";
 
 interface FieldProps {
   readonly label: string;
   readonly unit?: string;
-  /** A sentence that the sign beside the label shows. */
+  /** A sentence that the icon beside the label shows. */
   readonly help?: string | undefined;
   /** Label and control in one line. */
   readonly inline?: boolean;
@@ -45,7 +46,7 @@ export function Field({ label, unit, help, inline = false, children }: FieldProp
 function Hint({ id, text }: { readonly id: string; readonly text: string | undefined }) {
   return (
     <p class="hint" id={id}>
-      {text}
+      {text && <Sentence text={text} />}
     </p>
   );
 }
