@@ -13,6 +13,7 @@ from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.asset_check import left_out, read_gltf
 from deltalight.render_server.scene.mesh_loading import load_mesh
@@ -223,10 +224,11 @@ def beams_of(gpu: GpuContext, document: SceneDocument) -> np.ndarray:
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame())
     assert renderer.graph is not None
-    data = renderer.graph["caustic beams"]._beams.read()
+    caustics = renderer.graph["caustic ends"]
+    count = int(np.frombuffer(caustics._count.read(), np.uint32)[0])
+    beams = read_texture(caustics._beams).reshape(-1, 16)[:count]  # rows of 256
     renderer.release()
-    count = int(np.frombuffer(data, np.uint32, 1)[0])
-    return np.frombuffer(data, np.float32, 16 * count, 16).reshape(count, 16).astype(float)
+    return beams.astype(float)
 
 
 def test_ball_lens_gathers_light_in_its_focus(gpu: GpuContext, stage: Stage) -> None:
