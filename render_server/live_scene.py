@@ -432,9 +432,12 @@ class LiveScene:
     def _fit_graphs(self, views: Sequence[CameraView]) -> None:
         """Provides the graphs for these pictures' sizes; new ones if lens or size changed.
 
-        In software those before are kept: a GPU builds what it holds in no time, and its memory is scarcer.
+        In software those of another size are kept: a GPU builds what it holds in no time, and its memory is scarcer.
         """
-        if self._gpu.is_software and self._graphs and not _fit(self._graphs, views):
+        if len(views) != len(self._graphs):
+            self._free(self._spare)
+            self._spare = []
+        elif self._gpu.is_software and not _fit(self._graphs, views):
             self._graphs, self._spare = self._spare, self._graphs
         before, self._graphs = self._graphs, []
         self._graphs = self._fitting(before, views, self._plan.method)

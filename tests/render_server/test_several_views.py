@@ -13,7 +13,7 @@ import trimesh
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose, ViewFrame
 from deltalight.protocol.scene import SceneDocument
-from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext, count_gl_objects
 from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.depth_mesh import depth_mesh
@@ -278,3 +278,13 @@ def test_a_frame_that_is_not_shown_lights_the_room_and_one_left_out_does_not(
     assert psnr_db(second, facing.color) < 45, "the object is in it"
     again = pictures(renderer, CameraFrame("a", behind), CameraFrame("b", facing))
     assert all(psnr_db(one, other) > 50 for one, other in zip(again, together, strict=True))
+
+
+def test_the_gpu_holds_what_the_cameras_of_the_newest_frame_need(made: Callable[..., SceneRenderer]) -> None:
+    renderer, held = made("depth"), []
+    for poses in ((BEHIND, FACING), (BEHIND,)) * 2:
+        for number in range(2):
+            renderer.render_views([seen_room(pose, number) for pose in poses])
+        held.append(sum(count_gl_objects().values()))
+    assert held[1] < held[0]
+    assert held[2:] == held[:2], "nothing is kept for cameras that left"
