@@ -275,7 +275,7 @@ def test_a_room_is_moved_to_another_host_in_the_page(hosts: Hosts, installation:
         before = next_thumbnail(installation, hall)
         where.click()
         hall.get_by_role("menuitem", name=f"Move to {free}/1").click()
-        expect(where).to_contain_text(f"moves to {free}/1")
+        expect(where).to_contain_text(f"moving to {free}/1")
         photograph(page, "room_moves")
         expect(where).to_have_text(re.compile(rf"^\s*{free}/1$"))
         wait_for(lambda: is_gone(server))
