@@ -388,7 +388,14 @@ def arrow_place(page: Desk, from_m: np.ndarray) -> tuple[tuple[float, float], fl
 
 def seen_m(stack: Stack, page: Desk, point_m: np.ndarray) -> np.ndarray:
     """The surface that the renderer finds where a point is seen."""
-    found = stack.client.post("/live/pick", json=page.pixel_at(page.place_of(point_m))).json()
+    found: dict[str, Any] = {}
+
+    def answers() -> bool:  # not while a busy machine's renderer takes its time
+        answer = stack.client.post("/live/pick", json=page.pixel_at(page.place_of(point_m)))
+        found.update(answer.json())
+        return answer.status_code == 200
+
+    page.until(answers, "what is seen there")
     assert found["kind"] == "real"
     return np.array(found["point_m"])
 

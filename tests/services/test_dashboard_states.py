@@ -157,16 +157,22 @@ def test_fisheye_light_cannot_be_chosen_without_a_fisheye_camera(stack: Stack, p
 
 def test_a_page_that_meets_a_service_of_another_version_is_loaded_anew(page: Desk) -> None:
     connections: list[WebSocketRoute] = []
+    heard: list[str] = []
 
     def pass_on(ours: WebSocketRoute) -> None:
         theirs = ours.connect_to_server()
         connections.append(ours)
         newer = "9.9.9" if len(connections) > 1 else __version__
-        theirs.on_message(lambda text: ours.send(str(text).replace(__version__, newer)))
+
+        def tell(text: str | bytes) -> None:
+            ours.send(str(text).replace(__version__, newer))
+            heard.append(str(text))
+
+        theirs.on_message(tell)
 
     page.page.route_web_socket("**/api/v1/events", pass_on)
     page.open()
-    page.until(lambda: connections, "a connection")
+    page.until(lambda: any(__version__ in text for text in heard), "what says the version")
     with page.page.expect_event("load"):
         connections[0].close()
     page.shows_newest()
