@@ -48,7 +48,8 @@ class Declarations:
 
 def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = None) -> str:
     """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines."""
-    (body, files), given = _whole(path, SHADERS), defines or {}
+    files: list[Path] = []
+    body, given = _expand(path, files), defines or {}
     constants = _VALUE.findall(body)
     body = _VALUE.sub(
         lambda found: f"const bool {found[1]} = {'true' if found[1] in given else 'false'};", body
@@ -56,13 +57,6 @@ def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = 
     head = [VERSION, *(f"#define {name} {value}" for name, value in given.items() if name not in constants)]
     table = [f"// file {index}: {file.parent.name}/{file.name}" for index, file in enumerate(files)]
     return "\n".join([*head, *table, body])
-
-
-@lru_cache(maxsize=512)  # as `_split`; files do not change while a process runs
-def _whole(path: Path, _folder: Path) -> tuple[str, tuple[Path, ...]]:
-    """Returns the text of a file with its includes, which lie in the folder, and all files in it."""
-    files: list[Path] = []
-    return _expand(path, files), tuple(files)
 
 
 def _expand(path: Path, seen: list[Path]) -> str:

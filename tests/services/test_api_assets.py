@@ -99,7 +99,7 @@ def test_maps_are_taken_and_must_be_twice_as_wide_as_high(api: RunningApi, tmp_p
         answer = upload(api.client, content, name)
         assert answer.status_code == 201, answer.text
         assert (answer.json()["kind"], answer.json()["facts"]["width"] > 8) == ("map", True)
-    assert "twice as wide as high" in sentence(upload(api.client, hdr(20, 16), "room.hdr"), 422)
+    assert "twice as wide as it is high" in sentence(upload(api.client, hdr(20, 16), "room.hdr"), 422)
     scene = api.client.post(
         "/scenes", json={"lights": {"mode": "environment", "environment": {"map": "room.hdr"}}}
     )

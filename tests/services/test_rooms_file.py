@@ -68,7 +68,7 @@ BOMB = "a0: &a0 [x]\n" + "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)
         ("slots: []\nnodes: {a: {source: s}}\nrooms: {hall: {nodes: [a]}}", "`slots` is wrong"),
         (
             "nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a], scene: no.json}}",
-            "of the room hall is not there",
+            "of the room hall does not exist",
         ),
         ("nodes: {a: {source: s}}\nroom: {}", "the nearest known key is `rooms`"),
         ("- hall", "must hold keys and values"),

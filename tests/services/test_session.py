@@ -126,8 +126,8 @@ def test_the_first_picture_is_told_in_shaders_until_there_is_one(session: Render
     first, many = session.preparation(12), session.preparation(99)
     assert first is not None
     assert many is not None
-    assert (first.state, "12 of some 60" in first.detail) == ("starting", True)
-    assert "99 of some 99" in many.detail
+    assert (first.state, "12 of about 60" in first.detail) == ("starting", True)
+    assert "99 of about 99" in many.detail
     feed(session, 1)
     assert session.step() is not None
     assert session.preparation(12) is None
