@@ -73,12 +73,12 @@ MeshHit hit_before(Ray ray, float limit, bool any_hit) {
     vec3 safe = mix(ray.direction, vec3(1e-12), lessThan(abs(ray.direction), vec3(1e-12)));
     vec3 inverse = 1.0 / safe;
     MeshHit hit = MeshHit(limit, -1, vec2(0.0));
-    int count = node_at(0).skip;
-    for (int i = 0; i < count && !(any_hit && hit.triangle >= 0);) {
+    int nodes = node_at(0).skip;
+    for (int i = 0; i < nodes && !(any_hit && hit.triangle >= 0);) {
         Node node = node_at(i);
         bool met = meets_box(node.low, node.high, ray.from, inverse, hit.distance);
-        int last = met && node.leaf >= 0 ? (node.leaf >> 3) + (node.leaf & 7) : 0;
-        for (int j = node.leaf >> 3; j < last; ++j) meet_triangle(j, ray, hit);
+        int first = node.leaf >> 3, count = met && node.leaf >= 0 ? node.leaf & 7 : 0;
+        for (int j = first; j < first + count; ++j) meet_triangle(j, ray, hit);
         i = met ? i + 1 : node.skip;
     }
     return hit;
