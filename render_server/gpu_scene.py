@@ -9,12 +9,13 @@ from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
-from deltalight.render_server.scene.depth_mesh import back_faces
+from deltalight.render_server.passes.voxelize import VoxelizedMesh
+from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
 from deltalight.render_server.scene.depth_views import DepthViews
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh
 
-Corners = Float32[np.ndarray, "m 3 10"]
+Corners = Float32[np.ndarray, "m 3 3"]
 
 # Half the edge of a volume by how far objects reach from its middle, at least. Less than 2 / sqrt(3): twice the edge
 # of a cube leaves it that much in any turn.
@@ -76,41 +77,59 @@ class PlacedObject:
     moves: bool = False
 
 
+CoarseMesh = tuple[MeshBuffers, GpuMesh]  # what buffers hold
+
+
 @dataclass(frozen=True, eq=False)
 class GeometryState:
     """One set of triangles in the world; another set is another object.
 
-    `corners` are for the voxeliser (`triangle_corners` in passes/gbuffer.py), `points` enclose the set.
+    `buffers` hold `mesh` until the next set is written there; `points` enclose the set.
     `swept_points` enclose it at all times of its animations: what is fitted around them stands still while it moves.
     """
 
     buffers: MeshBuffers
-    corners: Corners
+    mesh: GpuMesh
     points: Float64[np.ndarray, "n 3"]
     materials: MaterialTable
-    coarse: Callable[[], Corners] | None = None  # makes fewer triangles for what lies far; None: all serve
+    coarse: Callable[[], CoarseMesh] | None = None  # makes fewer triangles for what lies far; None: all serve
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
     extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
     fronts_of: DepthViews | None = None  # what is solid as cameras see it: backs are not in it
 
     @cached_property
-    def coarse_corners(self) -> Corners:
-        """`corners` of fewer triangles, for what lies far."""
-        return self.corners if self.coarse is None else self.coarse()
+    def corners(self) -> Corners:
+        """Corners of all triangles, m; takes time."""
+        return self.mesh.corners
 
-    def solid_corners(self, voxel_edge: float) -> Corners:
-        """Returns `corners` for voxels of that edge (m), with coarse backs if cameras saw the fronts alone.
+    @property
+    def parts(self) -> tuple[VoxelizedMesh, ...]:
+        """All triangles, for the voxeliser."""
+        return (VoxelizedMesh(self.buffers),)
+
+    @cached_property
+    def _coarse(self) -> CoarseMesh:
+        return (self.buffers, self.mesh) if self.coarse is None else self.coarse()
+
+    @property
+    def coarse_parts(self) -> tuple[VoxelizedMesh, ...]:
+        """Fewer triangles, for what lies far."""
+        return (VoxelizedMesh(self._coarse[0]),)
+
+    def solid_parts(self, voxel_edge: float) -> tuple[VoxelizedMesh, ...]:
+        """Returns `parts` for voxels of that edge (m), with coarse backs if cameras saw the fronts alone.
 
         What is thinner than two voxels has none where another camera sees that nothing is there.
         """
         if self.fronts_of is None:
-            return self.corners
-        backs = back_faces(self.coarse_corners, voxel_edge)
+            return self.parts
+        buffers, mesh = self._coarse
+        chosen = None
         if len(self.fronts_of.frames) > 1:
-            middles = backs[..., :3].mean(axis=1, dtype=np.float64)
-            backs = backs[~self.fronts_of.in_free_space(middles)]
-        return np.concatenate([self.corners, backs])
+            middles = back_faces(mesh.corners, voxel_edge).mean(axis=1, dtype=np.float64)
+            chosen = np.flatnonzero(~self.fronts_of.in_free_space(middles)).astype(np.int32)
+        return *self.parts, VoxelizedMesh(buffers, BACK_OFFSET_VOXELS * voxel_edge, chosen)
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
@@ -120,7 +139,7 @@ class GeometryState:
     @cached_property
     def triangle_boxes(self) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
         """Least and greatest coordinates of each triangle, m."""
-        return short_axis.boxes(self.corners[..., :3].astype(np.float64))
+        return short_axis.boxes(self.corners.astype(np.float64))
 
     @cached_property
     def triangle_edges(self) -> Float64[np.ndarray, " m"]:

@@ -248,7 +248,7 @@ class LiveScene:
     def room_corners(self) -> Float32[np.ndarray, "m 3 3"] | None:
         """Corners of the real scene's triangles in the world, m; None before the first."""
         state = None if self._real is None else self._real.state
-        return None if state is None else state.corners[..., :3]
+        return None if state is None else state.corners
 
     def relight(self, taken: Sequence[PosedFrame], *, whole: bool = False) -> list[RelitFrame]:
         """Prepares a frame of each camera in the room for composition; returns none if there is nothing to compose.

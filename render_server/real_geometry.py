@@ -11,8 +11,8 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import ModelGeometry, RealScene
 from deltalight.render_server.camera_history import CameraHistory
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import Corners, GeometryState
-from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
+from deltalight.render_server.gpu_scene import CoarseMesh, GeometryState
+from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.scene.depth_surface import DepthSurface, grazing_depth_fill, noise_sigma
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
@@ -41,7 +41,7 @@ class RealGeometry:
         self._gpu = gpu
         self.budget = triangle_budget
         self._keeps_world = keeps_world
-        self._buffers = MeshBuffers(gpu)
+        self._buffers, self._coarse_buffers = MeshBuffers(gpu), MeshBuffers(gpu)
         self._materials: MaterialTable | None = None
         self.state: GeometryState | None = None
         self.material_names: tuple[str, ...] = ()
@@ -143,7 +143,7 @@ class RealGeometry:
         if not any(len(mesh.triangles) for mesh in coarse):
             self.state = None
             return
-        self._build(fine, partial(_corners, coarse))
+        self._build(fine, partial(self._coarse, coarse))
 
     def _build_from_depth(self) -> None:
         """Meshes the depth images, and with few triangles again once geometry far from the objects is asked for.
@@ -166,12 +166,12 @@ class RealGeometry:
         if not any(len(mesh.triangles) for mesh in fine):
             self.state = None
             return
-        self._build(fine, lambda: _corners(meshes(coarse_budget)), fronts_of=shown)
+        self._build(fine, lambda: self._coarse(meshes(coarse_budget)), fronts_of=shown)
 
     def _build(
         self,
         meshes: list[TriangleMesh],
-        coarse: Callable[[], Corners] | None,
+        coarse: Callable[[], CoarseMesh] | None,
         *,
         fronts_of: DepthViews | None = None,
     ) -> None:
@@ -182,22 +182,25 @@ class RealGeometry:
             self._materials = MaterialTable(self._gpu, merged, draws_maps=False)
         self.state = GeometryState(
             self._buffers,
-            triangle_corners(merged),
+            merged,
             _sample(merged.vertices[:, :3]),
             self._materials,
             coarse,
             fronts_of=fronts_of,
         )
 
+    def _coarse(self, meshes: Sequence[TriangleMesh]) -> CoarseMesh:
+        """Merges and uploads the meshes of what lies far."""
+        merged = merge_for_gpu(meshes)
+        self._coarse_buffers.write(merged)
+        return self._coarse_buffers, merged
+
     def release(self) -> None:
         """Frees the GL objects."""
         self._buffers.release()
+        self._coarse_buffers.release()
         if self._materials is not None:
             self._materials.release()
-
-
-def _corners(meshes: Sequence[TriangleMesh]) -> Corners:
-    return triangle_corners(merge_for_gpu(meshes))
 
 
 def _grazing_depth(seen: PosedFrame) -> Float32[np.ndarray, "h w"]:

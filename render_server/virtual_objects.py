@@ -14,7 +14,7 @@ from deltalight.protocol.scene_objects import Animation, AnyMaterial, SceneObjec
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent, PlacedObject
-from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
+from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip
 from deltalight.render_server.scene.gltf_meshes import GltfAsset, Pose
@@ -160,7 +160,7 @@ class VirtualObjects:
         self._buffers.cutouts = materials.bindings
         return GeometryState(
             self._buffers,
-            triangle_corners(merged),
+            merged,
             np.vstack(points),
             materials,
             objects=tuple(objects),

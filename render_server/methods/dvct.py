@@ -78,12 +78,12 @@ class InjectedVoxels:
 
     def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the real scene."""
-        self.real.fill(real.corners, placement)
+        self.real.fill(real.parts, placement)
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the objects."""
-        self.objects.fill(objects.corners, placement)
+        self.objects.fill(objects.parts, placement)
         return self.objects
 
     def find_albedo(

@@ -202,6 +202,6 @@ def shadow_receivers(real: GeometryState, extent: Points) -> Points:
     first, last = real.triangle_boxes
     meets = short_axis.all_of((first <= centre + reach) & (last >= centre - reach))
     large = meets & (real.triangle_edges > LARGE_TRIANGLE * reach)
-    corners = real.corners[large, :, :3].astype(np.float64)
+    corners = real.corners[large].astype(np.float64)
     clipped = np.clip(corners.reshape(-1, 3), centre - reach, centre + reach)
     return np.concatenate([near, clipped]) if len(near) or len(clipped) else points

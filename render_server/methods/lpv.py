@@ -6,7 +6,6 @@ from functools import partial
 
 import moderngl
 import numpy as np
-from jaxtyping import Float32
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources, Observation
@@ -56,7 +55,8 @@ from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.split_injection import RealAlbedo
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.passes.voxels import Voxelize, VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.voxelize import Meshes, Voxelize
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 
 
 class LpvCells:
@@ -99,18 +99,18 @@ class LpvCells:
     def voxelize_real(self, real: GeometryState, volume: PlacedVolume) -> VoxelStore:
         """Voxelises the real scene into surfels, if anything reads them."""
         if self._has_geometry or self._blocks_environment or self._settings.resolved_bounces > 0:
-            self._surfels(self.real, real.solid_corners(volume.placement.voxel_edge))
+            self._surfels(self.real, real.solid_parts(volume.placement.voxel_edge))
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, _volume: PlacedVolume) -> VoxelStore:
         """Voxelises the objects into surfels."""
-        self._surfels(self.objects, objects.corners)
+        self._surfels(self.objects, objects.parts)
         return self.objects
 
-    def _surfels(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"]) -> None:
+    def _surfels(self, store: VoxelStore, meshes: Meshes) -> None:
         """Voxelises at half a cell; only the store's surfels are used."""
         clear_buffer(self._gpu, store.grid)
-        self._voxelize.run(store, corners, self._half_cells)
+        self._voxelize.run(store, meshes, self._half_cells)
 
     def real_scene(
         self,

@@ -10,7 +10,6 @@ from typing import Protocol
 
 import moderngl
 import numpy as np
-from jaxtyping import Float32
 
 from deltalight.protocol.scene_method import DvctMethod, VoxelConeSettings
 from deltalight.render_server.frame import FrameResources, Observation
@@ -39,6 +38,7 @@ from deltalight.render_server.passes.voxel_light import (
     LightVoxels,
     SurfelGroups,
 )
+from deltalight.render_server.passes.voxelize import Meshes, Voxelize
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     MEGABYTE,
@@ -46,7 +46,6 @@ from deltalight.render_server.passes.voxels import (
     FilterVoxels,
     OccupyVoxels,
     ResolveVoxels,
-    Voxelize,
     VoxelMipmap,
     VoxelStore,
     volume_memory_bytes,
@@ -101,17 +100,15 @@ class VoxelSet:
         self._voxelize = Voxelize(gpu)
         self._clear = ClearVoxels(gpu, mipmaps[0].directions)
 
-    def fill(self, corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement) -> None:
+    def fill(self, meshes: Meshes, placement: VolumePlacement) -> None:
         """Replaces the voxels by those of the triangles, and clears the old ones from the mipmaps."""
-        self.fill_all([corners], (placement,))
+        self.fill_all([meshes], (placement,))
 
-    def fill_all(
-        self, corners: Sequence[Float32[np.ndarray, "m 3 10"]], placements: Sequence[VolumePlacement]
-    ) -> None:
+    def fill_all(self, meshes: Sequence[Meshes], placements: Sequence[VolumePlacement]) -> None:
         """Fills several volumes, each with the triangles of its own."""
         self._clear.run(self.store, self._mipmaps, self.volume)
         self.volume.place(*placements)
-        self._voxelize.run_all(self.store, corners, self.volume)
+        self._voxelize.run_all(self.store, meshes, self.volume)
         self.is_lit = False
 
     def resize(self, size: int, count: int) -> None:
@@ -152,7 +149,7 @@ class FarScene:
         if self._is_used:
             low, high = real.bounds
             edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
-            self._set.fill(real.coarse_corners, place_volume(low, high, FAR_SIZE, edge))
+            self._set.fill(real.coarse_parts, place_volume(low, high, FAR_SIZE, edge))
             self._block.write(self._set.volume.placement.far_block(is_used=True))
         return self._set
 
@@ -207,13 +204,13 @@ class DirectionalVoxels:
     def voxelize_real(self, real: GeometryState, placements: Placements) -> VoxelSet:
         """Voxelises the real scene, with back faces if one camera saw it."""
         self._make_room(placements)
-        self.real.fill_all([real.solid_corners(each.voxel_edge) for each in placements], placements)
+        self.real.fill_all([real.solid_parts(each.voxel_edge) for each in placements], placements)
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, placements: Placements) -> VoxelSet:
         """Voxelises the objects."""
         self._make_room(placements)
-        self.objects.fill_all([objects.corners] * len(placements), placements)
+        self.objects.fill_all([objects.parts] * len(placements), placements)
         self.objects.groups.reset(self.objects.store)
         if self._bounces > 0:
             self._group.run(

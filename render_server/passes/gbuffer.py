@@ -21,11 +21,11 @@ from deltalight.render_server.view import CameraView, Rectangle
 
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
 SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
-UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
-METALLIC, REFLECTANCE, ROUGHNESS, BY_LIGHT = (
+METALLIC, REFLECTANCE, ROUGHNESS, DOUBLE_SIDED, BY_LIGHT = (
     3,
     slice(4, 7),
     7,
+    12,
     14,
 )  # columns of the material table, as materials.glsl has them
 
@@ -136,6 +136,7 @@ class MeshBuffers:
         self._ctx = gpu.ctx
         self._vertices = gpu.ctx.buffer(reserve=4)
         self._indices = gpu.ctx.buffer(reserve=4)
+        self._sides = gpu.ctx.buffer(reserve=4)
         self._second_uv: moderngl.Buffer | None = None
         self._arrays: dict[int, moderngl.VertexArray] = {}
         self.triangles: Int32[np.ndarray, "m 3"] = np.zeros((0, 3), np.int32)
@@ -151,6 +152,11 @@ class MeshBuffers:
         """Vertices (rows of `VERTEX_LAYOUT`), for shaders that trace rays."""
         return {"Vertices": self._vertices}
 
+    @property
+    def solid(self) -> dict[str, Binding]:
+        """Vertices, triangles, and whether each material has two sides, for the voxeliser."""
+        return {"Vertices": self._vertices, "Indices": self._indices, "Sides": self._sides}
+
     def write(self, mesh: GpuMesh) -> None:
         """Replaces the contents by those of `mesh`."""
         vertices = np.ascontiguousarray(mesh.vertices, np.float32).tobytes()
@@ -160,10 +166,17 @@ class MeshBuffers:
             self.release()
             self._vertices = self._ctx.buffer(reserve=max(len(vertices), 4))
             self._indices = self._ctx.buffer(reserve=max(len(indices), 4))
+            self._sides = self._ctx.buffer(reserve=4)
         if self.triangle_count:
             self._vertices.write(vertices)
             self._indices.write(indices)
+            self._write_sides(mesh.material_table[:, DOUBLE_SIDED])
         self._write_second_uv(mesh.second_uv)
+
+    def _write_sides(self, double_sided: Float32[np.ndarray, " k"]) -> None:
+        if self._sides.size != double_sided.nbytes:
+            self._sides.orphan(double_sided.nbytes)
+        self._sides.write(double_sided.tobytes())
 
     def _write_second_uv(self, uv: Float32[np.ndarray, "n 2"] | None) -> None:
         if uv is None and self._second_uv is None:
@@ -185,7 +198,7 @@ class MeshBuffers:
 
     def release(self) -> None:
         """Frees all buffers."""
-        release_all(*self._arrays.values(), self._vertices, self._indices, self._second_uv)
+        release_all(*self._arrays.values(), self._vertices, self._indices, self._sides, self._second_uv)
         self._arrays.clear()
         self._second_uv = None
 
@@ -196,15 +209,6 @@ def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
     active = {name for _, name in parts if program.get(name, None) is not None}
     formats = (part if name in active else f"{int(part[0]) * 4}x" for part, name in parts)
     return " ".join(formats), *(name for _, name in parts if name in active)
-
-
-def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
-    """Returns each triangle's corners as the voxeliser reads them: position, uv, colour, material, double-sided."""
-    vertices = mesh.vertices
-    double_sided = np.array([material.double_sided for material in mesh.materials], np.float32)
-    flags = double_sided[vertices[:, MATERIAL].astype(int)][:, None]
-    columns = [vertices[:, :3], vertices[:, UV], vertices[:, COLOR], vertices[:, MATERIAL:], flags]
-    return np.asarray(np.concatenate(columns, axis=1)[mesh.triangles], np.float32)
 
 
 def bvh_texture(gpu: GpuContext, data: bytes) -> moderngl.Texture:
@@ -230,11 +234,11 @@ class ObjectBvh:
 
     def set_triangles(
         self,
-        corners: Float32[np.ndarray, "m 3 10"],
+        corners: Float32[np.ndarray, "m 3 3"],
         bounds: tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
         mesh: MeshBuffers,
     ) -> None:
-        """Sets triangles (positions first), their bounds (m) and vertices; a changed array is a changed shape."""
+        """Sets triangles, their bounds (m) and vertices; a changed array is a changed shape."""
         low, high = bounds
         self.centre, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
         self._corners, self._mesh = corners, mesh
@@ -245,7 +249,7 @@ class ObjectBvh:
         assert self._mesh is not None
         if self._corners is not self._built:
             self._built = self._corners
-            positions = np.ascontiguousarray(self._corners[..., :3])
+            positions = np.ascontiguousarray(self._corners)
             bvh = self._renewed(positions)
             self.release()
             self._nodes = bvh_texture(self._gpu, bvh.packed())

@@ -1,26 +1,22 @@
-"""Mipmaps of voxel volumes; sparse voxel sets, from triangles to filtered texels."""
+"""Mipmaps of voxel volumes; sparse voxel sets, from surfels to filtered texels."""
 
 import math
 from collections.abc import Sequence
 
 import moderngl
 import numpy as np
-from jaxtyping import Float32, Float64
 
-from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import (
     Binding,
-    Bindings,
     Kernel,
     clear_buffer,
     clear_volume,
     list_threads,
 )
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
-from deltalight.render_server.scene.triangle_mesh import split_triangles
+from deltalight.render_server.passes.volumes import PlacedVolume
 
 MEGABYTE = 1_000_000
 DIRECTIONS = 6  # of an anisotropic volume; isotropic ones have 1
@@ -30,15 +26,11 @@ SUMS_PER_SLOT = 24
 DELTA_SUMS_PER_SLOT = 18
 SURFELS_HEADER_BYTES = 16  # their number, padded
 TOUCHED_HEADER_BYTES = 4
-PAIR_BYTES = PAIRS_HEADER_BYTES = 8  # of a triangle and a voxel (shaders/common/voxel_pairs.glsl)
 LEAST_SURFELS = 1024
 LARGEST_ITEM_BYTES = (
     96  # of what is kept a surfel or slot: SUMS_PER_SLOT, SURFEL_LIGHT_BYTES (voxel_light.py)
 )
 LOWER_VOLUME, LOWER_SURFELS = "method.volume_size", "method.volume_size or method.triangle_budget"
-
-BORDER_VOXELS = 1e-3  # of rounding: this near, a triangle counts on both sides of a border
-LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 
 
 def mipmap_shape(size: int, directions: int, count: int = 1) -> tuple[int, int, int]:
@@ -204,90 +196,6 @@ class VoxelStore:
         """Frees all buffers."""
         self._release_growing()
         self.grid.release()
-
-
-class Voxelize:
-    """Clips triangles against the voxels they touch: surfels and touched voxels (docs/method.md 4.2)."""
-
-    def __init__(self, gpu: GpuContext) -> None:
-        self._gpu = gpu
-        self._find_pairs = Kernel(gpu, "voxel_pairs")
-        self._clip = Kernel(gpu, "voxelize")
-        self._triangles = gpu.ctx.buffer(reserve=64)
-        self._pairs = gpu.ctx.buffer(reserve=PAIRS_HEADER_BYTES + PAIR_BYTES)
-
-    def run(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"], volume: PlacedVolume) -> None:
-        """Fills the empty `store` with the surfels of the triangles inside the volume."""
-        self.run_all(store, [corners], volume)
-
-    def run_all(
-        self, store: VoxelStore, corners: Sequence[Float32[np.ndarray, "m 3 10"]], volume: PlacedVolume
-    ) -> None:
-        """Fills the empty `store`; `corners` are those of each volume."""
-        inside = [pieces_in_volume(own, each) for own, each in zip(corners, volume.placements, strict=True)]
-        store.reset(sum(bound for _, bound in inside))
-        for index, (pieces, bound) in enumerate(inside):
-            if len(pieces):
-                self._fill(store, pieces, bound, {**volume.bindings, "filled_volume": index})
-
-    def _fill(
-        self, store: VoxelStore, pieces: Float32[np.ndarray, "k 3 10"], bound: int, volume: Bindings
-    ) -> None:
-        """Adds the surfels of triangles in one of the volumes."""
-        self._write(pieces, bound)
-        shared: Bindings = {**volume, "Triangles": self._triangles, "Pairs": self._pairs}
-        self._find_pairs.run((len(pieces),), shared, triangle_count=len(pieces))
-        self._clip.run((list_threads(self._gpu, bound),), shared, store.bindings)
-
-    def _write(self, pieces: Float32[np.ndarray, "k 3 10"], bound: int) -> None:
-        """Uploads the triangles, and makes room for `bound` pairs."""
-        self._gpu.check_storage(pieces.nbytes, LOWER_SURFELS)
-        self._triangles.orphan(pieces.nbytes)
-        self._triangles.write(pieces.tobytes())
-        needed = PAIRS_HEADER_BYTES + PAIR_BYTES * bound
-        if self._pairs.size < needed:
-            self._gpu.check_storage(needed, LOWER_SURFELS)
-            self._pairs.orphan(needed)
-        self._pairs.write(bytes(PAIRS_HEADER_BYTES))
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(self._find_pairs, self._clip, self._triangles, self._pairs)
-
-
-def pieces_in_volume(
-    corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
-) -> tuple[Float32[np.ndarray, "k 3 10"], int]:
-    """Returns the triangles that meet the volume, long ones split, and a bound on their number of surfels."""
-    low, high = _voxel_extents(corners, placement)
-    met = short_axis.all_of((high >= 0) & (low < placement.size))
-    short = short_axis.all_of(high - low < LONGEST_EDGE_VOXELS / 2)
-    kept = met & short
-    split = split_triangles(corners[met & ~short], LONGEST_EDGE_VOXELS * placement.voxel_edge)
-    bound = _voxels_in(low[kept], high[kept], placement) + _voxels_in(
-        *_voxel_extents(split, placement), placement
-    )
-    return np.concatenate([corners[kept], split]), bound
-
-
-def _voxel_extents(
-    corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
-) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
-    """Returns the lowest and highest voxel coordinates of each triangle, on borders those of both sides.
-
-    The shaders' arithmetic rounds in another way, so these are at least the voxels that they find.
-    """
-    low, high = short_axis.boxes((corners[..., :3] - placement.origin) / placement.voxel_edge)
-    return np.floor(low - BORDER_VOXELS), np.floor(high + BORDER_VOXELS)
-
-
-def _voxels_in(
-    low: Float64[np.ndarray, "m 3"], high: Float64[np.ndarray, "m 3"], placement: VolumePlacement
-) -> int:
-    """Returns the number of voxels in the boxes, clipped to the volume."""
-    first, last = (np.clip(v, 0, placement.size - 1) for v in (low, high))
-    x, y, z = (last - first + 1).T
-    return int((x * y * z).sum())
 
 
 class ClearVoxels:

@@ -318,6 +318,11 @@ class GpuMesh:
     material_table: Float32[np.ndarray, "k 20"]
     second_uv: Float32[np.ndarray, "n 2"] | None
 
+    @property
+    def corners(self) -> Float32[np.ndarray, "m 3 3"]:
+        """Positions of each triangle's corners."""
+        return np.asarray(self.vertices[:, :3].take(self.triangles, axis=0))
+
     def repeats_per_m(self) -> Float32[np.ndarray, " k"]:
         """Returns how often the base colour's map repeats over a metre of each material's triangles, on average."""
         corners = self.vertices[self.triangles].astype(np.float64)

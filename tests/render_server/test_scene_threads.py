@@ -83,8 +83,8 @@ def test_the_coarse_mesh_is_made_once_and_when_asked_for(
     assert real.update([PosedFrame(seen, CameraView(seen.camera, seen.pose.world_from_camera))])
     assert real.state is not None
     assert budgets == [BUDGET]
-    coarse = real.state.coarse_corners
+    (coarse,) = real.state.coarse_parts
+    assert real.state.coarse_parts[0].mesh is coarse.mesh
     assert budgets == [BUDGET, BUDGET // COARSE_DIVISOR]
-    assert real.state.coarse_corners is coarse
-    assert 0 < len(coarse) < len(real.state.corners)
+    assert 0 < coarse.triangle_count < real.state.buffers.triangle_count
     real.release()

@@ -9,9 +9,10 @@ import trimesh
 from scipy import ndimage
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.gbuffer import triangle_corners
+from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, place_volume
-from deltalight.render_server.passes.voxels import SURFEL_BYTES, SURFELS_HEADER_BYTES, Voxelize, VoxelStore
+from deltalight.render_server.passes.voxelize import VoxelizedMesh, Voxelize
+from deltalight.render_server.passes.voxels import SURFEL_BYTES, SURFELS_HEADER_BYTES, VoxelStore
 from tests.render_server.voxel_lab import VoxelLab, gpu_mesh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -121,12 +122,14 @@ def test_faces_on_borders_of_voxels_keep_their_area(gpu: GpuContext, edge: float
     box = trimesh.creation.box((edge,) * 3)
     placement = place_volume(*box.bounds, SIZE, None)
     store, volume, voxelize = VoxelStore(gpu, SIZE), PlacedVolume(gpu, placement), Voxelize(gpu)
-    voxelize.run(store, triangle_corners(gpu_mesh(box)), volume)
+    mesh = MeshBuffers(gpu)
+    mesh.write(gpu_mesh(box))
+    voxelize.run(store, [VoxelizedMesh(mesh)], volume)
     _, count = store.counts()
     content = store.surfels.read(count * SURFEL_BYTES, offset=SURFELS_HEADER_BYTES)
     areas = np.frombuffer(content, np.float32).reshape(-1, SURFEL_BYTES // 4)[:, 3]
     assert areas.sum(dtype=np.float64) == pytest.approx(box.area, rel=1e-5)
-    for item in (store, volume, voxelize):
+    for item in (store, volume, voxelize, mesh):
         item.release()
 
 

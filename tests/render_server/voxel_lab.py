@@ -9,10 +9,11 @@ import trimesh
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Kernel
 from deltalight.render_server.gpu.uniform_block import UniformBlock
-from deltalight.render_server.passes.gbuffer import MaterialTable, triangle_corners
+from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.volumes import FarVolumeBlock, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxel_light import LightVoxels
+from deltalight.render_server.passes.voxelize import VoxelizedMesh, Voxelize
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     SURFEL_BYTES,
@@ -20,7 +21,6 @@ from deltalight.render_server.passes.voxels import (
     FilterVoxels,
     OccupyVoxels,
     ResolveVoxels,
-    Voxelize,
     VoxelMipmap,
     VoxelStore,
 )
@@ -62,7 +62,7 @@ class VoxelLab:
         self.placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, size)
         self._volume = PlacedVolume(gpu, self.placement)
         self._beyond = UniformBlock[FarVolumeBlock](gpu, self.placement.far_block(is_used=False))
-        self._voxelize = Voxelize(gpu)
+        self._voxelize, self._mesh = Voxelize(gpu), MeshBuffers(gpu)
         self._light = LightVoxels(gpu)
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
@@ -71,10 +71,15 @@ class VoxelLab:
         self._lights.set_environment(np.zeros((16, 16, 3), np.float32))
         self._cones = Kernel(gpu, Path(__file__).with_name("cones"))
 
+    def voxelize(self, store: VoxelStore, mesh: GpuMesh, behind_m: float = 0.0) -> None:
+        """Fill the empty store with the mesh, or with its backs."""
+        self._mesh.write(mesh)
+        self._voxelize.run(store, [VoxelizedMesh(self._mesh, behind_m)], self._volume)
+
     def surfels(self, mesh: GpuMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """World positions, areas, unit normals and voxel coordinates of a mesh's surfels."""
         store = VoxelStore(self.gpu, self.placement.size)
-        self._voxelize.run(store, triangle_corners(mesh), self._volume)
+        self.voxelize(store, mesh)
         _, count = store.counts()
         assert count <= store.surfel_capacity
         content = store.surfels.read(count * SURFEL_BYTES, offset=SURFELS_HEADER_BYTES) if count else b""
@@ -101,7 +106,7 @@ class VoxelLab:
             "bias_virtual": 0.0,
             "has_caustics": False,
         }
-        self._voxelize.run(voxels.store, triangle_corners(mesh), self._volume)
+        self.voxelize(voxels.store, mesh)
         self._light.light_virtual(voxels.store, scene)
         self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume)
         self._occupy.run(voxels.rho, self._volume, voxels.store)
@@ -148,6 +153,7 @@ class VoxelLab:
             self._volume,
             self._beyond,
             self._voxelize,
+            self._mesh,
             self._light,
             self._resolve,
             self._filter,

@@ -8,9 +8,10 @@
 #define SUMS_ACCESS
 #include "common/voxel_store.glsl"
 #define PAIRS_ACCESS readonly
-#include "common/voxel_pairs.glsl"
+#include "common/voxel_pieces.glsl"
 
 layout(local_size_x = 64) in;
+layout(std430) readonly buffer Sides { float double_sided[]; };   // of each material
 uniform int filled_volume;
 
 // A half plane of the piece's plane, seen along the axis nearest to its normal: dot(xy, p) + z >= 0, xy of length 1.
@@ -92,44 +93,38 @@ void touch(uint voxel) {
     for (int i = 0; i < SUMS_PER_SLOT; ++i) sums[int(slot) * SUMS_PER_SLOT + i] = 0;
 }
 
-vec2 corner_uv(Corner c) { return vec2(c.uv[0], c.uv[1]); }
-vec3 corner_tint(Corner c) { return vec3(c.tint[0], c.tint[1], c.tint[2]); }
-
-vec2 uv_at(Triangle t, vec3 p, vec3 a, vec3 b, vec3 c, vec3 n) {
+vec2 uv_at(Piece t, vec3 p, vec3 a, vec3 b, vec3 c, vec3 n) {
     float whole = dot(n, n);
     float wb = dot(cross(p - a, c - a), n) / whole, wc = dot(cross(b - a, p - a), n) / whole;
-    return (1.0 - wb - wc) * corner_uv(t.corners[0]) + wb * corner_uv(t.corners[1]) + wc * corner_uv(t.corners[2]);
+    return (1.0 - wb - wc) * t.a.uv + wb * t.b.uv + wc * t.c.uv;
 }
 
-void emit(Triangle t, vec4 piece, ivec3 voxel, vec3 a, vec3 b, vec3 c, vec3 n) {
-    if (piece.w < 1e-9) return;
+void emit(Piece t, int material, vec4 part, ivec3 voxel, vec3 a, vec3 b, vec3 c, vec3 n) {
+    if (part.w < 1e-9) return;
     uint index = atomicAdd(surfel_count, 1u);
     if (index >= uint(surfels.length())) return;
     uint v = voxel_index(voxel + ivec3(0, 0, volume * volume_size), volume_size);
     touch(v);
-    surfels[index].position_area =
-        vec4(volume_origin + piece.xyz * voxel_edge, piece.w * voxel_edge * voxel_edge);
-    surfels[index].normal_material = vec4(normalize(n), t.corners[0].material);
-    surfels[index].uv_voxel = vec4(uv_at(t, piece.xyz, a, b, c, n), uintBitsToFloat(v), t.corners[0].double_sided);
-    surfels[index].tint =
-        vec4((corner_tint(t.corners[0]) + corner_tint(t.corners[1]) + corner_tint(t.corners[2])) / 3.0, 1.0);
+    surfels[index].position_area = vec4(volume_origin + part.xyz * voxel_edge, part.w * voxel_edge * voxel_edge);
+    surfels[index].normal_material = vec4(normalize(n), float(material));
+    surfels[index].uv_voxel = vec4(uv_at(t, part.xyz, a, b, c, n), uintBitsToFloat(v), double_sided[material]);
+    surfels[index].tint = vec4((t.a.tint + t.b.tint + t.c.tint) / 3.0, 1.0);
 }
 
-void clip_to_voxel(uvec2 pair) {
-    Triangle t = triangles[pair.x];
-    ivec3 voxel = voxel_of_pair(pair);
-    vec3 a = volume_coordinate(corner_position(t.corners[0]));
-    vec3 b = volume_coordinate(corner_position(t.corners[1]));
-    vec3 c = volume_coordinate(corner_position(t.corners[2]));
+void clip_to_voxel(Pair pair) {
+    Piece t = piece_of(pair.triangle, pair.path);
+    int material = material_of(pair.triangle);
+    ivec3 voxel = voxel_of_bits(pair.voxel);
+    vec3 a = volume_coordinate(t.a.place), b = volume_coordinate(t.b.place), c = volume_coordinate(t.c.place);
     vec3 n = cross(b - a, c - a);
     bvec3 within = equal(ivec3(floor(min(a, min(b, c)))), ivec3(floor(max(a, max(b, c)))));
     if (all(within)) {   // most triangles of a depth mesh
-        emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), voxel, a, b, c, n);
+        emit(t, material, vec4((a + b + c) / 3.0, 0.5 * length(n)), voxel, a, b, c, n);
         return;
     }
     vec3 corner = vec3(voxel);
-    vec4 piece = centroid_area(a - corner, b - corner, c - corner, n, within);
-    emit(t, vec4(piece.xyz + corner, piece.w), voxel, a, b, c, n);
+    vec4 part = centroid_area(a - corner, b - corner, c - corner, n, within);
+    emit(t, material, vec4(part.xyz + corner, part.w), voxel, a, b, c, n);
 }
 
 void main() {
