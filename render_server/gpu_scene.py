@@ -98,6 +98,11 @@ class GeometryState:
     extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
     fronts_of: DepthViews | None = None  # what is solid as cameras see it: backs are not in it
 
+    @property
+    def is_measured(self) -> bool:
+        """Whether cameras saw it, so that there are many small triangles, and others with every frame."""
+        return self.coarse is not None
+
     @cached_property
     def corners(self) -> Corners:
         """Corners of all triangles, m; takes time."""

@@ -193,12 +193,15 @@ def _snapped(extent: Points) -> Points:
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:
     """Returns the real points around the objects, or all of them if none is near.
 
-    These are the vertices within reach and, for triangles too large to have a vertex there, their part of that cube.
+    These are the vertices within reach and, for a model's triangles too large to have a vertex there, their part of
+    that cube. What was measured is meshed finely, but at a grazing angle, where its vertices alone count.
     """
     low, high = short_axis.bounds(extent)
     centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
     points = real.points
     near = points[short_axis.lengths(points - centre) <= reach]
+    if real.is_measured:
+        return near if len(near) else points
     first, last = real.triangle_boxes
     meets = short_axis.all_of((first <= centre + reach) & (last >= centre - reach))
     large = meets & (real.triangle_edges > LARGE_TRIANGLE * reach)

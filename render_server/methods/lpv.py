@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import moderngl
-import numpy as np
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources, Observation

@@ -16,7 +16,8 @@ from deltalight.render_server.passes.voxels import LOWER_SURFELS, VoxelStore
 
 PAIR_BYTES, PAIRS_HEADER_BYTES = 12, 16  # shaders/common/voxel_pieces.glsl
 LONG_PIECE_BYTES = 8
-LEAST_PAIRS, LEAST_LONG_PIECES = 4096, 4096
+LEAST_LONG_PIECES = 4096
+PAIRS_PER_TRIANGLE = 2  # to begin with
 LONGEST_EDGE_VOXELS = 8.0  # longer triangles are cut: balances the threads, bounds each one's loops
 
 
@@ -55,7 +56,7 @@ class VoxelPairs:
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._pairs, self._long, self._chosen = (gpu.ctx.buffer(reserve=4) for _ in range(3))
-        self.make_room(PairCounts(LEAST_PAIRS, LEAST_LONG_PIECES, 0))
+        self.make_room(PairCounts(0, LEAST_LONG_PIECES, 0))
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -75,6 +76,7 @@ class VoxelPairs:
         self, find: Kernel, cut: Kernel, mesh: VoxelizedMesh, volume: Bindings, longest_m: float
     ) -> None:
         """Lists the pairs; those without room are only counted."""
+        self.make_room(PairCounts(PAIRS_PER_TRIANGLE * mesh.triangle_count, 0, 0))
         self._pairs.write(bytes(PAIRS_HEADER_BYTES))
         if mesh.chosen is not None:
             self._chosen.orphan(max(mesh.chosen.nbytes, 4))

@@ -11,7 +11,7 @@ from scipy import ndimage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, place_volume
-from deltalight.render_server.passes.voxelize import VoxelizedMesh, Voxelize
+from deltalight.render_server.passes.voxelize import Voxelize, VoxelizedMesh
 from deltalight.render_server.passes.voxels import SURFEL_BYTES, SURFELS_HEADER_BYTES, VoxelStore
 from tests.render_server.voxel_lab import VoxelLab, gpu_mesh
 

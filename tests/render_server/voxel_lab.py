@@ -13,7 +13,7 @@ from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.volumes import FarVolumeBlock, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxel_light import LightVoxels
-from deltalight.render_server.passes.voxelize import VoxelizedMesh, Voxelize
+from deltalight.render_server.passes.voxelize import Voxelize, VoxelizedMesh
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     SURFEL_BYTES,
