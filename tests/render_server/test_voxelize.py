@@ -1,6 +1,7 @@
 """Voxelisation is exact: no area is lost or made, and a closed mesh gives a closed shell (docs/method.md 4.2)."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,11 +9,20 @@ import pytest
 import trimesh
 from scipy import ndimage
 
+from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, place_volume
-from deltalight.render_server.passes.voxelize import Voxelize, VoxelizedMesh
+from deltalight.render_server.passes.voxelize import LONGEST_EDGE_VOXELS, Voxelize, VoxelizedMesh
 from deltalight.render_server.passes.voxels import SURFEL_BYTES, SURFELS_HEADER_BYTES, VoxelStore
+from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.triangle_mesh import (
+    GpuMesh,
+    TriangleMesh,
+    merge_for_gpu,
+    split_triangles,
+)
 from tests.render_server.voxel_lab import VoxelLab, gpu_mesh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -118,7 +128,7 @@ def test_a_sample_that_meets_anything_counts_as_occupied(lab: VoxelLab) -> None:
 
 @pytest.mark.parametrize("edge", [0.12, 0.07, 0.3])
 def test_faces_on_borders_of_voxels_keep_their_area(gpu: GpuContext, edge: float) -> None:
-    """But for rounding, which differs between the CPU, which makes room, and shaders."""
+    """But for rounding."""
     box = trimesh.creation.box((edge,) * 3)
     placement = place_volume(*box.bounds, SIZE, None)
     store, volume, voxelize = VoxelStore(gpu, SIZE), PlacedVolume(gpu, placement), Voxelize(gpu)
@@ -131,6 +141,61 @@ def test_faces_on_borders_of_voxels_keep_their_area(gpu: GpuContext, edge: float
     assert areas.sum(dtype=np.float64) == pytest.approx(box.area, rel=1e-5)
     for item in (store, volume, voxelize, mesh):
         item.release()
+
+
+def sorted_surfels(
+    lab: VoxelLab, mesh: GpuMesh, behind_m: float = 0.0, chosen: np.ndarray | None = None
+) -> np.ndarray:
+    positions, areas, normals, voxels = lab.surfels(mesh, behind_m, chosen)
+    rows = np.column_stack([positions, areas, normals, voxels])
+    return rows[np.lexsort(rows.T)]
+
+
+def of_corners(corners: np.ndarray) -> GpuMesh:
+    """A mesh of loose triangles (m, 3, 3) as they are."""
+    positions = np.ascontiguousarray(corners.reshape(-1, 3), np.float32)
+    triangles = np.arange(len(positions), dtype=np.int32).reshape(-1, 3)
+    return merge_for_gpu([TriangleMesh(positions, np.zeros_like(positions), triangles, None, Material())])
+
+
+def test_long_triangles_are_cut_into_the_pieces_of_the_mesh_code(lab: VoxelLab) -> None:
+    """To the bit, with more pieces than there is room for at first."""
+    rng = np.random.default_rng(5)
+    corners = np.concatenate(
+        [
+            rng.uniform(-20, SIZE + 20, (40, 3, 3)),
+            rng.uniform(-400, 400, (3, 3, 3)) + SIZE / 2,
+            rng.uniform(0, SIZE, (100, 1, 3)) + rng.uniform(-3, 3, (100, 3, 3)),
+        ]
+    ).astype(np.float32)
+    pieces = split_triangles(corners, LONGEST_EDGE_VOXELS)
+    assert len(pieces) > 4096
+    found = sorted_surfels(lab, of_corners(corners))
+    assert len(found) > 10_000
+    assert np.array_equal(found, sorted_surfels(lab, of_corners(pieces)))
+
+
+def test_backs_are_those_of_the_mesh_code(lab: VoxelLab) -> None:
+    rng = np.random.default_rng(6)
+    corners = rng.uniform(5, SIZE - 5, (300, 1, 3)) + rng.uniform(-4, 4, (300, 3, 3))
+    mesh = of_corners(corners)
+    backs = back_faces(mesh.corners, 1.0)
+    assert np.array_equal(
+        sorted_surfels(lab, mesh, BACK_OFFSET_VOXELS), sorted_surfels(lab, of_corners(backs))
+    )
+
+
+def test_chosen_triangles_alone_are_voxelised(lab: VoxelLab) -> None:
+    mesh = gpu_mesh(soup(np.random.default_rng(7), 50, (5.0, 5.0, 5.0)))
+    chosen = np.array([3, 17, 18, 44], np.int32)
+    wanted = sorted_surfels(lab, replace(mesh, triangles=mesh.triangles[chosen]))
+    assert np.array_equal(sorted_surfels(lab, mesh, chosen=chosen), wanted)
+
+
+def test_triangles_of_too_many_voxels_are_refused(lab: VoxelLab) -> None:
+    mesh = of_corners(np.array([[[-1e6, -1e6, 20.5], [2e6, -1e6, 20.5], [-1e6, 2e6, 20.5]]]))
+    with pytest.raises(DeltalightError, match="use fewer voxels"):
+        lab.surfels(mesh)
 
 
 TILTED = {

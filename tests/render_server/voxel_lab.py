@@ -71,15 +71,19 @@ class VoxelLab:
         self._lights.set_environment(np.zeros((16, 16, 3), np.float32))
         self._cones = Kernel(gpu, Path(__file__).with_name("cones"))
 
-    def voxelize(self, store: VoxelStore, mesh: GpuMesh, behind_m: float = 0.0) -> None:
-        """Fill the empty store with the mesh, or with its backs."""
+    def voxelize(
+        self, store: VoxelStore, mesh: GpuMesh, behind_m: float = 0.0, chosen: np.ndarray | None = None
+    ) -> None:
+        """Fill the empty store with the mesh, or with its backs, or with the chosen triangles."""
         self._mesh.write(mesh)
-        self._voxelize.run(store, [VoxelizedMesh(self._mesh, behind_m)], self._volume)
+        self._voxelize.run(store, [VoxelizedMesh(self._mesh, behind_m, chosen)], self._volume)
 
-    def surfels(self, mesh: GpuMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def surfels(
+        self, mesh: GpuMesh, behind_m: float = 0.0, chosen: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """World positions, areas, unit normals and voxel coordinates of a mesh's surfels."""
         store = VoxelStore(self.gpu, self.placement.size)
-        self.voxelize(store, mesh)
+        self.voxelize(store, mesh, behind_m, chosen)
         _, count = store.counts()
         assert count <= store.surfel_capacity
         content = store.surfels.read(count * SURFEL_BYTES, offset=SURFELS_HEADER_BYTES) if count else b""
