@@ -8,7 +8,7 @@ from typing import Any
 
 import moderngl
 
-from deltalight.render_server.gpu.textures import AsyncReadback, sizes_bytes
+from deltalight.render_server.gpu.textures import AsyncReadback, DelayedRead, sizes_bytes
 
 Wrap = Callable[[Any], Any]
 """Takes what a class has under a name, and returns what stands there instead."""
@@ -38,7 +38,7 @@ class GpuCounts:
 
     `buffer_clears` are those of moderngl, which maps the buffer and clears it on the CPU; `uploaded_bytes` go into
     buffers and textures, those of newly made ones included. `reads` wait for the GPU; the finished picture's own
-    are not counted. `uniform_writes` are of single uniforms: blocks are uploads.
+    and those of earlier frames' numbers are not counted. `uniform_writes` are of single uniforms: blocks are uploads.
     """
 
     dispatches: int = 0
@@ -63,7 +63,8 @@ class _Counter:
         writes = [(owner, "write", _noting(self._upload)) for owner in (moderngl.Buffer, *TEXTURES)]
         makers = [(moderngl.Context, name, _noting(self._make_texture)) for name in MAKERS]
         reads = [(owner, name, _noting(self._read)) for owner, name in READS]
-        picture = [(AsyncReadback, name, self._excepting_reads) for name in ("push", "pop")]
+        late = ((AsyncReadback, "push"), (AsyncReadback, "pop"), (DelayedRead, "pop"))
+        picture = [(owner, name, self._excepting_reads) for owner, name in late]
         return [
             *((owner, name, _noting(self._dispatch)) for owner, name in DISPATCHES),
             *((owner, name, _noting(self._draw)) for owner, name in DRAWS),

@@ -179,3 +179,37 @@ class AsyncReadback:
             buffer.release()
         self._free.clear()
         self._waiting.clear()
+
+
+class DelayedRead:
+    """First bytes of a buffer as they were in the last frame but one, for which nobody waits: by now it is done."""
+
+    def __init__(self, gpu: GpuContext, size: int) -> None:
+        self._ctx, self._size = gpu.ctx, size
+        self._free: list[moderngl.Buffer] = []
+        self._waiting: deque[moderngl.Buffer] = deque()
+
+    def push(self, source: moderngl.Buffer) -> None:
+        """Copies the first bytes of `source`; once a frame."""
+        copy = self._free.pop() if self._free else self._ctx.buffer(reserve=self._size, dynamic=True)
+        self._ctx.copy_buffer(copy, source, self._size)
+        self._waiting.append(copy)
+
+    def pop(self) -> bytes | None:
+        """Returns what was pushed in the last frame but one, once, in a frame that has not pushed yet; None: nothing."""
+        if len(self._waiting) < RING - 1:
+            return None
+        copy = self._waiting.popleft()
+        self._free.append(copy)
+        return copy.read(self._size)
+
+    def forget(self) -> None:
+        """Forgets what was pushed."""
+        self._free += self._waiting
+        self._waiting.clear()
+
+    def release(self) -> None:
+        """Frees the copies."""
+        self.forget()
+        release_all(*self._free)
+        self._free.clear()

@@ -1,23 +1,28 @@
 """From triangles to surfels and touched voxels (docs/method.md 4.2)."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import moderngl
 import numpy as np
 from jaxtyping import Int32
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.textures import DelayedRead, release_all
 from deltalight.render_server.passes.gbuffer import MeshBuffers
-from deltalight.render_server.passes.volumes import PlacedVolume
+from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import LOWER_SURFELS, VoxelStore
 
-PAIR_BYTES, PAIRS_HEADER_BYTES = 12, 16  # shaders/common/voxel_pieces.glsl
+PAIR_BYTES, PAIRS_HEADER_BYTES, COUNTS_BYTES = 12, 16, 12  # shaders/common/voxel_pieces.glsl
 LONG_PIECE_BYTES = 8
 LEAST_LONG_PIECES = 4096
 PAIRS_PER_TRIANGLE = 2  # to begin with
+# How many pairs are expected by those of earlier frames: so many times as many, and so many a voxel of a face.
+GROWTH, MORE_A_FACE = 1.5, 2.0
+MORE_TRIANGLES = 1.25  # beyond so many times as many, earlier frames tell nothing
 LONGEST_EDGE_VOXELS = 8.0  # longer triangles are cut: balances the threads, bounds each one's loops
 
 
@@ -43,11 +48,94 @@ Meshes = Sequence[VoxelizedMesh]
 
 @dataclass(frozen=True)
 class PairCounts:
-    """How many pairs and long pieces were found, with those that had no room, and pieces too long to be cut."""
+    """How many pairs and long pieces were found, with those that had no room; pieces too long to be cut."""
 
     pairs: int
     long_pieces: int
-    refused: int
+    refused: int = 0
+
+    @classmethod
+    def of(cls, header: bytes) -> "PairCounts":
+        """Returns the counts of the pairs' header.
+
+        Raises:
+            DeltalightError: pieces were refused.
+        """
+        counts = cls(*np.frombuffer(header, np.uint32).tolist())
+        if counts.refused:
+            raise DeltalightError(
+                "a mesh has triangles of more than a hundred thousand voxels; use fewer voxels or a smaller mesh."
+            )
+        return counts
+
+    def fits(self, room: "PairCounts") -> bool:
+        """Whether so many have room."""
+        return self.pairs <= room.pairs and self.long_pieces <= room.long_pieces
+
+
+@dataclass(frozen=True, eq=False)
+class Filling:
+    """A mesh that is to fill a volume, how many triangles it has now, and the bindings of both."""
+
+    mesh: VoxelizedMesh
+    triangle_count: int
+    placement: VolumePlacement
+    bindings: Bindings
+
+    def is_like(self, other: "Filling") -> bool:
+        """Whether about as many pairs may be expected: of as many triangles, and voxels of one size."""
+        mine, its = self.placement, other.placement
+        is_more = self.triangle_count > MORE_TRIANGLES * other.triangle_count
+        return not is_more and (mine.voxel_edge, mine.size) == (
+            its.voxel_edge,
+            its.size,
+        )
+
+
+class EarlierCounts:
+    """What earlier fillings tell about the next one, so that the CPU need not wait for the GPU to count.
+
+    Where they tell nothing it waits, and in software always: it has nothing else to do. A filling that has more pairs
+    than expected lacks them; two fillings later that is known, and the CPU waits.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._late = DelayedRead(gpu, COUNTS_BYTES)
+        self._waiting: deque[tuple[Filling, PairCounts]] = deque()  # and the room that each had
+        self._known: tuple[Filling, PairCounts] | None = None
+
+    def expected(self, filling: Filling) -> PairCounts | None:
+        """Returns for how many to make room; None: wait and see."""
+        header = self._late.pop()
+        if header is not None:
+            before, room = self._waiting.popleft()
+            counts = PairCounts.of(header)
+            self._known = (before, counts) if counts.fits(room) else None
+        if self._gpu.is_software or self._known is None:
+            return None
+        before, counts = self._known
+        if not filling.is_like(before):
+            return None
+        pairs = GROWTH * counts.pairs + MORE_A_FACE * filling.placement.size**2
+        return PairCounts(int(pairs), LEAST_LONG_PIECES + 2 * counts.long_pieces)
+
+    def wait(self, filling: Filling, pairs: moderngl.Buffer) -> PairCounts:
+        """Waits for the counts of a filling, and forgets those of earlier ones."""
+        self._late.forget()
+        self._waiting.clear()
+        counts = PairCounts.of(pairs.read(COUNTS_BYTES))
+        self._known = filling, counts
+        return counts
+
+    def note(self, filling: Filling, room: PairCounts, pairs: moderngl.Buffer) -> None:
+        """Notes a filling whose counts are not known yet."""
+        self._late.push(pairs)
+        self._waiting.append((filling, room))
+
+    def release(self) -> None:
+        """Frees the buffers."""
+        self._late.release()
 
 
 class VoxelPairs:
@@ -56,7 +144,10 @@ class VoxelPairs:
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._pairs, self._long, self._chosen = (gpu.ctx.buffer(reserve=4) for _ in range(3))
-        self.make_room(PairCounts(0, LEAST_LONG_PIECES, 0))
+        self._find = Kernel(gpu, "voxel_pairs")
+        self._cut = Kernel(gpu, "voxel_pairs", LONG=1)
+        self._earlier = EarlierCounts(gpu)
+        self._expected: PairCounts | None = None
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -64,57 +155,69 @@ class VoxelPairs:
         return {"Pairs": self._pairs}
 
     @property
-    def pair_capacity(self) -> int:
-        """How many pairs there is room for."""
-        return (self._pairs.size - PAIRS_HEADER_BYTES) // PAIR_BYTES
+    def _room(self) -> PairCounts:
+        pairs = (self._pairs.size - PAIRS_HEADER_BYTES) // PAIR_BYTES
+        return PairCounts(pairs, self._long.size // LONG_PIECE_BYTES)
 
-    @property
-    def _long_capacity(self) -> int:
-        return self._long.size // LONG_PIECE_BYTES
+    def begin(self, filling: Filling) -> None:
+        """Begins to list the pairs."""
+        self._expected = self._earlier.expected(filling)
+        guess = PairCounts(PAIRS_PER_TRIANGLE * filling.triangle_count, LEAST_LONG_PIECES)
+        self._make_room(self._expected or guess)
+        self._list(filling)
 
-    def find(
-        self, find: Kernel, cut: Kernel, mesh: VoxelizedMesh, volume: Bindings, longest_m: float
-    ) -> None:
-        """Lists the pairs; those without room are only counted."""
-        self.make_room(PairCounts(PAIRS_PER_TRIANGLE * mesh.triangle_count, 0, 0))
+    def bound(self, filling: Filling) -> int:
+        """Returns how many pairs there are at most."""
+        if self._expected is not None:
+            self._earlier.note(filling, self._expected, self._pairs)
+            return self._expected.pairs
+        counts = self._earlier.wait(filling, self._pairs)
+        while not counts.fits(self._room):
+            self._make_room(counts)
+            self._list(filling)
+            counts = self._earlier.wait(filling, self._pairs)
+        return counts.pairs
+
+    def _make_room(self, wanted: PairCounts) -> None:
+        """Makes room for so many and some more; what was found is lost."""
+        sizes = (
+            (self._pairs, PAIRS_HEADER_BYTES + PAIR_BYTES * wanted.pairs),
+            (self._long, LONG_PIECE_BYTES * wanted.long_pieces),
+        )
+        for buffer, size in sizes:
+            if buffer.size < size:
+                self._gpu.check_storage(size, LOWER_SURFELS)
+                buffer.orphan(size * 5 // 4)
+
+    def _list(self, filling: Filling) -> None:
+        """Lists the pairs of short triangles, then those of long ones; what has no room is only counted."""
         self._pairs.write(bytes(PAIRS_HEADER_BYTES))
-        if mesh.chosen is not None:
-            self._chosen.orphan(max(mesh.chosen.nbytes, 4))
-            self._chosen.write(mesh.chosen.tobytes())
+        mesh, longest_m = filling.mesh, LONGEST_EDGE_VOXELS * filling.placement.voxel_edge
         shared: Bindings = {
-            **volume,
-            **mesh.mesh.solid,
+            **filling.bindings,
             **self.bindings,
             "LongPieces": self._long,
             "longest_kept": longest_m,
         }
-        count = mesh.triangle_count
-        chosen = None if mesh.chosen is None else self._chosen
-        find.run((count,), shared, Chosen=chosen, is_chosen=chosen is not None, triangle_count=count)
-        cut.run((list_threads(self._gpu, self._long_capacity),), shared)
-
-    def counts(self) -> PairCounts:
-        """Returns what `find` counted; waits for the GPU."""
-        return PairCounts(*np.frombuffer(self._pairs.read(12), np.uint32).tolist())
-
-    def holds(self, counts: PairCounts) -> bool:
-        """Whether there is room for so many."""
-        return counts.pairs <= self.pair_capacity and counts.long_pieces <= self._long_capacity
-
-    def make_room(self, counts: PairCounts) -> None:
-        """Makes room for so many and some more; what was found is lost."""
-        wanted = (
-            (self._pairs, PAIRS_HEADER_BYTES, PAIR_BYTES, counts.pairs),
-            (self._long, 0, LONG_PIECE_BYTES, counts.long_pieces),
+        self._find.run(
+            (filling.triangle_count,),
+            shared,
+            Chosen=self._write_chosen(mesh),
+            is_chosen=mesh.chosen is not None,
+            triangle_count=filling.triangle_count,
         )
-        for buffer, header, item_bytes, count in wanted:
-            if buffer.size < header + item_bytes * count:
-                self._gpu.check_storage(header + item_bytes * count, LOWER_SURFELS)
-                buffer.orphan(header + item_bytes * count * 5 // 4)
+        self._cut.run((list_threads(self._gpu, self._room.long_pieces),), shared)
+
+    def _write_chosen(self, mesh: VoxelizedMesh) -> moderngl.Buffer | None:
+        if mesh.chosen is None:
+            return None
+        self._chosen.orphan(mesh.chosen.nbytes)
+        self._chosen.write(mesh.chosen.tobytes())
+        return self._chosen
 
     def release(self) -> None:
-        """Frees the buffers."""
-        release_all(self._pairs, self._long, self._chosen)
+        """Frees the GL objects."""
+        release_all(self._pairs, self._long, self._chosen, self._find, self._cut, self._earlier)
 
 
 class Voxelize:
@@ -122,10 +225,8 @@ class Voxelize:
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
-        self._find = Kernel(gpu, "voxel_pairs")
-        self._cut = Kernel(gpu, "voxel_pairs", LONG=1)
+        self._pairs = [VoxelPairs(gpu)]  # of each filling
         self._clip = Kernel(gpu, "voxelize")
-        self._pairs: list[VoxelPairs] = []
 
     def run(self, store: VoxelStore, meshes: Meshes, volume: PlacedVolume) -> None:
         """Fills the empty `store` with the surfels of the triangles inside the volume."""
@@ -137,54 +238,33 @@ class Voxelize:
         Raises:
             DeltalightError: the triangles are too long for such small voxels, or no buffer holds their surfels.
         """
-        placed = [
-            (index, mesh) for index, own in enumerate(meshes) for mesh in own if mesh.triangle_count > 0
-        ]
-        while len(self._pairs) < len(placed):
+        fillings = _fillings(meshes, volume)
+        while len(self._pairs) < len(fillings):
             self._pairs.append(VoxelPairs(self._gpu))
-        fillings = [
-            _Filling(
-                pairs,
-                mesh,
-                {**volume.bindings, "filled_volume": index, "behind": mesh.behind_m},
-                LONGEST_EDGE_VOXELS * volume.placements[index].voxel_edge,
-            )
-            for pairs, (index, mesh) in zip(self._pairs, placed, strict=False)
-        ]
-        for each in fillings:
-            self._list(each)
-        counts = [self._counted(each) for each in fillings]
-        store.reset(sum(counts))
-        for each, count in zip(fillings, counts, strict=True):
-            shared: Bindings = {**each.volume, **each.mesh.mesh.solid, **each.pairs.bindings}
-            self._clip.run((list_threads(self._gpu, count),), shared, store.bindings)
-
-    def _list(self, each: "_Filling") -> None:
-        each.pairs.find(self._find, self._cut, each.mesh, each.volume, each.longest_m)
-
-    def _counted(self, each: "_Filling") -> int:
-        """Returns how many pairs there are, and makes room for all of them."""
-        counts = each.pairs.counts()
-        while not each.pairs.holds(counts):
-            each.pairs.make_room(counts)
-            self._list(each)
-            counts = each.pairs.counts()
-        if counts.refused:
-            raise DeltalightError(
-                "a mesh has triangles of more than a hundred thousand voxels; use fewer voxels or a smaller mesh."
-            )
-        return counts.pairs
+        both = list(zip(fillings, self._pairs, strict=False))
+        for filling, pairs in both:
+            pairs.begin(filling)
+        bounds = [pairs.bound(filling) for filling, pairs in both]
+        store.reset(sum(bounds))
+        for bound, (filling, pairs) in zip(bounds, both, strict=True):
+            threads = list_threads(self._gpu, bound)
+            self._clip.run((threads,), filling.bindings, pairs.bindings, store.bindings)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._find, self._cut, self._clip, *self._pairs)
+        release_all(self._clip, *self._pairs)
 
 
-@dataclass(frozen=True, eq=False)
-class _Filling:
-    """A mesh, the bindings of the volume that it is to fill, and from which edge on (m) triangles are cut."""
-
-    pairs: VoxelPairs
-    mesh: VoxelizedMesh
-    volume: Bindings
-    longest_m: float
+def _fillings(meshes: Sequence[Meshes], volume: PlacedVolume) -> list[Filling]:
+    """Returns what fills the volumes; `meshes` are those of each."""
+    return [
+        Filling(
+            mesh,
+            mesh.triangle_count,
+            volume.placements[index],
+            {**volume.bindings, **mesh.mesh.solid, "filled_volume": index, "behind": mesh.behind_m},
+        )
+        for index, own in enumerate(meshes)
+        for mesh in own
+        if mesh.triangle_count > 0
+    ]

@@ -13,7 +13,12 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, place_volume
-from deltalight.render_server.passes.voxelize import LONGEST_EDGE_VOXELS, Voxelize, VoxelizedMesh
+from deltalight.render_server.passes.voxelize import (
+    LONGEST_EDGE_VOXELS,
+    EarlierCounts,
+    Voxelize,
+    VoxelizedMesh,
+)
 from deltalight.render_server.passes.voxels import SURFEL_BYTES, SURFELS_HEADER_BYTES, VoxelStore
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
 from deltalight.render_server.scene.materials import Material
@@ -190,6 +195,30 @@ def test_chosen_triangles_alone_are_voxelised(lab: VoxelLab) -> None:
     chosen = np.array([3, 17, 18, 44], np.int32)
     wanted = sorted_surfels(lab, replace(mesh, triangles=mesh.triangles[chosen]))
     assert np.array_equal(sorted_surfels(lab, mesh, chosen=chosen), wanted)
+
+
+def test_a_gpu_counts_without_being_waited_for(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for the first filling, and for the second after one that had no room for all."""
+    lab = VoxelLab(replace(gpu, is_software=False), SIZE)
+    exact = VoxelLab(gpu, SIZE)
+    few, many = (gpu_mesh(soup(np.random.default_rng(8), 400, (edge,) * 3)) for edge in (1.5, 25.0))
+    shown = [few] * 4 + [many] * 6
+    waited: list[int] = []
+    missing: list[int] = []
+    wanted = {id(mesh): len(exact.surfels(mesh)[1]) for mesh in (few, many)}
+    wait = EarlierCounts.wait
+
+    def noted(earlier: EarlierCounts, *given: Any) -> Any:  # noqa: ANN401
+        waited.append(len(missing))
+        return wait(earlier, *given)
+
+    monkeypatch.setattr(EarlierCounts, "wait", noted)
+    for mesh in shown:
+        missing.append(wanted[id(mesh)] - len(lab.surfels(mesh)[1]))
+    assert set(waited) == {0, 6}
+    assert [step for step, count in enumerate(missing) if count] == [4, 5]
+    for each in (lab, exact):
+        each.release()
 
 
 def test_triangles_of_too_many_voxels_are_refused(lab: VoxelLab) -> None:
