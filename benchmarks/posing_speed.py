@@ -1,8 +1,7 @@
 """Processor time of a moving object per frame: `python -m deltalight.benchmarks.posing_speed` (a minute).
 
 A ball each of whose vertices depends on four of forty joints. The steps are those of
-`render_server/virtual_objects.py`; the last one is the voxeliser's work before the GPU's, for a volume of 256^3
-voxels.
+`render_server/virtual_objects.py`.
 """
 
 import tempfile
@@ -15,9 +14,6 @@ import numpy as np
 import trimesh
 
 from deltalight.benchmarks.glb_builder import GlbBuilder
-from deltalight.render_server.passes.gbuffer import triangle_corners
-from deltalight.render_server.passes.volumes import place_volume
-from deltalight.render_server.passes.voxels import pieces_in_volume
 from deltalight.render_server.scene.gltf_meshes import load_gltf
 from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
 
@@ -66,17 +62,14 @@ def row(path: Path) -> str:
     pose_ms, meshes = timed(lambda: asset.meshes(asset.pose(clip, 0.3)))
     place_ms, placed = timed(lambda: [mesh.transformed(np.diag([2.0, 2, 2, 1])) for mesh in meshes])
     merge_ms, merged = timed(lambda: merge_for_gpu(placed))
-    corners_ms, corners = timed(lambda: triangle_corners(merged))
-    bounds = placed[0].bounds().astype(np.float64)
-    split_ms, _ = timed(lambda: pieces_in_volume(corners, place_volume(bounds[0], bounds[1], 256, None)))
     counts = f"{len(merged.vertices):>8} {len(merged.triangles):>9}"
-    steps = (pose_ms, place_ms, merge_ms + corners_ms, split_ms)
+    steps = (pose_ms, place_ms, merge_ms)
     return counts + "".join(f" {spent_ms:>10.1f}" for spent_ms in steps)
 
 
 def main() -> None:
     """Print the table."""
-    print("vertices triangles    pose ms   place ms   merge ms   split ms")
+    print("vertices triangles    pose ms   place ms   merge ms")
     with tempfile.TemporaryDirectory() as folder:
         for subdivisions in (3, 4, 5, 6, 7):
             print(row(skinned_ball(Path(folder) / "ball.glb", subdivisions)))

@@ -196,7 +196,7 @@ class DelayedRead:
         self._waiting.append(copy)
 
     def pop(self) -> bytes | None:
-        """Returns what was pushed in the last frame but one, once, in a frame that has not pushed yet; None: nothing."""
+        """Returns what was pushed in the last frame but one; once, before the frame pushes. None: nothing."""
         if len(self._waiting) < RING - 1:
             return None
         copy = self._waiting.popleft()

@@ -159,17 +159,16 @@ class MeshBuffers:
 
     def write(self, mesh: GpuMesh) -> None:
         """Replaces the contents by those of `mesh`."""
-        vertices = np.ascontiguousarray(mesh.vertices, np.float32).tobytes()
+        vertices = np.ascontiguousarray(mesh.vertices, np.float32)
         self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
-        indices = self.triangles.tobytes()
-        if len(vertices) > self._vertices.size or len(indices) > self._indices.size:
+        if vertices.nbytes > self._vertices.size or self.triangles.nbytes > self._indices.size:
             self.release()
-            self._vertices = self._ctx.buffer(reserve=max(len(vertices), 4))
-            self._indices = self._ctx.buffer(reserve=max(len(indices), 4))
+            self._vertices = self._ctx.buffer(reserve=max(vertices.nbytes, 4))
+            self._indices = self._ctx.buffer(reserve=max(self.triangles.nbytes, 4))
             self._sides = self._ctx.buffer(reserve=4)
         if self.triangle_count:
             self._vertices.write(vertices)
-            self._indices.write(indices)
+            self._indices.write(self.triangles)
             self._write_sides(mesh.material_table[:, DOUBLE_SIDED])
         self._write_second_uv(mesh.second_uv)
 

@@ -279,7 +279,9 @@ def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
 def joined_triangles(
     parts: Sequence[Int32[np.ndarray, "_ 3"]], vertex_counts: Sequence[int]
 ) -> Int32[np.ndarray, "m 3"]:
-    """Concatenates triangles whose vertices are concatenated too."""
+    """Concatenates triangles whose vertices are concatenated too; those of one mesh are not copied."""
+    if len(parts) == 1:
+        return parts[0]
     starts = np.cumsum([0, *vertex_counts[:-1]])
     moved = [triangles + start for triangles, start in zip(parts, starts, strict=True)]
     return np.concatenate(moved).astype(np.int32)
@@ -365,8 +367,9 @@ def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
     if not meshes:
         raise DeltalightError("there is no mesh to draw; give the scene an object.")
     materials = tuple(mesh.material for mesh in meshes)
+    vertices = [_interleaved(mesh, index) for index, mesh in enumerate(meshes)]
     return GpuMesh(
-        np.concatenate([_interleaved(mesh, index) for index, mesh in enumerate(meshes)]),
+        vertices[0] if len(vertices) == 1 else np.concatenate(vertices),
         joined_triangles([mesh.triangles for mesh in meshes], [len(mesh.positions) for mesh in meshes]),
         materials,
         material_table(materials),

@@ -147,7 +147,7 @@ def test_the_paths_of_gpus_make_the_same_picture_without_waiting(
     pictures, dispatches = pictures_of(replace(gpu, is_software=False), case, tmp_path, checks=True)
     assert min(psnr_db(one, other) for one, other in zip(pictures, expected, strict=True)) >= LEAST_PSNR_DB
     assert audit == []
-    assert readers == {f"deltalight.render_server.{name}" for name in ("gpu.textures", "passes.voxelize")}
+    assert readers - {"deltalight.render_server.passes.voxelize"} == {"deltalight.render_server.gpu.textures"}
     assert any(one.kernel.startswith("mirror_smooth") for part in dispatches for one in part) == (
         case.method in ("exact", "differential", "dlpv")
     )

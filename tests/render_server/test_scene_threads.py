@@ -8,10 +8,12 @@ from deltalight.protocol.frames import DepthImage
 from deltalight.protocol.scene_objects import RealScene
 from deltalight.render_server import real_geometry
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.methods.light_maps import shadow_receivers
 from deltalight.render_server.real_geometry import COARSE_DIVISOR, RealGeometry
 from deltalight.render_server.scene import threads
 from deltalight.render_server.scene.depth_surface import depth_surface
 from deltalight.render_server.scene.threads import BAND_ROWS, by_bands
+from deltalight.render_server.scene.triangle_mesh import GpuMesh
 from deltalight.render_server.view import CameraView, PosedFrame
 from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at
 
@@ -63,6 +65,31 @@ def test_normals_do_not_depend_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> 
     assert np.isfinite(found[0].gradient).any()
     assert np.array_equal(found[0].gradient, found[1].gradient, equal_nan=True)
     assert np.array_equal(found[0].normals, found[1].normals)
+
+
+def test_no_array_of_a_measured_room_s_triangles_is_made(
+    gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Voxels and shadow views of a new frame: shaders read the mesh's own buffers."""
+
+    def refuse(_: GpuMesh) -> None:
+        raise AssertionError("an array of all triangles' corners")
+
+    monkeypatch.setattr(GpuMesh, "corners", property(refuse))
+    pose = look_at((0.25, -0.9, 0.65))
+    seen = frame(checkered(), pose=pose, depth=depth_image(floor_depth(pose)))
+    real = RealGeometry(gpu, RealScene(), BUDGET)
+    assert seen.pose is not None
+    real.update([PosedFrame(seen, CameraView(seen.camera, seen.pose.world_from_camera))])
+    assert real.state is not None
+    fronts, backs = real.state.solid_parts(0.01)
+    assert fronts.triangle_count > backs.triangle_count > 0
+    assert backs.behind_m > fronts.behind_m == 0
+    receivers = shadow_receivers(real.state, np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.1]]))
+    assert 0 < len(receivers) <= len(real.state.points)
+    with pytest.raises(AssertionError, match="all triangles"):
+        _ = real.state.corners
+    real.release()
 
 
 def test_the_coarse_mesh_is_made_once_and_when_asked_for(
