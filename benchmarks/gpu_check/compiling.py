@@ -6,7 +6,7 @@ what the driver kept on disk.
 """
 
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,9 +36,9 @@ class UncompiledShader(moderngl.ComputeShader):
     def __del__(self) -> None:
         pass
 
-    def __iter__(self) -> Iterator[str]:
+    def __iter__(self) -> Generator[str, None, None]:
         """Names no resource."""
-        return iter(())
+        yield from ()
 
     def run(self, group_x: int = 1, group_y: int = 1, group_z: int = 1) -> None:
         """Does nothing."""
@@ -105,7 +105,7 @@ def asked_variants(part: str) -> dict[str, str]:
 
     with opened_context() as gpu, TemporaryDirectory() as folder, suppress(Exception):
         gpu.compile_watchers.append(note)
-        gpu.ctx.compute_shader = lambda _source: UncompiledShader()  # type: ignore[method-assign]
+        gpu.ctx.compute_shader = lambda source: UncompiledShader()  # type: ignore[method-assign] # noqa: ARG005
         shader_parts()[part](gpu, Path(folder))
     return found
 
