@@ -74,16 +74,23 @@ class FrameTimes:
 
 
 def measure_speed(
-    job: SpeedJob, budget_ms: float, progress: Progress, keep: Keep, *, end_to_end: bool
+    job: SpeedJob,
+    budget_ms: float,
+    progress: Progress,
+    keep: Keep,
+    *,
+    end_to_end: bool,
+    take: Take | None = None,
 ) -> SpeedReport:
     """Measure every motion by every method; frames that take longer than `budget_ms` are late.
 
-    `keep` is given the report so far after every motion, so that nothing is lost where a run is stopped.
+    `keep` is given the report so far after every motion, so that nothing is lost where a run is stopped. `take`: the
+    frames, if they have been prepared.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a process that died for good.
     """
-    scenes, take = job.scenes(), prepare_take(progress)
+    scenes, take = job.scenes(), take or prepare_take(progress)
     with opened(job.device) as gpu:
         frame = take.standing[0].camera
         report = SpeedReport(
