@@ -1,7 +1,7 @@
 """Every shader variant through the driver's compiler, on all cores.
 
 Scenes ask for their variants one after the other, many of them for the same ones. So the scenes are rendered without
-compiling first, which tells most variants; then these are compiled, each once; then the scenes are rendered, with
+compiling first, which tells the compute shaders; these are compiled, each once; then the scenes are rendered, with
 what the driver kept on disk.
 """
 
