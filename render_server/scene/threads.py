@@ -10,6 +10,7 @@ Result = TypeVar("Result")
 
 # Of a picture: few enough to stay in a core's cache, so many that threads seldom wait for each other.
 BAND_ROWS = 120
+MIN_BAND_ROWS = 24  # where cores would be idle otherwise
 
 
 def begun(call: Callable[[], Result]) -> "Future[Result]":
@@ -23,13 +24,15 @@ def by_bands(work: Callable[[slice], None], rows: int) -> None:
     Raises:
         Exception: what `work` raises.
     """
-    bands = iter([slice(first, min(first + BAND_ROWS, rows)) for first in range(0, rows, BAND_ROWS)])
+    step = min(BAND_ROWS, max(-(-rows // _cores()), MIN_BAND_ROWS))
+    every = [slice(first, min(first + step, rows)) for first in range(0, rows, step)]
+    bands = iter(every)
 
     def work_on() -> None:
         for band in bands:
             work(band)
 
-    helpers = [begun(work_on) for _ in range(_cores() - 1)]
+    helpers = [begun(work_on) for _ in range(min(_cores(), len(every)) - 1)]
     work_on()
     for each in helpers:
         if not each.cancel():
