@@ -45,11 +45,11 @@ COLOR_SIGMAS = 3.0
 # Fraction of a strip that must look like a grazing surface for all of it to count as one: all but a mixed pixel at
 # either side of strips 8 pixels wide. Of blurred edges of near things before far ones, a third or more is mixed.
 MIN_GRAZING_FRACTION = 0.75
-ALL_ROWS = slice(None)
 
 Map = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 Colors = Float32[np.ndarray, "h w 3"]
+Pixels = slice | Int64[np.ndarray, "k w"]  # flat indices
 Jumps = tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]
 
 
@@ -102,7 +102,7 @@ def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     def move(rows: slice) -> None:
         moved = by_pixel[:, rows].copy()
         _move_windows(by_pixel, crossed, radius, rows, moved)
-        gradient[:, rows] = by_ray(moved, camera, rows)
+        gradient[:, rows] = by_ray(moved, camera, slice(rows.start * shape[1], rows.stop * shape[1]))
 
     if camera.has_distortion:
         _pixel_from_ray(camera)  # once, before threads ask for it
@@ -266,7 +266,7 @@ def _move_windows(
     rows: slice,
     moved: Float32[np.ndarray, "2 k w"],
 ) -> None:
-    """Gives pixels of some rows whose window crosses an edge the slope of a shifted window that does not, in `moved`."""
+    """Gives pixels of some rows whose window crosses an edge the slope of a shifted one that does not, in `moved`."""
     width, first = crossed.shape[1], rows.start * crossed.shape[1]
     slopes, own = gradient.reshape(2, -1), moved.reshape(2, -1)
     pending = np.flatnonzero(crossed[rows]) + first
@@ -280,21 +280,21 @@ def _move_windows(
 
 
 def by_ray(
-    by_pixel: Float32[np.ndarray, "2 k w"], camera: CameraModel, rows: slice = ALL_ROWS
+    by_pixel: Float32[np.ndarray, "2 k w"], camera: CameraModel, pixels: Pixels
 ) -> Float32[np.ndarray, "2 k w"]:
-    """Turns a change by pixel, of some rows of the picture, into a change by ray coordinate."""
+    """Turns a change by pixel, at these pixels (flat indices), into a change by ray coordinate."""
     if not camera.has_distortion:
         return by_pixel * camera.matrix[[0, 1], [0, 1]].astype(np.float32)[:, None, None]
-    inverse = _pixel_from_ray(camera)[:, :, rows]
+    inverse = _pixel_from_ray(camera)[:, :, pixels].reshape(2, *by_pixel.shape)
     return np.stack([(by_pixel * inverse[:, ray]).sum(axis=0) for ray in (0, 1)])
 
 
 @lru_cache(maxsize=LENSES_KEPT)
-def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 h w"]:
+def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 n"]:
     """Returns the change of pixel coordinates (first axis) by ray coordinates (second) at every pixel."""
     rays = camera.rays().astype(np.float64)
     jacobian = np.stack([np.gradient(rays, axis=1), np.gradient(rays, axis=0)], axis=-1)
-    return np.ascontiguousarray(np.linalg.inv(jacobian).transpose(2, 3, 0, 1), np.float32)
+    return np.ascontiguousarray(np.linalg.inv(jacobian).transpose(2, 3, 0, 1), np.float32).reshape(2, 2, -1)
 
 
 def surface_normals(
