@@ -154,7 +154,7 @@ class RealGeometry:
         grazing = [begun(partial(_grazing_depth, each)) for each in seen]  # while surfaces are fitted
         shown = DepthViews(tuple(map(_posed_surface, self.cameras, seen)))
         known = [
-            (each, frame.surface, fill.result())
+            (each, frame.surface, fill.result)
             for each, frame, fill in zip(seen, shown.frames, grazing, strict=True)
         ]
 
@@ -206,7 +206,10 @@ def _grazing_depth(seen: PosedFrame) -> Float32[np.ndarray, "h w"]:
 
 
 def _depth_mesh(
-    seen: PosedFrame, surface: DepthSurface, grazing: Float32[np.ndarray, "h w"], triangle_budget: int
+    seen: PosedFrame,
+    surface: DepthSurface,
+    grazing: Callable[[], Float32[np.ndarray, "h w"]],
+    triangle_budget: int,
 ) -> TriangleMesh:
     """Returns a mesh of what a camera saw."""
     view = seen.view

@@ -1,5 +1,6 @@
 """Triangle mesh of one depth image, and back faces for it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,11 +16,12 @@ from deltalight.render_server.scene.depth_surface import (
     DepthSurface,
     by_ray,
     depth_surface,
-    fill_normals,
     jump_threshold,
+    normals_along,
     ray_planes,
 )
 from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.threads import by_bands
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import LENSES_KEPT
 
@@ -29,6 +31,9 @@ MAX_CELL_DISTANCE = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
 # A ray that leaves a surface samples the cells around its own, which must not contain the surface's back face.
 BACK_OFFSET_VOXELS = 2.0
+# Corners of the triangles in a quad of nodes (0 1 above 2 3): two if it is cut from 0 to 3, two if from 1 to 2.
+QUAD_TRIANGLES = ((0, 2, 3), (0, 3, 1), (0, 2, 1), (1, 2, 3))
+QUAD_CORNERS = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +43,7 @@ class _Nodes:
     pixels: Float32[np.ndarray, "gh gw 2"]
     rays: Float32[np.ndarray, "2 gh gw"]
     inverse_depth: Float32[np.ndarray, "gh gw"]
-    normals: Float32[np.ndarray, "gh gw 3"]
+    normals: Float32[np.ndarray, "3 gh gw"]
 
 
 def depth_mesh(
@@ -48,16 +53,16 @@ def depth_mesh(
     triangle_budget: int = 40_000,
     surface: DepthSurface | None = None,
     *,
-    grazing: Float32[np.ndarray, "h w"] | None = None,
+    grazing: Callable[[], Float32[np.ndarray, "h w"]] | None = None,
 ) -> TriangleMesh:
     """Meshes a clean depth image, registered to `camera`, in the world.
 
     A node represents each cell of stride x stride pixels, at the cell's centre, with the cell's median depth (moved
     to the centre along the fitted surface); the stride is the least within the budget. No triangle crosses a depth
     discontinuity; cells without depth or normal are holes. `uv` is the vertex's pixel coordinate (pixel centres at
-    integers) in the camera's picture. `surface` is `depth_surface(depth, camera)` if already computed. `grazing` is
-    the inverse depth of surfaces too oblique to measure (`grazing_depth_fill`), which join their two sides. Without
-    any valid depth the mesh is empty.
+    integers) in the camera's picture. `surface` is `depth_surface(depth, camera)` if already computed. `grazing`
+    returns the inverse depth of surfaces too oblique to measure (`grazing_depth_fill`), which join their two sides.
+    Without any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.
@@ -71,10 +76,10 @@ def depth_mesh(
     nodes = _nodes(known, camera, stride)
     limit = jump_threshold(depth, camera, nodes.inverse_depth, stride)
     slack = None
-    if grazing is not None and grazing.any():
-        nodes, slack = _with_grazing(nodes, grazing, camera, stride)
-    triangles, is_used = _grid_triangles(nodes.inverse_depth, limit, slack)
-    return _world_mesh(nodes, triangles, is_used, world_from_camera)
+    oblique = None if grazing is None else grazing()
+    if oblique is not None and oblique.any():
+        nodes, slack = _with_grazing(nodes, oblique, camera, stride)
+    return _world_mesh(nodes, _triangles_of_quads(nodes.inverse_depth, limit, slack), world_from_camera)
 
 
 def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
@@ -87,24 +92,23 @@ def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
 
 def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     pixels, rays = _node_rays(camera, stride)
-    flat = _median_pixels(surface.fitted_depth, stride)
-    chosen = surface.fitted_depth.ravel().take(flat)
-    gradient = surface.gradient.reshape(2, -1).take(flat, axis=1)
-    along = ray_planes(camera).reshape(2, -1).take(flat, axis=1)
-    shift = gradient[0] * (rays[0] - along[0]) + gradient[1] * (rays[1] - along[1])
-    # An outlier of the slope must not throw the node off the depths of its cell.
-    at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
-    return _Nodes(pixels, rays, np.where(chosen > 0, at_centre, 0), _normals_along(chosen, gradient, along))
+    depth, all_rays = surface.fitted_depth, ray_planes(camera)
+    inverse, normals = (np.empty((*parts, *rays.shape[1:]), np.float32) for parts in ((), (3,)))
 
+    def fill(rows: slice) -> None:
+        first = rows.start * stride
+        flat = _median_pixels(depth[first : rows.stop * stride], stride) + first * camera.width
+        chosen = depth.ravel().take(flat)
+        gradient = surface.gradient.reshape(2, -1).take(flat, axis=1)
+        along = all_rays.reshape(2, -1).take(flat, axis=1)
+        shift = gradient[0] * (rays[0, rows] - along[0]) + gradient[1] * (rays[1, rows] - along[1])
+        # An outlier of the slope must not throw the node off the depths of its cell.
+        at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
+        inverse[rows] = np.where(chosen > 0, at_centre, 0)
+        normals[:, rows] = normals_along(chosen, gradient, along)
 
-def _normals_along(
-    inverse: Float32[np.ndarray, "gh gw"],
-    gradient: Float32[np.ndarray, "2 gh gw"],
-    rays: Float32[np.ndarray, "2 gh gw"],
-) -> Float32[np.ndarray, "gh gw 3"]:
-    normals = np.empty((*inverse.shape, 3), np.float32)
-    fill_normals(inverse, gradient, rays, normals)
-    return normals
+    by_bands(fill, len(inverse))
+    return _Nodes(pixels, rays, inverse, normals)
 
 
 def _with_grazing(
@@ -114,13 +118,13 @@ def _with_grazing(
     flat = _median_pixels(grazing, stride)
     chosen, by_pixel = grazing.ravel().take(flat), _slopes(grazing, flat)
     along = ray_planes(camera).reshape(2, -1).take(flat, axis=1)
-    normals = _normals_along(chosen, by_ray(by_pixel, camera, flat), along)
-    added = (chosen > 0) & (nodes.inverse_depth == 0) & short_axis.any_of(normals != 0)
+    normals = np.stack(normals_along(chosen, by_ray(by_pixel, camera, flat), along))
+    added = (chosen > 0) & (nodes.inverse_depth == 0) & (normals != 0).any(axis=0)
     joined = _Nodes(
         nodes.pixels,
         nodes.rays,
         np.where(added, chosen, nodes.inverse_depth),
-        np.where(added[..., None], normals, nodes.normals),
+        np.where(added, normals, nodes.normals),
     )
     slope = np.hypot(*by_pixel)
     return joined, np.where(added, np.float32(MAX_CELL_DISTANCE * stride) * slope, np.float32(0))
@@ -213,25 +217,24 @@ def _sorted_planes(planes: UInt32[np.ndarray, "k+1 a b"]) -> Int64[np.ndarray, "
     return np.array(places)
 
 
-def _grid_triangles(
+def _triangles_of_quads(
     inverse: Float32[np.ndarray, "gh gw"],
     threshold: Float32[np.ndarray, "gh gw"],
     slack: Float32[np.ndarray, "gh gw"] | None,
-) -> tuple[Int32[np.ndarray, "m 3"], Bool[np.ndarray, "gh gw"]]:
-    """Joins neighbouring nodes on one surface, and tells which nodes that are.
+) -> list[Bool[np.ndarray, "a b"]]:
+    """Joins neighbouring nodes on one surface: returns which quads hold each of QUAD_TRIANGLES.
 
     Quads are cut along the diagonal with the lesser step. Steps may exceed the threshold by the slack of either node.
     Seen from the camera, triangles are counter-clockwise.
     """
-    quads = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
-    corners = [inverse[quad] for quad in quads]
+    corners = [inverse[quad] for quad in QUAD_CORNERS]
     usable = [corner > 0 for corner in corners]
     holes = [~each for each in usable]
 
     def joined(one: int, other: int) -> Bool[np.ndarray, "a b"]:
         limit = threshold[:-1, :-1]
         if slack is not None:
-            limit = limit + slack[quads[one]] + slack[quads[other]]
+            limit = limit + slack[QUAD_CORNERS[one]] + slack[QUAD_CORNERS[other]]
         return np.asarray(np.abs(corners[one] - corners[other]) <= limit)
 
     top, bottom, left, right = joined(0, 1), joined(2, 3), joined(0, 2), joined(1, 3)
@@ -239,21 +242,11 @@ def _grid_triangles(
     # A quad with one hole still holds a triangle, if it is cut between the hole's neighbours.
     falling = (falling | holes[1] | holes[2]) & ~(holes[0] | holes[3])
     diagonal = np.where(falling, joined(0, 3), joined(1, 2))
-    kinds = [
-        (falling & left & bottom, (0, 2, 3)),
-        (falling & right & top, (0, 3, 1)),
-        (~falling & left & top, (0, 2, 1)),
-        (~falling & right & bottom, (1, 2, 3)),
+    edges = (falling & left & bottom, falling & right & top, ~falling & left & top, ~falling & right & bottom)
+    return [
+        fits & diagonal & usable[one] & usable[two] & usable[three]
+        for fits, (one, two, three) in zip(edges, QUAD_TRIANGLES, strict=True)
     ]
-    first, offsets = _first_nodes(*inverse.shape), (0, 1, inverse.shape[1], inverse.shape[1] + 1)
-    parts, is_used = [], np.zeros(inverse.shape, bool)
-    for fits, names in kinds:
-        chosen = fits & diagonal & usable[names[0]] & usable[names[1]] & usable[names[2]]
-        node = first.take(np.flatnonzero(chosen))
-        parts.append(np.stack([node + np.int32(offsets[name]) for name in names], axis=1))
-        for name in names:
-            is_used[quads[name]] |= chosen
-    return np.concatenate(parts), is_used
 
 
 @lru_cache(maxsize=2 * LENSES_KEPT)
@@ -264,32 +257,58 @@ def _first_nodes(rows: int, columns: int) -> Int32[np.ndarray, " q"]:
 
 
 def _world_mesh(
-    nodes: _Nodes,
-    triangles: Int32[np.ndarray, "m 3"],
-    is_used: Bool[np.ndarray, "gh gw"],
-    world_from_camera: Float64[np.ndarray, "4 4"],
+    nodes: _Nodes, triangles: list[Bool[np.ndarray, "a b"]], world_from_camera: Float64[np.ndarray, "4 4"]
 ) -> TriangleMesh:
     """Keeps the nodes that triangles use and transforms them to the world."""
-    used, numbers = np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32) - 1
-    depth = 1 / nodes.inverse_depth.ravel().take(used).astype(np.float64)
-    rays = nodes.rays.reshape(2, -1).take(used, axis=1)
-    rotation = world_from_camera[:3, :3]
-    return TriangleMesh(
-        _turned(np.stack([rays[0] * depth, rays[1] * depth, depth]), rotation, world_from_camera[:3, 3:]),
-        _turned(nodes.normals.reshape(-1, 3).take(used, axis=0).T.astype(np.float64), rotation),
-        numbers.take(triangles),
-        nodes.pixels.reshape(-1, 2).take(used, axis=0),
-        REAL_MATERIAL,
-    )
+    is_used = np.zeros(nodes.inverse_depth.shape, bool)
+    for chosen, names in zip(triangles, QUAD_TRIANGLES, strict=True):
+        for name in names:
+            is_used[QUAD_CORNERS[name]] |= chosen
+    ends = np.cumsum(is_used, dtype=np.int32)  # of vertices, node by node
+    count = int(ends[-1])
+    positions, normals = np.empty((2, count, 3), np.float32)
+    uv = np.empty((count, 2), np.float32)
+
+    def fill(rows: slice) -> None:
+        used = np.flatnonzero(is_used[rows])
+        last = int(ends[rows.stop * is_used.shape[1] - 1])
+        own = slice(last - len(used), last)
+        depth = 1 / nodes.inverse_depth[rows].ravel().take(used).astype(np.float64)
+        x, y = nodes.rays[:, rows].reshape(2, -1).take(used, axis=1)
+        normal = nodes.normals[:, rows].reshape(3, -1).take(used, axis=1).astype(np.float64)
+        rotation = world_from_camera[:3, :3]
+        positions[own] = (
+            _turned(np.stack([x * depth, y * depth, depth]), rotation) + world_from_camera[:3, 3:]
+        ).T
+        normals[own] = _turned(normal, rotation).T
+        uv[own] = nodes.pixels[rows].reshape(-1, 2).take(used, axis=0)
+
+    by_bands(fill, len(is_used))
+    return TriangleMesh(positions, normals, _numbered(triangles, ends - 1, is_used.shape), uv, REAL_MATERIAL)
 
 
 def _turned(
-    columns: Float64[np.ndarray, "3 n"], rotation: Float64[np.ndarray, "3 3"], shift: float | np.ndarray = 0.0
-) -> Float32[np.ndarray, "n 3"]:
-    """Returns turned vectors, which are shifted then. Given by columns: NumPy is slow along short rows."""
+    columns: Float64[np.ndarray, "3 n"], rotation: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "3 n"]:
+    """Returns turned vectors. Given by columns: NumPy is slow along short rows."""
     # einsum, because the BLAS behind `@` spins on every core for such slim matrices.
-    turned = np.einsum("ij,jn->in", rotation, columns) + shift
-    return np.ascontiguousarray(turned.T, np.float32)
+    return np.asarray(np.einsum("ij,jn->in", rotation, columns))
+
+
+def _numbered(
+    triangles: list[Bool[np.ndarray, "a b"]], numbers: Int32[np.ndarray, " n"], shape: tuple[int, ...]
+) -> Int32[np.ndarray, "m 3"]:
+    """Returns the triangles, of which quads of a grid of that shape hold these, by the numbers of its nodes."""
+    first, offsets = _first_nodes(*shape), (0, 1, shape[1], shape[1] + 1)
+    quads = [np.flatnonzero(chosen) for chosen in triangles]
+    found = np.empty((sum(map(len, quads)), 3), np.int32)
+    end = 0
+    for quad, names in zip(quads, QUAD_TRIANGLES, strict=True):
+        node = first.take(quad)
+        begin, end = end, end + len(quad)
+        for column, name in enumerate(names):
+            found[begin:end, column] = numbers.take(node + np.int32(offsets[name]))
+    return found
 
 
 def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:

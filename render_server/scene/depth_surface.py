@@ -73,7 +73,13 @@ class DepthSurface:
     @cached_property
     def fitted_depth(self) -> Float32[np.ndarray, "h w"]:
         """`inverse_depth` where the gradient is known, 0 elsewhere."""
-        return self.inverse_depth * np.isfinite(self.gradient[0])
+        fitted = np.empty_like(self.inverse_depth)
+
+        def fill(rows: slice) -> None:
+            np.multiply(self.inverse_depth[rows], np.isfinite(self.gradient[0, rows]), out=fitted[rows])
+
+        by_bands(fill, len(fitted))
+        return fitted
 
 
 def noise_sigma(depth: DepthImage) -> float:
@@ -305,23 +311,23 @@ def surface_normals(
     """Returns unit normals of inverse depth and its change by ray at every pixel; zero where unknown."""
     normals = np.empty((*inverse.shape, 3), np.float32)
     rays = ray_planes(camera)
-    by_bands(
-        lambda rows: fill_normals(inverse[rows], gradient[:, rows], rays[:, rows], normals[rows]),
-        len(inverse),
-    )
+
+    def fill(rows: slice) -> None:
+        cv2.merge(normals_along(inverse[rows], gradient[:, rows], rays[:, rows]), normals[rows])
+
+    by_bands(fill, len(inverse))
     return normals
 
 
-def fill_normals(
+def normals_along(
     inverse: Float32[np.ndarray, "h w"],
     gradient: Float32[np.ndarray, "2 h w"],
     rays: Float32[np.ndarray, "2 h w"],
-    normals: Float32[np.ndarray, "h w 3"],
-) -> None:
-    """Fills unit normals of inverse depth and its change by ray, along these rays; zero where unknown.
+) -> list[Float32[np.ndarray, "h w"]]:
+    """Returns x, y and z of the unit normals of inverse depth and its change by ray, along these rays.
 
-    They are in the optical frame, towards the camera. A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along
-    (gradient, w - gradient.ray).
+    They are in the optical frame, towards the camera; zero where unknown. A plane n.P = d has
+    w = (n/d).(x/z, y/z, 1), so n is along (gradient, w - gradient.ray).
     """
     x, y = gradient
     z = inverse - x * rays[0] - y * rays[1]
@@ -331,7 +337,7 @@ def fill_normals(
     parts = [part * scale for part in (x, y, z)]
     for part in parts:
         part[unknown] = 0
-    cv2.merge(parts, normals)
+    return parts
 
 
 @lru_cache(maxsize=LENSES_KEPT)
