@@ -58,28 +58,19 @@ class DepthSurface:
     """The surface at every pixel of `camera`.
 
     `inverse_depth` is as measured, 0 where invalid and where a pixel stands alone. `gradient` is its change
-    by ray coordinate (x/z, y/z), fitted to the surroundings (NaN where unknown).
+    by ray coordinate (x/z, y/z), fitted to the surroundings (NaN where unknown), and `fitted_depth` is
+    `inverse_depth` where it is known, 0 elsewhere.
     """
 
     inverse_depth: Float32[np.ndarray, "h w"]
     gradient: Float32[np.ndarray, "2 h w"]
+    fitted_depth: Float32[np.ndarray, "h w"]
     camera: CameraModel
 
     @cached_property
     def normals(self) -> Float32[np.ndarray, "h w 3"]:
         """Unit vectors in the optical frame towards the camera, zero where they are unknown."""
         return surface_normals(self.inverse_depth, self.gradient, self.camera)
-
-    @cached_property
-    def fitted_depth(self) -> Float32[np.ndarray, "h w"]:
-        """`inverse_depth` where the gradient is known, 0 elsewhere."""
-        fitted = np.empty_like(self.inverse_depth)
-
-        def fill(rows: slice) -> None:
-            np.multiply(self.inverse_depth[rows], np.isfinite(self.gradient[0, rows]), out=fitted[rows])
-
-        by_bands(fill, len(fitted))
-        return fitted
 
 
 def noise_sigma(depth: DepthImage) -> float:
@@ -95,7 +86,7 @@ def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     (if there is one).
     """
     shape, radius, terms = depth.depth_m.shape, window_radius(depth, camera), jump_terms(depth, camera)
-    inverse, crossed = np.empty(shape, np.float32), np.empty(shape, bool)
+    inverse, fitted, crossed = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, bool)
     by_pixel, gradient = (np.empty((2, *shape), np.float32) for _ in range(2))
 
     def fit(rows: slice) -> None:
@@ -109,12 +100,13 @@ def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
         moved = by_pixel[:, rows].copy()
         _move_windows(by_pixel, crossed, radius, rows, moved)
         gradient[:, rows] = by_ray(moved, camera, slice(rows.start * shape[1], rows.stop * shape[1]))
+        np.multiply(inverse[rows], np.isfinite(moved[0]), out=fitted[rows])
 
     if camera.has_distortion:
         _pixel_from_ray(camera)  # once, before threads ask for it
     by_bands(fit, shape[0])
     by_bands(move, shape[0])
-    return DepthSurface(inverse, gradient, camera)
+    return DepthSurface(inverse, gradient, fitted, camera)
 
 
 def _with_margin(rows: slice, margin: int) -> tuple[slice, slice]:
@@ -362,18 +354,22 @@ def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], cam
     the pixel, so strips are filled linearly from their near to their far side.
     """
     valid = depth.valid & (depth.depth_m > 0)
-    inverse = np.divide(1, depth.depth_m, out=np.zeros_like(depth.depth_m), where=valid)
-    result = np.zeros_like(inverse)
+    result = np.zeros_like(depth.depth_m)
     unknown = (~valid).view(np.uint8)
-    to_known = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_5)
     thick = cv2.morphologyEx(unknown, cv2.MORPH_OPEN, np.ones((MIN_STRIP_WIDTH_PX,) * 2, np.uint8))
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
+    to_known: Map | None = None
     for label in range(1, count):
         if boxes[label, cv2.CC_STAT_AREA] < MIN_STRIP_AREA_PX:
             continue
         part = _strip_window(boxes[label])
         strip = labels[part] == label
-        around = inverse[part] * _dilated(strip, BORDER_RADIUS_PX)
+        beside = valid[part] & _dilated(strip, BORDER_RADIUS_PX)
+        around = np.divide(1, depth.depth_m[part], out=np.zeros_like(result[part]), where=beside)
+        if not _steps_at_all(around, depth, camera):
+            continue
+        if to_known is None:  # takes as long as all else
+            to_known = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_5)
         if _may_be_grazing(strip, around, to_known[part], depth, camera):
             grazing, bridged = _bridge(strip, around, color[part], depth, camera)
             result[part][grazing] = bridged[grazing]
@@ -390,6 +386,15 @@ def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
     )
 
 
+def _steps_at_all(around: Map, depth: DepthImage, camera: CameraModel) -> bool:
+    """Whether inverse depth beside a strip (0 elsewhere) differs by more than even its border could explain."""
+    known = around[around > 0]
+    if not known.size:
+        return False
+    least = known.min(keepdims=True)
+    return bool(known.max() - least > jump_threshold(depth, camera, least, 2.0))
+
+
 def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, camera: CameraModel) -> bool:
     """Rules out most strips cheaply: no depth step beside them could make most of their pixels grazing.
 
@@ -397,8 +402,6 @@ def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, 
     strip is at least twice as wide there.
     """
     known = around[around > 0]
-    if not known.size:
-        return False
     least = np.full(int(strip.sum()), known.min())
     bearable = jump_threshold(depth, camera, least, 2 * to_known[strip])
     return bool((known.max() - known.min() > bearable).mean() > MIN_GRAZING_FRACTION)
