@@ -171,9 +171,7 @@ def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> Int64[np
     """
     height, width = inverse.shape
     rows, columns = -(-height // stride), -(-width // stride)
-    padded = cv2.copyMakeBorder(
-        inverse, 0, rows * stride - height, 0, columns * stride - width, cv2.BORDER_CONSTANT
-    ).view(np.uint32)
+    bits = inverse.view(np.uint32)
     steps = np.unique(np.linspace(0, stride - 1, min(stride, CELL_SAMPLES)).round().astype(int))
     offsets = np.array([(down, right) for down in steps for right in steps])
     count = len(offsets)
@@ -181,7 +179,10 @@ def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> Int64[np
     keys = np.empty((count + 1, rows, columns), np.uint32)  # one more than there are, for sorting
     invalid = np.zeros((rows, columns), np.uint8)
     for number, (down, right) in enumerate(offsets):
-        keys[number] = padded[down::stride, right::stride]
+        sampled = bits[down::stride, right::stride]  # less than all cells where the border cuts some
+        if sampled.shape != invalid.shape:
+            keys[number] = 0
+        keys[number, : len(sampled), : sampled.shape[1]] = sampled
         invalid += keys[number] == 0
         keys[number] &= ~number_bits
         keys[number] |= np.uint32(number)

@@ -268,13 +268,14 @@ def _move_windows(
     width, first = crossed.shape[1], rows.start * crossed.shape[1]
     slopes, own = gradient.reshape(2, -1), moved.reshape(2, -1)
     pending = np.flatnonzero(crossed[rows]) + first
+    columns = pending % width
     for down, right in SHIFTS:
-        column = pending % width + radius * right
+        column = columns + radius * right
         source = np.clip(pending + radius * (down * width + right), 0, crossed.size - 1)
         is_clean = ~crossed.ravel().take(source) & np.isfinite(slopes[0].take(source))
         hit = is_clean & (column >= 0) & (column < width)
         own[:, pending[hit] - first] = slopes.take(source[hit], axis=1)
-        pending = pending[~hit]
+        pending, columns = pending[~hit], columns[~hit]
 
 
 def by_ray(
