@@ -261,7 +261,8 @@ def _world_mesh(
     nodes: _Nodes, triangles: list[Bool[np.ndarray, "a b"]], world_from_camera: Float64[np.ndarray, "4 4"]
 ) -> TriangleMesh:
     """Keeps the nodes that triangles use and transforms them to the world."""
-    is_used = np.zeros(nodes.inverse_depth.shape, bool)
+    shape = nodes.inverse_depth.shape
+    is_used = np.zeros(shape, bool)
     for chosen, names in zip(triangles, QUAD_TRIANGLES, strict=True):
         for name in names:
             is_used[QUAD_CORNERS[name]] |= chosen
@@ -272,7 +273,7 @@ def _world_mesh(
 
     def fill(rows: slice) -> None:
         used = np.flatnonzero(is_used[rows])
-        last = int(ends[rows.stop * is_used.shape[1] - 1])
+        last = int(ends[rows.stop * shape[1] - 1])
         own = slice(last - len(used), last)
         depth = 1 / nodes.inverse_depth[rows].ravel().take(used).astype(np.float64)
         x, y = nodes.rays[:, rows].reshape(2, -1).take(used, axis=1)
@@ -285,7 +286,7 @@ def _world_mesh(
         uv[own] = nodes.pixels[rows].reshape(-1, 2).take(used, axis=0)
 
     by_bands(fill, len(is_used))
-    return TriangleMesh(positions, normals, _numbered(triangles, ends - 1, is_used.shape), uv, REAL_MATERIAL)
+    return TriangleMesh(positions, normals, _numbered(triangles, ends - 1, shape), uv, REAL_MATERIAL)
 
 
 def _turned(
