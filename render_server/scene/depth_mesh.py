@@ -21,7 +21,7 @@ from deltalight.render_server.scene.depth_surface import (
     ray_planes,
 )
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.threads import by_bands
+from deltalight.render_server.scene.threads import by_bands, for_each
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import LENSES_KEPT
 
@@ -302,14 +302,16 @@ def _numbered(
 ) -> Int32[np.ndarray, "m 3"]:
     """Returns the triangles, of which quads of a grid of that shape hold these, by the numbers of its nodes."""
     first, offsets = _first_nodes(*shape), (0, 1, shape[1], shape[1] + 1)
-    quads = [np.flatnonzero(chosen) for chosen in triangles]
-    found = np.empty((sum(map(len, quads)), 3), np.int32)
-    end = 0
-    for quad, names in zip(quads, QUAD_TRIANGLES, strict=True):
-        node = first.take(quad)
-        begin, end = end, end + len(quad)
-        for column, name in enumerate(names):
-            found[begin:end, column] = numbers.take(node + np.int32(offsets[name]))
+    ends = np.cumsum([np.count_nonzero(chosen) for chosen in triangles])
+    found = np.empty((ends[-1], 3), np.int32)
+
+    def fill(kind: int) -> None:
+        node = first.take(np.flatnonzero(triangles[kind]))
+        own = found[ends[kind] - len(node) : ends[kind]]
+        for column, name in enumerate(QUAD_TRIANGLES[kind]):
+            own[:, column] = numbers.take(node + np.int32(offsets[name]))
+
+    for_each(fill, range(len(triangles)))
     return found
 
 
