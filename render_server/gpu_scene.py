@@ -114,13 +114,14 @@ class GeometryState:
         return (VoxelizedMesh(self.buffers),)
 
     @cached_property
-    def _coarse(self) -> CoarseMesh:
+    def coarse_mesh(self) -> CoarseMesh:
+        """Fewer triangles, and the buffers that hold them; made when first asked for."""
         return (self.buffers, self.mesh) if self.coarse is None else self.coarse()
 
     @property
     def coarse_parts(self) -> tuple[VoxelizedMesh, ...]:
         """Fewer triangles, for what lies far."""
-        return (VoxelizedMesh(self._coarse[0]),)
+        return (VoxelizedMesh(self.coarse_mesh[0]),)
 
     def solid_parts(self, voxel_edge: float) -> tuple[VoxelizedMesh, ...]:
         """Returns `parts` for voxels of that edge (m), with coarse backs if cameras saw the fronts alone.
@@ -129,7 +130,7 @@ class GeometryState:
         """
         if self.fronts_of is None:
             return self.parts
-        buffers, mesh = self._coarse
+        buffers, mesh = self.coarse_mesh
         chosen = None
         if len(self.fronts_of.frames) > 1:
             middles = back_faces(mesh.corners, voxel_edge).mean(axis=1, dtype=np.float64)

@@ -18,7 +18,7 @@ from deltalight.render_server.scene.depth_surface import DepthSurface, grazing_d
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.threads import begun
-from deltalight.render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
+from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
 from deltalight.render_server.scene.tsdf_mesh import TsdfScene
 from deltalight.render_server.view import CameraView, PosedFrame
 
@@ -51,6 +51,7 @@ class RealGeometry:
         self._tsdf_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
         self._tsdf = TsdfScene() if real.geometry == "fused" else None
         self._still_frames = 0
+        self._used_coarse = False  # of the state before
         self.model: list[TriangleMesh] = []
         if isinstance(real.geometry, ModelGeometry):
             self.model = self._load_model(real.geometry)
@@ -143,7 +144,7 @@ class RealGeometry:
         if not any(len(mesh.triangles) for mesh in coarse):
             self.state = None
             return
-        self._build(fine, partial(self._coarse, coarse))
+        self._build(fine, lambda: self._uploaded(merge_for_gpu(coarse)))
 
     def _build_from_depth(self) -> None:
         """Meshes the depth images, and with few triangles again once geometry far from the objects is asked for.
@@ -154,7 +155,7 @@ class RealGeometry:
         grazing = [begun(partial(_grazing_depth, each)) for each in seen]  # while surfaces are fitted
         shown = DepthViews(tuple(map(_posed_surface, self.cameras, seen)))
         known = [
-            (each, frame.surface, fill.result())
+            (each, frame.surface, fill.result)
             for each, frame, fill in zip(seen, shown.frames, grazing, strict=True)
         ]
 
@@ -162,11 +163,23 @@ class RealGeometry:
             return shown.without_copies([_depth_mesh(*each, budget) for each in known], budget)
 
         budget = self.budget // len(seen)  # of the room, however many cameras see it
-        fine, coarse_budget = meshes(budget), budget // COARSE_DIVISOR
+        coarse = self._begun_coarse(lambda: merge_for_gpu(meshes(budget // COARSE_DIVISOR)))
+        fine = meshes(budget)
         if not any(len(mesh.triangles) for mesh in fine):
             self.state = None
             return
-        self._build(fine, lambda: self._coarse(meshes(coarse_budget)), fronts_of=shown)
+        self._build(fine, coarse, fronts_of=shown)
+
+    def _begun_coarse(self, make: Callable[[], GpuMesh]) -> Callable[[], CoarseMesh]:
+        """Returns what makes coarse triangles when asked; begun now if the last ones were asked for too."""
+        meanwhile = begun(make) if self._used_coarse else None
+        self._used_coarse = False
+
+        def coarse() -> CoarseMesh:
+            self._used_coarse = True
+            return self._uploaded(make() if meanwhile is None else meanwhile.result())
+
+        return coarse
 
     def _build(
         self,
@@ -189,11 +202,10 @@ class RealGeometry:
             fronts_of=fronts_of,
         )
 
-    def _coarse(self, meshes: Sequence[TriangleMesh]) -> CoarseMesh:
-        """Merges and uploads the meshes of what lies far."""
-        merged = merge_for_gpu(meshes)
-        self._coarse_buffers.write(merged)
-        return self._coarse_buffers, merged
+    def _uploaded(self, coarse: GpuMesh) -> CoarseMesh:
+        """Uploads the mesh of what lies far."""
+        self._coarse_buffers.write(coarse)
+        return self._coarse_buffers, coarse
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -209,7 +221,10 @@ def _grazing_depth(seen: PosedFrame) -> Float32[np.ndarray, "h w"]:
 
 
 def _depth_mesh(
-    seen: PosedFrame, surface: DepthSurface, grazing: Float32[np.ndarray, "h w"], triangle_budget: int
+    seen: PosedFrame,
+    surface: DepthSurface,
+    grazing: Callable[[], Float32[np.ndarray, "h w"]],
+    triangle_budget: int,
 ) -> TriangleMesh:
     """Returns a mesh of what a camera saw."""
     view = seen.view

@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,11 +130,13 @@ def fresh_logs() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def shared_context() -> Iterator["GpuContext"]:
-    """The context that keeps linked programs from module to module."""
+    """The context that keeps linked programs from module to module; its new memory holds NaN."""
     from deltalight.render_server.gpu.context import create_context
+    from tests.unwritten_memory import FilledContext
 
     context = create_context()
-    yield context
+    poisoned: Any = FilledContext(context.ctx)
+    yield replace(context, ctx=poisoned)
     context.release()
 
 

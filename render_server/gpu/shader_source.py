@@ -56,7 +56,7 @@ def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = 
     )
     head = [VERSION, *(f"#define {name} {value}" for name, value in given.items() if name not in constants)]
     table = [f"// file {index}: {file.parent.name}/{file.name}" for index, file in enumerate(files)]
-    return "\n".join([*head, *table, body])
+    return "\n".join([*head, *table, body, ""])  # NVIDIA refuses a `#line` that no line break follows
 
 
 def _expand(path: Path, seen: list[Path]) -> str:

@@ -37,8 +37,14 @@ def texture_2d(
     linear: bool = False,
     data: bytes | None = None,
 ) -> moderngl.Texture:
-    """Creates a texture of `size` (width, height), clamped at its edges; nearest unless `linear`."""
-    texture = gpu.ctx.texture(size, components, data, dtype=dtype, alignment=1)
+    """Creates a texture of `size` (width, height), clamped at its edges; nearest unless `linear`.
+
+    It holds zeros where `data` is None. OpenGL promises nothing: Mesa clears it, NVIDIA leaves what was there, and
+    passes that write only texels of a work list would read that.
+    """
+    texel_bytes = components * int(dtype[1])
+    zeros = None if data else bytes(size[0] * size[1] * texel_bytes)
+    texture = gpu.ctx.texture(size, components, data or zeros, dtype=dtype, alignment=1)
     mode = moderngl.LINEAR if linear else moderngl.NEAREST
     if dtype[0] == "f":
         texture.filter = (mode, mode)
