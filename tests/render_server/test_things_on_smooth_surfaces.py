@@ -135,7 +135,9 @@ def test_the_boards_paper_and_its_cards_are_as_without_the_declared_table(
     bare_table, table = (mirrored(gpu, silver(plain), view) for view in (bare, with_board))
     assert (bare_table[paper] > 0.5).sum() > 50
     assert not table[paper].any()
-    np.testing.assert_allclose(table[~paper], bare_table[~paper], rtol=0, atol=0 if gpu.is_software else 2.0**-10)
+    np.testing.assert_allclose(
+        table[~paper], bare_table[~paper], rtol=0, atol=0 if gpu.is_software else 2.0**-10
+    )
     declared, undeclared = (composite(gpu, document, with_board) for document in (silver(plain), plain))
     codes = np.abs(declared[paper].astype(int) - undeclared[paper])
     assert codes.max() <= (0 if gpu.is_software else 1)
