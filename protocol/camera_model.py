@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
+from weakref import WeakValueDictionary
 
 import cv2
 import numpy as np
 import yaml
 from jaxtyping import Float32, Float64
 
+from deltalight.protocol import short_axis
 from deltalight.protocol.documents import read_mapping
 from deltalight.protocol.errors import DeltalightError
 
@@ -19,6 +21,11 @@ DISTORTION_LENGTHS: dict[str, tuple[int, ...]] = {"plumb_bob": (0, 4, 5, 8, 12, 
 MAX_EDGE = 16384
 RAY_TOLERANCE_PX = 0.05
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+
+# Of the cameras that exist, by value: each frame brings its camera anew.
+_RAYS: WeakValueDictionary[tuple[int | float | str, ...], Float32[np.ndarray, "h w 2"]] = (
+    WeakValueDictionary()
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +78,16 @@ class CameraModel:
 
     def __eq__(self, other: object) -> bool:
         """Compare by value."""
-        return isinstance(other, CameraModel) and self.to_dict() == other.to_dict()
+        return isinstance(other, CameraModel) and self._values == other._values
 
     def __hash__(self) -> int:
-        return hash((self.width, self.height, self.matrix.tobytes(), self._coefficients.tobytes()))
+        return hash(self._values)
+
+    @cached_property
+    def _values(self) -> tuple[int | float | str, ...]:
+        """All that tells cameras apart."""
+        numbers = (*self.matrix.ravel().tolist(), *self._coefficients.tolist())
+        return (self.width, self.height, self.distortion_model, *numbers)
 
     @property
     def _coefficients(self) -> Float64[np.ndarray, " k"]:
@@ -89,7 +102,7 @@ class CameraModel:
     def rays(self) -> Float32[np.ndarray, "h w 2"]:
         """Return (x/z, y/z) of the ray through every pixel centre, by the full lens model.
 
-        The array is computed once per instance and is read-only.
+        The array is computed once, as long as any camera of these values keeps it, and is read-only.
 
         Raises:
             DeltalightError: the lens model has no ray for some pixel (it folds inside the picture).
@@ -98,13 +111,19 @@ class CameraModel:
 
     @cached_property
     def _rays(self) -> Float32[np.ndarray, "h w 2"]:
+        known = _RAYS.get(self._values)
+        if known is None:
+            known = _RAYS[self._values] = self._find_rays()
+        return known
+
+    def _find_rays(self) -> Float32[np.ndarray, "h w 2"]:
         columns, rows = np.meshgrid(
             np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64)
         )
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
         rays = self.unproject(pixels)
         back = self.project(np.column_stack([rays, np.ones(len(rays))]))
-        lost = ~(np.abs(back - pixels).max(axis=1) < RAY_TOLERANCE_PX)
+        lost = ~(short_axis.greatest(np.abs(back - pixels)) < RAY_TOLERANCE_PX)
         if lost.any():
             raise DeltalightError(
                 f"the lens model has no ray for {lost.sum()} of {lost.size} pixels; "

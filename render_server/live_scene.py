@@ -469,6 +469,7 @@ class LiveScene:
     def release(self) -> None:
         """Frees all GL objects."""
         release_all(
+            self.timers,
             self._objects,
             self._real,
             *self._graphs[:1],

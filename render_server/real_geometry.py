@@ -51,6 +51,7 @@ class RealGeometry:
         self._tsdf_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
         self._tsdf = TsdfScene() if real.geometry == "fused" else None
         self._still_frames = 0
+        self._used_coarse = False  # of the state before
         self.model: list[TriangleMesh] = []
         if isinstance(real.geometry, ModelGeometry):
             self.model = self._load_model(real.geometry)
@@ -154,7 +155,7 @@ class RealGeometry:
         grazing = [begun(partial(_grazing_depth, each)) for each in seen]  # while surfaces are fitted
         shown = DepthViews(tuple(map(_posed_surface, self.cameras, seen)))
         known = [
-            (each, frame.surface, fill.result())
+            (each, frame.surface, fill.result)
             for each, frame, fill in zip(seen, shown.frames, grazing, strict=True)
         ]
 
@@ -162,11 +163,23 @@ class RealGeometry:
             return shown.without_copies([_depth_mesh(*each, budget) for each in known], budget)
 
         budget = self.budget // len(seen)  # of the room, however many cameras see it
-        fine, coarse_budget = meshes(budget), budget // COARSE_DIVISOR
+        coarse = self._begun_coarse(lambda: _corners(meshes(budget // COARSE_DIVISOR)))
+        fine = meshes(budget)
         if not any(len(mesh.triangles) for mesh in fine):
             self.state = None
             return
-        self._build(fine, lambda: _corners(meshes(coarse_budget)), fronts_of=shown)
+        self._build(fine, coarse, fronts_of=shown)
+
+    def _begun_coarse(self, make: Callable[[], Corners]) -> Callable[[], Corners]:
+        """Returns what makes coarse triangles when asked; begun now if the last ones were asked for too."""
+        meanwhile = begun(make) if self._used_coarse else None
+        self._used_coarse = False
+
+        def corners() -> Corners:
+            self._used_coarse = True
+            return make() if meanwhile is None else meanwhile.result()
+
+        return corners
 
     def _build(
         self,
@@ -206,7 +219,10 @@ def _grazing_depth(seen: PosedFrame) -> Float32[np.ndarray, "h w"]:
 
 
 def _depth_mesh(
-    seen: PosedFrame, surface: DepthSurface, grazing: Float32[np.ndarray, "h w"], triangle_budget: int
+    seen: PosedFrame,
+    surface: DepthSurface,
+    grazing: Callable[[], Float32[np.ndarray, "h w"]],
+    triangle_budget: int,
 ) -> TriangleMesh:
     """Returns a mesh of what a camera saw."""
     view = seen.view

@@ -6,6 +6,7 @@ import moderngl
 import numpy as np
 
 POISON = b"\xff"  # NaN in floats, -1 or the greatest number in integers
+MOST_BYTES = 2**30
 
 
 class FilledContext:
@@ -20,6 +21,8 @@ class FilledContext:
     def buffer(
         self, data: bytes | None = None, *, reserve: int = 0, dynamic: bool = False
     ) -> moderngl.Buffer:
+        if reserve > MOST_BYTES:  # no device has it, nor this process
+            return self._ctx.buffer(data, reserve=reserve, dynamic=dynamic)
         self.filled += data is None
         return self._ctx.buffer(self._content * reserve if data is None else data, dynamic=dynamic)
 

@@ -78,7 +78,7 @@ def _child(step: Step, path: Path, out: Path, folder: Path) -> Iterator["subproc
         str(path),
         str(out.resolve()),
     ]
-    mine = {"DELTALIGHT_CACHE": str(folder / "cache"), SUPERVISOR_VARIABLE: str(os.getpid())}
+    mine = {**_caches(folder), SUPERVISOR_VARIABLE: str(os.getpid())}
     with (out / OUTPUT_FILE).open("ab") as output:
         output.write(f"== {step.name}\n".encode())
         output.flush()
@@ -98,6 +98,18 @@ def _child(step: Step, path: Path, out: Path, folder: Path) -> Iterator["subproc
             os.killpg(child.pid, signal.SIGKILL)
         with suppress(subprocess.TimeoutExpired):
             child.wait(KILL_TIMEOUT_S)
+
+
+def _caches(folder: Path) -> dict[str, str]:
+    """Variables by which steps share what they compute, and what NVIDIA's driver compiles: it keeps none for root."""
+    shaders = folder / "shaders"
+    shaders.mkdir(exist_ok=True)
+    driver = {
+        "__GL_SHADER_DISK_CACHE": "1",
+        "__GL_SHADER_DISK_CACHE_PATH": str(shaders),
+        "__GL_SHADER_DISK_CACHE_SKIP_CLEANUP": "1",
+    }
+    return {"DELTALIGHT_CACHE": str(folder / "cache"), **driver}
 
 
 def _ended(child: "subprocess.Popen[bytes]") -> int | None:

@@ -6,6 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_bytes
 
 
@@ -71,6 +72,12 @@ class Findings:
         """Write the record for the last time."""
         self.record.state = state
         self.keep(sentence)
+
+
+def fault_sentence(fault: Exception) -> str:
+    """Return what an exception says, with its kind where that is not written for users."""
+    kind = "" if isinstance(fault, DeltalightError) else f"{type(fault).__name__}, "
+    return f"{kind}{fault}"
 
 
 def read_record(path: Path) -> Record:

@@ -109,18 +109,27 @@ class Report:
 
 
 def _table(methods: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Frames of each kind, then stages from the slowest on: median milliseconds, a column a method."""
+    """Frames of each kind, then stages from the slowest on: median milliseconds, a column a method.
+
+    Of a stage in brackets what the CPU takes to issue it.
+    """
     rows = [f"| ms | {' | '.join(methods)} |", f"|---|{'--:|' * len(methods)}"]
-    for key in ("frames_ms", "stages_ms"):
+    for key, kind in (("frames_ms", "frame, "), ("stages_ms", "")):
         longest: dict[str, float] = {}
         for timing in methods.values():
             for name, milliseconds in timing[key].items():
                 longest[name] = max(milliseconds, longest.get(name, 0.0))
         for name in sorted(longest, key=longest.__getitem__, reverse=True):
-            cells = [f"{timing[key][name]:.2f}" if name in timing[key] else "" for timing in methods.values()]
-            kind = "frame, " if key == "frames_ms" else ""
+            cells = [_cell(timing, key, name) for timing in methods.values()]
             rows.append(f"| {kind}{name} | {' | '.join(cells)} |")
     return "\n".join(rows)
+
+
+def _cell(timing: dict[str, dict[str, float]], key: str, name: str) -> str:
+    if name not in timing[key]:
+        return ""
+    submit_ms = timing["submit_ms"].get(name) if key == "stages_ms" else None
+    return f"{timing[key][name]:.2f}" + ("" if submit_ms is None else f" ({submit_ms:.2f})")
 
 
 def _verb(state: State) -> str:

@@ -1,57 +1,54 @@
 """The steps of `deltalight gpu-check`; each runs in a process of its own and keeps what it finds as it goes along."""
 
+import gc
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import partial
 from importlib.util import find_spec
-from math import isfinite
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any
 
-from deltalight.benchmarks.gpu_check.record import Findings, Skipped
-from deltalight.protocol.errors import DeltalightError
+from deltalight.benchmarks.gpu_check.processes import opened_context, usable_cores
+from deltalight.benchmarks.gpu_check.record import Findings, Skipped, fault_sentence
 
 if TYPE_CHECKING:
     from deltalight.render_server.gpu.context import GpuContext
     from deltalight.render_server.renderer import SceneRenderer
 
-METHODS = ("exact", "paper", "dlpv", "differential", "dlpv-paper", "none", "aroof")
-"""As for `demo --method`; the one that computes longest before its first frame comes last."""
+METHODS = ("exact", "paper", "dlpv", "differential", "dlpv-paper", "aroof")
+"""As for `demo --method`; the one that computes longest before its first frame comes last.
+
+`none` is left out: it draws the objects as `exact` does, so each of its stages runs, and leaves its light on the real
+scene out of the composition.
+"""
 NEEDLESS_CHECKS = ("packages to serve",)  # of doctor: what rendering does without
 SIZES = {"640x480, 64^3": ((640, 480), 64), "1280x720, 256^3": ((1280, 720), 256)}
-SPEED_FRAMES = 30  # the demo's recording; its camera moves in the last ten
+SPEED_FRAMES = 12  # of each motion, after those that warm up
 LEAK_ROUNDS = 3
 LEAK_FRAMES = 4
 
 
 @contextmanager
-def _context() -> "Iterator[GpuContext]":
-    from deltalight.render_server.gpu.context import create_context
-
-    gpu = create_context()
-    try:
-        yield gpu
-    finally:
-        gpu.release()
-
-
-@contextmanager
-def _noting(findings: Findings, what: str | Callable[[], str]) -> Iterator[None]:
+def _noting(findings: Findings, what: str) -> Iterator[None]:
     """Note what is raised inside, so that the step goes on with the next thing; `what` names this one."""
     try:
         yield
     except Exception as fault:  # moderngl raises its own Error, with the driver's words
         traceback.print_exc()
-        kind = "" if isinstance(fault, DeltalightError) else f"{type(fault).__name__}, "
-        findings.fault(f"{what if isinstance(what, str) else what()}: {kind}{fault}")
+        findings.fault(f"{what}: {fault_sentence(fault)}")
+
+
+def _processes() -> int:
+    """Return how many processes share a step's work: one in software, which fills the cores by itself."""
+    with opened_context() as gpu:
+        return 1 if gpu.is_software else usable_cores()
 
 
 def machine(findings: Findings) -> str:
     """Say what renders here: GL_RENDERER, GL_VENDOR, and GL_VERSION, which names the driver after the first space."""
-    with _context() as gpu:
+    with opened_context() as gpu:
         version, _, driver = gpu.version.partition(" ")
         findings.keep(
             gpu=gpu.renderer_name,
@@ -77,42 +74,17 @@ def doctor(findings: Findings) -> str:
 
 
 def shaders(findings: Findings) -> str:
-    """Let the driver compile every variant of every shader; a refusal leaves out the rest of that scene."""
-    from deltalight.benchmarks.gpu_check.beside_tests import shader_parts
+    """Let the driver compile every variant of every shader."""
+    from deltalight.benchmarks.gpu_check.compiling import compile_everything
 
-    parts, labels = shader_parts(), list[str]()
-    with _context() as gpu:
-        gpu.compile_watchers.append(lambda label, _sources: labels.append(label))
-        for name, compile_part in parts.items():
-            with _noting(findings, partial(_latest, name, labels)):
-                compile_part(gpu, findings.scratch)
-            variants = sorted(set(labels))
-            findings.keep(f"{len(variants)} shader variants so far", variants=variants)
-    return f"{len(variants)} shader variants given to the driver"
-
-
-def _latest(name: str, labels: list[str]) -> str:
-    """What is being compiled: the scene, and the variant that came last."""
-    return ", ".join([name, *labels[-1:]])
+    return compile_everything(findings, _processes())
 
 
 def pictures(findings: Findings) -> str:
     """Compare the protected pictures with their goldens; those that differ go into `failed_pictures.png`."""
-    from deltalight.benchmarks.gpu_check.beside_tests import compare_picture, protected_cases
-    from deltalight.benchmarks.gpu_check.failed_pictures import FailedPictures
+    from deltalight.benchmarks.gpu_check.picture_check import compare_pictures
 
-    cases, shown, psnr_db = protected_cases(), FailedPictures(findings.out), dict[str, float]()
-    with _context() as gpu:
-        for count, case in enumerate(cases, start=1):
-            with _noting(findings, str(case)):
-                one = compare_picture(gpu, case, findings.scratch)
-                if isfinite(one.psnr_db):  # neither the same to the bit nor without a golden
-                    psnr_db[one.name] = round(one.psnr_db, 2)
-                if not one.is_alike:
-                    shown.add(one)
-                    findings.fault(f"{one.name}: {one.complaint}")
-            findings.keep(f"{count} pictures compared so far", compared=count, psnr_db=psnr_db)
-    return f"{len(cases) - len(findings.record.faults)} of {len(cases)} pictures agree with their goldens"
+    return compare_pictures(findings, _processes())
 
 
 def speed(findings: Findings) -> str:
@@ -120,12 +92,17 @@ def speed(findings: Findings) -> str:
     from deltalight.benchmarks.gpu_check.timing import time_method
 
     timed: dict[str, dict[str, Any]] = {title: {} for title in SIZES}
-    for title, (size, volume) in SIZES.items():
-        for method in METHODS:
-            with _noting(findings, f"{method} at {title}"):
-                timed[title][method] = asdict(time_method(method, SPEED_FRAMES, size, volume))
-                findings.keep(f"{method} at {title} was the last", timed=timed)
+    open_ = [(method, title) for method in METHODS for title in SIZES]
+    while open_:
+        method, title = open_.pop(0)
+        with _noting(findings, f"{method} at {title}"):
+            timed[title][method] = asdict(time_method(method, SPEED_FRAMES, *SIZES[title]))
+        findings.keep(_not_yet(f"{at} at {of}" for at, of in open_), timed=timed)
     return f"{sum(map(len, timed.values()))} measurements"
+
+
+def _not_yet(names: Iterable[str]) -> str:
+    return f"not yet: {', '.join(names) or 'nothing'}"
 
 
 def memory(findings: Findings) -> str:
@@ -134,13 +111,13 @@ def memory(findings: Findings) -> str:
     `room_bytes` is what a room takes of the device's memory, whatever its method.
     """
     held: dict[str, dict[str, Any]] = {}
-    with _context() as gpu:
+    with opened_context() as gpu:
         free_bytes = _free_bytes(gpu)
-        for method in METHODS:
+        for number, method in enumerate(METHODS, start=1):
             with _noting(findings, method):
                 held[method] = _held(gpu, method, findings.scratch)
                 room_bytes = _room_bytes(gpu, held, free_bytes)
-                findings.keep(f"{method} was the last", held=held, room_bytes=room_bytes)
+                findings.keep(_not_yet(METHODS[number:]), held=held, room_bytes=room_bytes)
     return f"memory of {len(held)} methods"
 
 
@@ -175,11 +152,11 @@ def _held(gpu: "GpuContext", method: str, folder: Path) -> dict[str, Any]:
 def leaks(findings: Findings) -> str:
     """Create, use and release a renderer of each method again and again: the number of GL objects stays the same."""
     counts: dict[str, list[dict[str, int]]] = {}
-    with _context() as gpu:
-        for method in METHODS:
+    with opened_context() as gpu:
+        for number, method in enumerate(METHODS, start=1):
             with _noting(findings, method):
                 counts[method] = list(_counts(gpu, method, findings.scratch))
-                findings.keep(f"{method} was the last", counts=counts)
+                findings.keep(_not_yet(METHODS[number:]), counts=counts)
                 first, *later = counts[method]  # the first also makes what the context keeps for everybody
                 if any(each != first for each in later):
                     findings.fault(f"{method}: {_grown(first, later[-1])} after {len(later)} more renderers")
@@ -191,6 +168,8 @@ def _counts(gpu: "GpuContext", method: str, folder: Path) -> Iterator[dict[str, 
 
     for _ in range(LEAK_ROUNDS):
         _rendered(gpu, method, folder).release()
+        gc.collect()  # an earlier method may have failed in the middle
+        gpu.check()
         yield count_gl_objects()
 
 

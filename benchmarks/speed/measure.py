@@ -65,6 +65,7 @@ class FrameTimes:
     picture_ms: float
     submit_ms: float
     stages_ms: Mapping[str, float]
+    stages_submit_ms: Mapping[str, float]
 
     @property
     def all_stages_ms(self) -> float:
@@ -73,16 +74,23 @@ class FrameTimes:
 
 
 def measure_speed(
-    job: SpeedJob, budget_ms: float, progress: Progress, keep: Keep, *, end_to_end: bool
+    job: SpeedJob,
+    budget_ms: float,
+    progress: Progress,
+    keep: Keep,
+    *,
+    end_to_end: bool,
+    take: Take | None = None,
 ) -> SpeedReport:
     """Measure every motion by every method; frames that take longer than `budget_ms` are late.
 
-    `keep` is given the report so far after every motion, so that nothing is lost where a run is stopped.
+    `keep` is given the report so far after every motion, so that nothing is lost where a run is stopped. `take`: the
+    frames, if they have been prepared.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a process that died for good.
     """
-    scenes, take = job.scenes(), prepare_take(progress)
+    scenes, take = job.scenes(), take or prepare_take(progress)
     with opened(job.device) as gpu:
         frame = take.standing[0].camera
         report = SpeedReport(
@@ -198,16 +206,19 @@ def time_step(renderer: SceneRenderer, step: Step) -> FrameTimes:
         1000 * (finished_s - started_s),
         1000 * (finished_s - submitting_s),
         1000 * (submitted_s - submitting_s),
-        _stage_times(renderer.graph),
+        *_stage_times(renderer.graph),
     )
 
 
-def _stage_times(graph: Graph | None) -> dict[str, float]:
-    """Return the newest frame's times by stage, ms; timer queries are otherwise read some frames late."""
+def _stage_times(graph: Graph | None) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the newest frame's times by stage, and the CPU's to issue them, ms.
+
+    Timer queries are otherwise read some frames late.
+    """
     if graph is None or graph.timers is None:
-        return {}
+        return {}, {}
     graph.timers.wait()
-    return dict(graph.timers.times_ms)
+    return dict(graph.timers.times_ms), dict(graph.timers.submit_ms)
 
 
 def motion_figures(
@@ -230,9 +241,14 @@ def _stage_figures(
     name: str, times: Sequence[FrameTimes], moved_bytes: int | None, peaks: Peaks
 ) -> StageFigures:
     ran = [each.stages_ms[name] for each in times if name in each.stages_ms]
+    submitted = [each.stages_submit_ms[name] for each in times if name in each.stages_submit_ms]
     floor_ms = None if moved_bytes is None else 1000 * moved_bytes / peaks.bytes_per_s
     return StageFigures(
-        ms=Spread.of(ran), runs=len(ran) / len(times), moved_bytes=moved_bytes, floor_ms=floor_ms
+        ms=Spread.of(ran),
+        runs=len(ran) / len(times),
+        submit_ms=Spread.of(submitted),
+        moved_bytes=moved_bytes,
+        floor_ms=floor_ms,
     )
 
 

@@ -28,12 +28,14 @@ class Spread(StrictModel):
 class StageFigures(StrictModel):
     """One stage, over the frames in which it ran.
 
-    `runs` is their share of all frames. `moved_bytes` are the sizes of all that it reads and writes, `floor_ms` what
-    moving them takes at the machine's bandwidth; None for what is no stage of the graph.
+    `runs` is their share of all frames. `submit_ms` is what the CPU takes to issue it. `moved_bytes` are the sizes of
+    all that it reads and writes, `floor_ms` what moving them takes at the machine's bandwidth; None for what is no
+    stage of the graph.
     """
 
     ms: Spread
     runs: float
+    submit_ms: Spread | None = None
     moved_bytes: int | None = None
     floor_ms: float | None = None
 

@@ -53,10 +53,11 @@ def _frame_cells(found: MotionFigures, frames: int) -> list[str]:
 
 def stages_table(title: str, found: MotionFigures) -> Table:
     """Return the stages of one motion in the order in which they ran."""
-    headings = ("median ms", "p95", "runs in", "MB", "floor ms", "times floor")
+    headings = ("median ms", "p95", "submit", "runs in", "MB", "floor ms", "times floor")
     table = figure_table(title, ("Stage",), headings)
     for name, stage in found.stages.items():
-        table.add_row(name, *_both(stage.ms, 2), f"{stage.runs:.0%}", *_floor_cells(stage))
+        submit = MISSING if stage.submit_ms is None else f"{stage.submit_ms.median:.2f}"
+        table.add_row(name, *_both(stage.ms, 2), submit, f"{stage.runs:.0%}", *_floor_cells(stage))
     return table
 
 

@@ -206,6 +206,16 @@ class GpuContext:
                 f"of one: lower {lower}."
             )
 
+    @cached_property
+    def spare_queries(self) -> list[moderngl.Query]:
+        """Timer queries that nobody uses: moderngl frees none, so they pass from one renderer to the next."""
+        return []
+
+    @cached_property
+    def flush(self) -> Callable[[], None]:
+        """glFlush, which moderngl lacks: hands the GPU what was issued so far."""
+        return ctypes.CFUNCTYPE(None)(self.ctx.mglo._context.load("glFlush"))
+
     def release(self) -> None:
         """Frees the context; nothing made from it may be used afterwards."""
         self.ctx.release()

@@ -27,6 +27,7 @@ SOFTWARE_WALKERS = 1024
 SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
 MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
+GPU_WALKERS = 2**18  # 4096 workgroups: as many threads as the largest GPUs hold at a time; idle ones cost microseconds
 CLEARING_GROUPS = 4096  # of workgroups at most; they stride over larger buffers
 WORD_BYTES = 4
 GL_INT = 0x1404
@@ -438,14 +439,15 @@ def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:
     return " ".join([stem, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])
 
 
-def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
-    """Returns the number of threads for walking a list whose length only the GPU knows: at most `longest`.
+def list_threads(gpu: GpuContext, longest: int | None = None) -> int:
+    """Returns the number of threads for walking a list of at most `longest` items; the GPU alone knows how many.
 
     Few in software, where an idle thread costs as much as a busy one, but enough that no thread's loops are
     cut off.
     """
     if not gpu.is_software:
-        return min(longest, MOST_WALKERS)
+        return min(longest or GPU_WALKERS, MOST_WALKERS)
+    longest = longest or LIST_WALKERS
     return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
 
 

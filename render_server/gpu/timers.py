@@ -11,39 +11,57 @@ from deltalight.render_server.gpu.context import GpuContext
 QUERIES_IN_FLIGHT = 3  # frames until a query is read without waiting for the GPU
 
 
+def has_timer_queries(gpu: GpuContext) -> bool:
+    """Whether the driver's timer queries tell anything."""
+    return not gpu.is_software
+
+
 class PassTimers:
     """Milliseconds per pass, by name, for the newest frame with known times.
 
-    A pass that runs several times in a frame is summed.
+    A pass that runs several times in a frame is summed. A query runs from the moment when the GPU meets the pass's
+    first command to its last one's end, so it counts what the GPU waits in between. `submit_ms` is what the CPU takes
+    to issue the passes of the newest frame: a pass with about as much of either may have waited for the CPU.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
-        self._free: list[moderngl.Query] = []
+        self._queries = has_timer_queries(gpu)
         self._pending: list[list[tuple[str, moderngl.Query]]] = []
         self._current: list[tuple[str, moderngl.Query]] = []
         self._clock: dict[str, float] = {}
+        self._submitted: dict[str, float] = {}
         self.times_ms: dict[str, float] = {}
+        self.submit_ms: dict[str, float] = {}
         self.last_ms: dict[str, float] = {}  # of each pass when it last ran
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
         """Times the GL work issued inside."""
-        if self._gpu.is_software:
-            start = time.perf_counter()
+        start_s = time.perf_counter()
+        if not self._queries:
             yield
+            _add_since(start_s, self._submitted, name)
             self._gpu.ctx.finish()
-            elapsed = (time.perf_counter() - start) * 1e3
-            self._clock[name] = self._clock.get(name, 0.0) + elapsed
+            _add_since(start_s, self._clock, name)
             return
-        query = self._free.pop() if self._free else self._gpu.ctx.query(time=True)
-        with query:
-            yield
+        spare = self._gpu.spare_queries
+        query = spare.pop() if spare else self._gpu.ctx.query(time=True)
+        try:
+            with query:
+                yield
+        except BaseException:
+            spare.append(query)
+            raise
         self._current.append((name, query))
+        # Otherwise the query's end is kept back with whatever comes next, and counts the CPU's work until then.
+        self._gpu.flush()
+        _add_since(start_s, self._submitted, name)
 
     def end_frame(self) -> dict[str, float]:
         """Ends the frame and returns the newest known times."""
-        if self._gpu.is_software:
+        self.submit_ms, self._submitted = self._submitted, {}
+        if not self._queries:
             self.times_ms, self._clock = self._clock, {}
             self.last_ms |= self.times_ms
             return self.times_ms
@@ -54,11 +72,11 @@ class PassTimers:
         return self.times_ms
 
     def _read(self, queries: list[tuple[str, moderngl.Query]]) -> dict[str, float]:
-        """Sums the queries of one frame by name and frees them."""
+        """Sums the queries of one frame by name and gives them back."""
         times: dict[str, float] = {}
         for name, query in queries:
             times[name] = times.get(name, 0.0) + query.elapsed / 1e6
-            self._free.append(query)
+            self._gpu.spare_queries.append(query)
         self.last_ms |= times
         return times
 
@@ -66,3 +84,13 @@ class PassTimers:
         """Waits for the GPU, so that the times of all frames are known."""
         while self._pending:
             self.times_ms = self._read(self._pending.pop(0))
+
+    def release(self) -> None:
+        """Gives back the queries that were not read."""
+        for frame in (*self._pending, self._current):
+            self._gpu.spare_queries.extend(query for _, query in frame)
+        self._pending, self._current = [], []
+
+
+def _add_since(start_s: float, times_ms: dict[str, float], name: str) -> None:
+    times_ms[name] = times_ms.get(name, 0.0) + (time.perf_counter() - start_s) * 1e3

@@ -1,5 +1,6 @@
 """Triangle mesh of one depth image, and back faces for it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,9 +17,11 @@ from deltalight.render_server.scene.depth_surface import (
     by_ray,
     depth_surface,
     jump_threshold,
-    surface_normals,
+    normals_along,
+    ray_planes,
 )
 from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.threads import by_bands, for_each
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import LENSES_KEPT
 
@@ -28,6 +31,9 @@ MAX_CELL_DISTANCE = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
 # A ray that leaves a surface samples the cells around its own, which must not contain the surface's back face.
 BACK_OFFSET_VOXELS = 2.0
+# Corners of the triangles in a quad of nodes (0 1 above 2 3): two if it is cut from 0 to 3, two if from 1 to 2.
+QUAD_TRIANGLES = ((0, 2, 3), (0, 3, 1), (0, 2, 1), (1, 2, 3))
+QUAD_CORNERS = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +41,9 @@ class _Nodes:
     """The mesh's grid: pixel coordinates (u, v), rays, inverse depth (0 = hole), normals, optical frame."""
 
     pixels: Float32[np.ndarray, "gh gw 2"]
-    rays: Float32[np.ndarray, "gh gw 2"]
+    rays: Float32[np.ndarray, "2 gh gw"]
     inverse_depth: Float32[np.ndarray, "gh gw"]
-    normals: Float32[np.ndarray, "gh gw 3"]
+    normals: Float32[np.ndarray, "3 gh gw"]
 
 
 def depth_mesh(
@@ -47,16 +53,16 @@ def depth_mesh(
     triangle_budget: int = 40_000,
     surface: DepthSurface | None = None,
     *,
-    grazing: Float32[np.ndarray, "h w"] | None = None,
+    grazing: Callable[[], Float32[np.ndarray, "h w"]] | None = None,
 ) -> TriangleMesh:
     """Meshes a clean depth image, registered to `camera`, in the world.
 
     A node represents each cell of stride x stride pixels, at the cell's centre, with the cell's median depth (moved
     to the centre along the fitted surface); the stride is the least within the budget. No triangle crosses a depth
     discontinuity; cells without depth or normal are holes. `uv` is the vertex's pixel coordinate (pixel centres at
-    integers) in the camera's picture. `surface` is `depth_surface(depth, camera)` if already computed. `grazing` is
-    the inverse depth of surfaces too oblique to measure (`grazing_depth_fill`), which join their two sides. Without
-    any valid depth the mesh is empty.
+    integers) in the camera's picture. `surface` is `depth_surface(depth, camera)` if already computed. `grazing`
+    returns the inverse depth of surfaces too oblique to measure (`grazing_depth_fill`), which join their two sides.
+    Without any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.
@@ -69,11 +75,11 @@ def depth_mesh(
     stride = stride_for_budget(camera.width, camera.height, triangle_budget)
     nodes = _nodes(known, camera, stride)
     limit = jump_threshold(depth, camera, nodes.inverse_depth, stride)
-    slack = np.zeros_like(limit)
-    if grazing is not None and grazing.any():
-        nodes, slack = _with_grazing(nodes, grazing, camera, stride)
-    triangles = _grid_triangles(nodes.inverse_depth, limit, slack)
-    return _world_mesh(nodes, triangles, world_from_camera)
+    slack = None
+    oblique = None if grazing is None else grazing()
+    if oblique is not None and oblique.any():
+        nodes, slack = _with_grazing(nodes, oblique, camera, stride)
+    return _world_mesh(nodes, _triangles_of_quads(nodes.inverse_depth, limit, slack), world_from_camera)
 
 
 def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
@@ -86,19 +92,23 @@ def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
 
 def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     pixels, rays = _node_rays(camera, stride)
-    known = np.isfinite(surface.gradient[0])
-    inverse = np.where(known, surface.inverse_depth, 0)
-    flat = _median_pixels(inverse, stride)
-    chosen = inverse.ravel()[flat]
-    gradient = surface.gradient.reshape(2, -1)[:, flat]
-    along = camera.rays().reshape(-1, 2).take(flat, axis=0)
-    moved = [rays[..., axis] - along[..., axis] for axis in (0, 1)]
-    shift = gradient[0] * moved[0] + gradient[1] * moved[1]
-    # An outlier of the slope must not throw the node off the depths of its cell.
-    at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
-    return _Nodes(
-        pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3).take(flat, axis=0)
-    )
+    depth, all_rays = surface.fitted_depth, ray_planes(camera)
+    inverse, normals = (np.empty((*parts, *rays.shape[1:]), np.float32) for parts in ((), (3,)))
+
+    def fill(rows: slice) -> None:
+        first = rows.start * stride
+        flat = _median_pixels(depth[first : rows.stop * stride], stride) + first * camera.width
+        chosen = depth.ravel().take(flat)
+        gradient = surface.gradient.reshape(2, -1).take(flat, axis=1)
+        along = all_rays.reshape(2, -1).take(flat, axis=1)
+        shift = gradient[0] * (rays[0, rows] - along[0]) + gradient[1] * (rays[1, rows] - along[1])
+        # An outlier of the slope must not throw the node off the depths of its cell.
+        at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
+        inverse[rows] = np.where(chosen > 0, at_centre, 0)
+        normals[:, rows] = normals_along(chosen, gradient, along)
+
+    by_bands(fill, len(inverse))
+    return _Nodes(pixels, rays, inverse, normals)
 
 
 def _with_grazing(
@@ -106,25 +116,32 @@ def _with_grazing(
 ) -> tuple[_Nodes, Float32[np.ndarray, "gh gw"]]:
     """Fills holes with nodes of grazing surfaces; the second value is the step (1/m) that their slopes explain."""
     flat = _median_pixels(grazing, stride)
-    by_pixel = _slopes(grazing)
-    normals = surface_normals(grazing, by_ray(by_pixel, camera), camera).reshape(-1, 3)[flat]
-    added = (grazing.ravel()[flat] > 0) & (nodes.inverse_depth == 0) & short_axis.any_of(normals != 0)
-    slope = np.hypot(*by_pixel.reshape(2, -1)[:, flat])
+    chosen, by_pixel = grazing.ravel().take(flat), _slopes(grazing, flat)
+    along = ray_planes(camera).reshape(2, -1).take(flat, axis=1)
+    normals = np.stack(normals_along(chosen, by_ray(by_pixel, camera, flat), along))
+    added = (chosen > 0) & (nodes.inverse_depth == 0) & (normals != 0).any(axis=0)
     joined = _Nodes(
         nodes.pixels,
         nodes.rays,
-        np.where(added, grazing.ravel()[flat], nodes.inverse_depth),
-        np.where(added[..., None], normals, nodes.normals),
+        np.where(added, chosen, nodes.inverse_depth),
+        np.where(added, normals, nodes.normals),
     )
+    slope = np.hypot(*by_pixel)
     return joined, np.where(added, np.float32(MAX_CELL_DISTANCE * stride) * slope, np.float32(0))
 
 
-def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]:
+def _slopes(
+    inverse: Float32[np.ndarray, "h w"], flat: Int64[np.ndarray, "gh gw"]
+) -> Float32[np.ndarray, "2 gh gw"]:
     """Returns differences per pixel, to the right and down, among non-zero pixels; NaN for isolated ones."""
-    known = np.where(inverse > 0, inverse, np.float32(np.nan))
-    slopes = np.empty((2, *inverse.shape), np.float32)
-    for slope, values in ((slopes[0], known), (slopes[1].T, known.T)):
-        before, after = np.diff(values, prepend=np.nan), np.diff(values, append=np.nan)
+    known = cv2.copyMakeBorder(inverse, 1, 1, 1, 1, cv2.BORDER_CONSTANT).astype(np.float64)
+    known[known <= 0] = np.nan
+    width = known.shape[1]
+    at = (flat // inverse.shape[1] + 1) * width + flat % inverse.shape[1] + 1
+    slopes = np.empty((2, *flat.shape), np.float32)
+    for slope, step in ((slopes[0], 1), (slopes[1], width)):
+        own = known.ravel().take(at)
+        before, after = own - known.ravel().take(at - step), known.ravel().take(at + step) - own
         slope[:] = np.where(np.isnan(before), after, np.where(np.isnan(after), before, (before + after) / 2))
     return slopes
 
@@ -132,13 +149,13 @@ def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]
 @lru_cache(maxsize=2 * LENSES_KEPT)  # meshes are made fine and coarse
 def _node_rays(
     camera: CameraModel, stride: int
-) -> tuple[Float32[np.ndarray, "gh gw 2"], Float32[np.ndarray, "gh gw 2"]]:
+) -> tuple[Float32[np.ndarray, "gh gw 2"], Float32[np.ndarray, "2 gh gw"]]:
     """Returns pixel coordinates and rays of the cells' centres (those of cells cut by the border as well)."""
     columns = _cell_centres(camera.width, stride)
     rows = _cell_centres(camera.height, stride)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
     rays = camera.unproject(pixels.reshape(-1, 2)).reshape(pixels.shape)
-    return pixels.astype(np.float32), rays.astype(np.float32)
+    return pixels.astype(np.float32), np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32)
 
 
 def _cell_centres(length: int, stride: int) -> Float64[np.ndarray, " n"]:
@@ -154,103 +171,148 @@ def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> Int64[np
     """
     height, width = inverse.shape
     rows, columns = -(-height // stride), -(-width // stride)
-    padded = cv2.copyMakeBorder(
-        inverse, 0, rows * stride - height, 0, columns * stride - width, cv2.BORDER_CONSTANT
-    ).view(np.uint32)
+    bits = inverse.view(np.uint32)
     steps = np.unique(np.linspace(0, stride - 1, min(stride, CELL_SAMPLES)).round().astype(int))
-    offsets = [(down, right) for down in steps for right in steps]
-    number_bits = np.uint32((1 << (len(offsets) - 1).bit_length()) - 1)
-    planes = [padded[down::stride, right::stride] for down, right in offsets]
-    invalid = sum((plane == 0).astype(np.intp) for plane in planes)
-    keys = [(plane & ~number_bits) | np.uint32(number) for number, plane in enumerate(planes)]
-    _sort_planes(keys)
-    middle = np.minimum((invalid + len(offsets)) // 2, len(offsets) - 1)
-    chosen = np.take_along_axis(np.stack(keys), middle[None], axis=0)[0] & number_bits
-    down, right = np.array(offsets)[chosen.astype(np.intp)].transpose(2, 0, 1)
-    row = np.minimum(np.arange(rows)[:, None] * stride + down, height - 1)
-    return np.asarray(row * width + np.minimum(np.arange(columns) * stride + right, width - 1))
+    offsets = np.array([(down, right) for down in steps for right in steps])
+    count = len(offsets)
+    number_bits = np.uint32((1 << (count - 1).bit_length()) - 1)
+    keys = np.empty((count + 1, rows, columns), np.uint32)  # one more than there are, for sorting
+    invalid = np.zeros((rows, columns), np.uint8)
+    for number, (down, right) in enumerate(offsets):
+        sampled = bits[down::stride, right::stride]  # less than all cells where the border cuts some
+        if sampled.shape != invalid.shape:
+            keys[number] = 0
+        keys[number, : len(sampled), : sampled.shape[1]] = sampled
+        invalid += keys[number] == 0
+        keys[number] &= ~number_bits
+        keys[number] |= np.uint32(number)
+    middle = np.minimum((invalid + np.uint8(count)) // 2, count - 1)
+    place = _sorted_planes(keys).take(middle)
+    chosen = (
+        keys.ravel().take(place * invalid.size + np.arange(invalid.size).reshape(invalid.shape)) & number_bits
+    )
+    row = np.minimum(offsets[:, 0].take(chosen) + np.arange(rows)[:, None] * stride, height - 1)
+    column = np.minimum(offsets[:, 1].take(chosen) + np.arange(columns) * stride, width - 1)
+    return np.asarray(row * width + column)
 
 
-def _sort_planes(planes: list[UInt32[np.ndarray, "a b"]]) -> None:
-    """Sorts every element's values over the planes, in place: Batcher's odd-even merge network."""
-    count, run = len(planes), 1
+def _sorted_planes(planes: UInt32[np.ndarray, "k+1 a b"]) -> Int64[np.ndarray, " k"]:
+    """Sorts every element's values over all planes but the last, which is free; returns where each place's plane is.
+
+    Batcher's odd-even merge network.
+    """
+    *places, free = range(len(planes))
+    count, run = len(places), 1
     while run < count:
         gap = run
         while gap:
             for start in range(gap % run, count - gap, 2 * gap):
                 for low in range(start, min(start + gap, count - gap)):
                     if low // (2 * run) == (low + gap) // (2 * run):
-                        one, other = planes[low], planes[low + gap]
-                        planes[low], planes[low + gap] = np.minimum(one, other), np.maximum(one, other)
+                        one, other = planes[places[low]], planes[places[low + gap]]
+                        np.minimum(one, other, out=planes[free])
+                        np.maximum(one, other, out=other)
+                        places[low], free = free, places[low]
             gap //= 2
         run *= 2
+    return np.array(places)
 
 
-def _grid_triangles(
+def _triangles_of_quads(
     inverse: Float32[np.ndarray, "gh gw"],
     threshold: Float32[np.ndarray, "gh gw"],
-    slack: Float32[np.ndarray, "gh gw"],
-) -> Int32[np.ndarray, "m 3"]:
-    """Joins neighbouring nodes on one surface; quads are cut along the diagonal with the lesser step.
+    slack: Float32[np.ndarray, "gh gw"] | None,
+) -> list[Bool[np.ndarray, "a b"]]:
+    """Joins neighbouring nodes on one surface: returns which quads hold each of QUAD_TRIANGLES.
 
-    Steps may exceed the threshold by the slack of either node. Seen from the camera, triangles are counter-clockwise.
+    Quads are cut along the diagonal with the lesser step. Steps may exceed the threshold by the slack of either node.
+    Seen from the camera, triangles are counter-clockwise.
     """
-    valid = inverse > 0
-    index = np.arange(inverse.size, dtype=np.int32).reshape(inverse.shape)
-    quads = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
-    corners = [inverse[quad] for quad in quads]
-    slacks = [slack[quad] for quad in quads]
-    limit = threshold[:-1, :-1]
-    holes = [~valid[quad] for quad in quads]
+    corners = [inverse[quad] for quad in QUAD_CORNERS]
+    usable = [corner > 0 for corner in corners]
+    holes = [~each for each in usable]
 
     def joined(one: int, other: int) -> Bool[np.ndarray, "a b"]:
-        return np.asarray(np.abs(corners[one] - corners[other]) <= limit + slacks[one] + slacks[other])
+        limit = threshold[:-1, :-1]
+        if slack is not None:
+            limit = limit + slack[QUAD_CORNERS[one]] + slack[QUAD_CORNERS[other]]
+        return np.asarray(np.abs(corners[one] - corners[other]) <= limit)
 
     top, bottom, left, right = joined(0, 1), joined(2, 3), joined(0, 2), joined(1, 3)
     falling = np.abs(corners[0] - corners[3]) <= np.abs(corners[1] - corners[2])
     # A quad with one hole still holds a triangle, if it is cut between the hole's neighbours.
     falling = (falling | holes[1] | holes[2]) & ~(holes[0] | holes[3])
     diagonal = np.where(falling, joined(0, 3), joined(1, 2))
-    usable = [~hole for hole in holes]
-    kinds = [
-        (falling & left & bottom, (0, 2, 3)),
-        (falling & right & top, (0, 3, 1)),
-        (~falling & left & top, (0, 2, 1)),
-        (~falling & right & bottom, (1, 2, 3)),
+    edges = (falling & left & bottom, falling & right & top, ~falling & left & top, ~falling & right & bottom)
+    return [
+        fits & diagonal & usable[one] & usable[two] & usable[three]
+        for fits, (one, two, three) in zip(edges, QUAD_TRIANGLES, strict=True)
     ]
-    parts = []
-    for fits, names in kinds:
-        chosen = fits & diagonal & usable[names[0]] & usable[names[1]] & usable[names[2]]
-        parts.append(np.stack([index[quads[name]][chosen] for name in names], axis=1))
-    return np.concatenate(parts)
+
+
+@lru_cache(maxsize=2 * LENSES_KEPT)
+def _first_nodes(rows: int, columns: int) -> Int32[np.ndarray, " q"]:
+    """Returns the upper left node (flat index) of each quad of a grid."""
+    nodes = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    return nodes[:-1, :-1].ravel()
 
 
 def _world_mesh(
-    nodes: _Nodes, triangles: Int32[np.ndarray, "m 3"], world_from_camera: Float64[np.ndarray, "4 4"]
+    nodes: _Nodes, triangles: list[Bool[np.ndarray, "a b"]], world_from_camera: Float64[np.ndarray, "4 4"]
 ) -> TriangleMesh:
     """Keeps the nodes that triangles use and transforms them to the world."""
-    is_used = np.zeros(nodes.inverse_depth.size, bool)
-    is_used[triangles.ravel()] = True
-    used, numbers = np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32) - 1
-    depth = 1 / nodes.inverse_depth.ravel()[used].astype(np.float64)
-    rays = nodes.rays.reshape(-1, 2).take(used, axis=0).T
-    rotation = world_from_camera[:3, :3]
-    return TriangleMesh(
-        _turned(np.stack([rays[0] * depth, rays[1] * depth, depth]), rotation, world_from_camera[:3, 3:]),
-        _turned(nodes.normals.reshape(-1, 3).take(used, axis=0).T.astype(np.float64), rotation),
-        numbers.take(triangles),
-        nodes.pixels.reshape(-1, 2).take(used, axis=0),
-        REAL_MATERIAL,
-    )
+    shape = nodes.inverse_depth.shape
+    is_used = np.zeros(shape, bool)
+    for chosen, names in zip(triangles, QUAD_TRIANGLES, strict=True):
+        for name in names:
+            is_used[QUAD_CORNERS[name]] |= chosen
+    ends = np.cumsum(is_used, dtype=np.int32)  # of vertices, node by node
+    count = int(ends[-1])
+    positions, normals = np.empty((2, count, 3), np.float32)
+    uv = np.empty((count, 2), np.float32)
+
+    def fill(rows: slice) -> None:
+        used = np.flatnonzero(is_used[rows])
+        last = int(ends[rows.stop * shape[1] - 1])
+        own = slice(last - len(used), last)
+        depth = 1 / nodes.inverse_depth[rows].ravel().take(used).astype(np.float64)
+        x, y = nodes.rays[:, rows].reshape(2, -1).take(used, axis=1)
+        normal = nodes.normals[:, rows].reshape(3, -1).take(used, axis=1).astype(np.float64)
+        rotation = world_from_camera[:3, :3]
+        positions[own] = (
+            _turned(np.stack([x * depth, y * depth, depth]), rotation) + world_from_camera[:3, 3:]
+        ).T
+        normals[own] = _turned(normal, rotation).T
+        uv[own] = nodes.pixels[rows].reshape(-1, 2).take(used, axis=0)
+
+    by_bands(fill, len(is_used))
+    return TriangleMesh(positions, normals, _numbered(triangles, ends - 1, shape), uv, REAL_MATERIAL)
 
 
 def _turned(
-    columns: Float64[np.ndarray, "3 n"], rotation: Float64[np.ndarray, "3 3"], shift: float | np.ndarray = 0.0
-) -> Float32[np.ndarray, "n 3"]:
-    """Returns turned vectors, which are shifted then. Given by columns: NumPy is slow along short rows."""
+    columns: Float64[np.ndarray, "3 n"], rotation: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "3 n"]:
+    """Returns turned vectors. Given by columns: NumPy is slow along short rows."""
     # einsum, because the BLAS behind `@` spins on every core for such slim matrices.
-    turned = np.einsum("ij,jn->in", rotation, columns) + shift
-    return np.ascontiguousarray(turned.T, np.float32)
+    return np.asarray(np.einsum("ij,jn->in", rotation, columns))
+
+
+def _numbered(
+    triangles: list[Bool[np.ndarray, "a b"]], numbers: Int32[np.ndarray, " n"], shape: tuple[int, ...]
+) -> Int32[np.ndarray, "m 3"]:
+    """Returns the triangles, of which quads of a grid of that shape hold these, by the numbers of its nodes."""
+    first, offsets = _first_nodes(*shape), (0, 1, shape[1], shape[1] + 1)
+    ends = np.cumsum([np.count_nonzero(chosen) for chosen in triangles])
+    found = np.empty((ends[-1], 3), np.int32)
+
+    def fill(kind: int) -> None:
+        node = first.take(np.flatnonzero(triangles[kind]))
+        own = found[ends[kind] - len(node) : ends[kind]]
+        for column, name in enumerate(QUAD_TRIANGLES[kind]):
+            own[:, column] = numbers.take(node + np.int32(offsets[name]))
+
+    for_each(fill, range(len(triangles)))
+    return found
 
 
 def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:
@@ -260,10 +322,15 @@ def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Flo
     blocks the light from above it and reflects that from below. The thickness is unknown, so a back face lies as near
     as voxels allow. `voxel_edge` in m.
     """
-    positions = corners[..., :3]
-    across = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
-    length = short_axis.lengths(across)[..., None]
-    normals = across / np.maximum(length, np.finfo(np.float32).tiny)
+    first, second, third = np.ascontiguousarray(corners[..., :3].transpose(1, 2, 0))
+    along, beside = second - first, third - first
+    across = np.stack(
+        [
+            along[after] * beside[before] - along[before] * beside[after]
+            for after, before in ((1, 2), (2, 0), (0, 1))
+        ]
+    )
+    normals = across / np.maximum(short_axis.lengths(across.T), np.finfo(np.float32).tiny)
     backs = corners[:, ::-1].copy()
-    backs[..., :3] -= BACK_OFFSET_VOXELS * voxel_edge * normals[:, None]
+    backs[..., :3] -= (BACK_OFFSET_VOXELS * voxel_edge * normals).T[:, None]
     return backs

@@ -11,7 +11,7 @@ beside it, the occlusion shadow of stereo.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -49,20 +49,28 @@ MIN_GRAZING_FRACTION = 0.75
 Map = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 Colors = Float32[np.ndarray, "h w 3"]
+Pixels = slice | Int64[np.ndarray, "k w"]  # flat indices
+Jumps = tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSurface:
-    """The surface at every pixel.
+    """The surface at every pixel of `camera`.
 
     `inverse_depth` is as measured, 0 where invalid and where a pixel stands alone. `gradient` is its change
-    by ray coordinate (x/z, y/z), fitted to the surroundings (NaN where unknown). `normals` are unit vectors
-    in the optical frame towards the camera, zero where they are unknown.
+    by ray coordinate (x/z, y/z), fitted to the surroundings (NaN where unknown), and `fitted_depth` is
+    `inverse_depth` where it is known, 0 elsewhere.
     """
 
     inverse_depth: Float32[np.ndarray, "h w"]
     gradient: Float32[np.ndarray, "2 h w"]
-    normals: Float32[np.ndarray, "h w 3"]
+    fitted_depth: Float32[np.ndarray, "h w"]
+    camera: CameraModel
+
+    @cached_property
+    def normals(self) -> Float32[np.ndarray, "h w 3"]:
+        """Unit vectors in the optical frame towards the camera, zero where they are unknown."""
+        return surface_normals(self.inverse_depth, self.gradient, self.camera)
 
 
 def noise_sigma(depth: DepthImage) -> float:
@@ -77,18 +85,52 @@ def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     would hold a discontinuity, the window is moved aside to one that holds the pixel but no discontinuity
     (if there is one).
     """
-    valid = depth.valid & (depth.depth_m > 0)
-    inverse = np.zeros_like(depth.depth_m, np.float32)
-    np.divide(1, depth.depth_m, out=inverse, where=valid)
-    jumps = _jumps(inverse, jump_threshold(depth, camera, inverse), valid)
+    shape, radius, terms = depth.depth_m.shape, window_radius(depth, camera), jump_terms(depth, camera)
+    inverse, fitted, crossed = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, bool)
+    by_pixel, gradient = (np.empty((2, *shape), np.float32) for _ in range(2))
+
+    def fit(rows: slice) -> None:
+        around, own = _with_margin(rows, radius + 1)
+        near, valid, jumps = _clean_inverse(depth.depth_m[around], depth.valid[around], terms)
+        inverse[rows] = near[own]
+        _fit_windows(near, valid.astype(np.float32), radius, own, by_pixel[:, rows])
+        crossed[rows] = valid[own] & _crosses_edge(jumps, valid, radius)[own]
+
+    def move(rows: slice) -> None:
+        moved = by_pixel[:, rows].copy()
+        _move_windows(by_pixel, crossed, radius, rows, moved)
+        gradient[:, rows] = by_ray(moved, camera, slice(rows.start * shape[1], rows.stop * shape[1]))
+        np.multiply(inverse[rows], np.isfinite(moved[0]), out=fitted[rows])
+
+    if camera.has_distortion:
+        _pixel_from_ray(camera)  # once, before threads ask for it
+    by_bands(fit, shape[0])
+    by_bands(move, shape[0])
+    return DepthSurface(inverse, gradient, fitted, camera)
+
+
+def _with_margin(rows: slice, margin: int) -> tuple[slice, slice]:
+    """Returns rows with those around them, and where they are among these."""
+    around = slice(max(rows.start - margin, 0), rows.stop + margin)
+    return around, slice(rows.start - around.start, rows.stop - around.start)
+
+
+def _clean_inverse(
+    depth_m: Float32[np.ndarray, "h w"], is_valid: Mask, terms: tuple[float, float]
+) -> tuple[Map, Mask, Jumps]:
+    """Returns inverse depth (0 where unknown) without pixels that stand alone, where it is known, and its jumps.
+
+    The jumps are those with all valid pixels. `terms`: those of `jump_threshold`.
+    """
+    valid = is_valid & (depth_m > 0)
+    inverse = np.empty(depth_m.shape, np.float32)
+    with np.errstate(divide="ignore"):
+        np.divide(1, depth_m, out=inverse)
+    inverse[~valid] = 0
+    jumps = _jumps(inverse, _threshold(inverse, terms), valid)
     valid &= ~_lonely(jumps)
     inverse *= valid
-    mask = valid.astype(np.float32)
-    radius = window_radius(depth, camera)
-    by_pixel = _window_gradient(inverse, mask, radius)
-    _move_windows(by_pixel, valid & _crosses_edge(jumps, valid, radius), radius)
-    gradient = by_ray(by_pixel, camera)
-    return DepthSurface(inverse, gradient, surface_normals(inverse, gradient, camera))
+    return inverse, valid, jumps
 
 
 def jump_threshold(
@@ -102,7 +144,15 @@ def jump_threshold(
     Three sigma of a difference, and the change on a surface that is 80 degrees from facing the camera:
     |dw| = w tan(slope) / f.
     """
-    slope, least = jump_terms(depth, camera)
+    return _threshold(inverse_depth, jump_terms(depth, camera), step_px)
+
+
+def _threshold(
+    inverse_depth: Float32[np.ndarray, "*s"],
+    terms: tuple[float, float],
+    step_px: float | Float32[np.ndarray, "*s"] = 1.0,
+) -> Float32[np.ndarray, "*s"]:
+    slope, least = terms
     return inverse_depth * (step_px * np.float32(slope)) + np.float32(least)
 
 
@@ -130,24 +180,6 @@ def window_radius(depth: DepthImage, camera: CameraModel) -> int:
     return MAX_RADIUS
 
 
-def _window_gradient(
-    inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"], radius: int
-) -> Float32[np.ndarray, "2 h w"]:
-    """Returns the slope of w by pixel: least squares over a square window, valid pixels only.
-
-    Where pixels are too few or in a line, the slope is NaN.
-    """
-    gradient = np.empty((2, *inverse.shape), np.float32)
-
-    def fit(rows: slice) -> None:
-        around = slice(max(rows.start - radius, 0), rows.stop + radius)
-        own = slice(rows.start - around.start, rows.stop - around.start)
-        _fit_windows(inverse[around], mask[around], radius, own, gradient[:, rows])
-
-    by_bands(fit, len(inverse))
-    return gradient
-
-
 def _fit_windows(
     inverse: Float32[np.ndarray, "h w"],
     mask: Float32[np.ndarray, "h w"],
@@ -155,9 +187,10 @@ def _fit_windows(
     rows: slice,
     gradient: Float32[np.ndarray, "2 k w"],
 ) -> None:
-    """Fills the slopes of some rows, which have their windows inside the image.
+    """Fills the slopes of w by pixel of some rows: least squares over a square window, valid pixels only.
 
-    Offsets count from the pixel itself, so that no large numbers cancel.
+    The rows around them that their windows hold are given too. Where pixels are too few or in a line, the slope is
+    NaN. Offsets count from the pixel itself, so that no large numbers cancel.
     """
     one = np.ones(2 * radius + 1)
     ramp = np.arange(-radius, radius + 1.0)
@@ -191,9 +224,7 @@ def _filtered(
     return np.asarray(cv2.sepFilter2D(values, cv2.CV_32F, across, down, borderType=cv2.BORDER_CONSTANT))
 
 
-def _jumps(
-    inverse: Float32[np.ndarray, "h w"], threshold: Float32[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
-) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
+def _jumps(inverse: Map, threshold: Map, valid: Mask) -> Jumps:
     """Returns where a pixel and the next one down, and right, are valid but on different surfaces (1)."""
     down, right = np.zeros((2, *valid.shape), np.uint8)
     down[:-1] = (np.abs(inverse[1:] - inverse[:-1]) > threshold[:-1]) & valid[1:] & valid[:-1]
@@ -203,7 +234,7 @@ def _jumps(
     return down, right
 
 
-def _lonely(jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
+def _lonely(jumps: Jumps) -> Mask:
     """Whether a pixel jumps to at least three of its neighbours: a spike, or a flying pixel between surfaces."""
     down, right = jumps
     count = down + right
@@ -212,11 +243,7 @@ def _lonely(jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]) ->
     return np.asarray(count >= 3)
 
 
-def _crosses_edge(
-    jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]],
-    valid: Bool[np.ndarray, "h w"],
-    radius: int,
-) -> Bool[np.ndarray, "h w"]:
+def _crosses_edge(jumps: Jumps, valid: Mask, radius: int) -> Mask:
     """Whether the window around a pixel holds a jump between two valid neighbours."""
     down, right = jumps
     down[:-1] &= valid[1:] & valid[:-1]
@@ -231,38 +258,42 @@ def _crosses_edge(
 
 
 def _move_windows(
-    gradient: Float32[np.ndarray, "2 h w"], crossed: Bool[np.ndarray, "h w"], radius: int
+    gradient: Float32[np.ndarray, "2 h w"],
+    crossed: Mask,
+    radius: int,
+    rows: slice,
+    moved: Float32[np.ndarray, "2 k w"],
 ) -> None:
-    """Gives pixels whose window crosses an edge the slope of a shifted window that does not, in place."""
-    width = crossed.shape[1]
-    clean = (~crossed & np.isfinite(gradient[0])).ravel()
-    slopes = gradient.reshape(2, -1)
-    pending = np.flatnonzero(crossed)
-    targets, sources = [], []
+    """Gives pixels of some rows whose window crosses an edge the slope of a shifted one that does not, in `moved`."""
+    width, first = crossed.shape[1], rows.start * crossed.shape[1]
+    slopes, own = gradient.reshape(2, -1), moved.reshape(2, -1)
+    pending = np.flatnonzero(crossed[rows]) + first
+    columns = pending % width
     for down, right in SHIFTS:
-        column = pending % width + radius * right
+        column = columns + radius * right
         source = np.clip(pending + radius * (down * width + right), 0, crossed.size - 1)
-        hit = clean[source] & (column >= 0) & (column < width)
-        targets.append(pending[hit])
-        sources.append(source[hit])
-        pending = pending[~hit]
-    slopes[:, np.concatenate(targets)] = slopes[:, np.concatenate(sources)]
+        is_clean = ~crossed.ravel().take(source) & np.isfinite(slopes[0].take(source))
+        hit = is_clean & (column >= 0) & (column < width)
+        own[:, pending[hit] - first] = slopes.take(source[hit], axis=1)
+        pending, columns = pending[~hit], columns[~hit]
 
 
-def by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
-    """Turns a change by pixel into a change by ray coordinate."""
+def by_ray(
+    by_pixel: Float32[np.ndarray, "2 k w"], camera: CameraModel, pixels: Pixels
+) -> Float32[np.ndarray, "2 k w"]:
+    """Turns a change by pixel, at these pixels (flat indices), into a change by ray coordinate."""
     if not camera.has_distortion:
         return by_pixel * camera.matrix[[0, 1], [0, 1]].astype(np.float32)[:, None, None]
-    inverse = _pixel_from_ray(camera)
+    inverse = _pixel_from_ray(camera)[:, :, pixels].reshape(2, *by_pixel.shape)
     return np.stack([(by_pixel * inverse[:, ray]).sum(axis=0) for ray in (0, 1)])
 
 
 @lru_cache(maxsize=LENSES_KEPT)
-def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 h w"]:
+def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 n"]:
     """Returns the change of pixel coordinates (first axis) by ray coordinates (second) at every pixel."""
     rays = camera.rays().astype(np.float64)
     jacobian = np.stack([np.gradient(rays, axis=1), np.gradient(rays, axis=0)], axis=-1)
-    return np.ascontiguousarray(np.linalg.inv(jacobian).transpose(2, 3, 0, 1), np.float32)
+    return np.ascontiguousarray(np.linalg.inv(jacobian).transpose(2, 3, 0, 1), np.float32).reshape(2, 2, -1)
 
 
 def surface_normals(
@@ -270,26 +301,27 @@ def surface_normals(
     gradient: Float32[np.ndarray, "2 h w"],
     camera: CameraModel,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Returns unit normals of inverse depth and its change by ray; zero where unknown.
-
-    They are in the optical frame, towards the camera. A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along
-    (gradient, w - gradient.ray).
-    """
+    """Returns unit normals of inverse depth and its change by ray at every pixel; zero where unknown."""
     normals = np.empty((*inverse.shape, 3), np.float32)
-    rays = _ray_planes(camera)
-    by_bands(
-        lambda rows: _fill_normals(inverse[rows], gradient[:, rows], rays[:, rows], normals[rows]),
-        len(inverse),
-    )
+    rays = ray_planes(camera)
+
+    def fill(rows: slice) -> None:
+        cv2.merge(normals_along(inverse[rows], gradient[:, rows], rays[:, rows]), normals[rows])
+
+    by_bands(fill, len(inverse))
     return normals
 
 
-def _fill_normals(
+def normals_along(
     inverse: Float32[np.ndarray, "h w"],
     gradient: Float32[np.ndarray, "2 h w"],
     rays: Float32[np.ndarray, "2 h w"],
-    normals: Float32[np.ndarray, "h w 3"],
-) -> None:
+) -> list[Float32[np.ndarray, "h w"]]:
+    """Returns x, y and z of the unit normals of inverse depth and its change by ray, along these rays.
+
+    They are in the optical frame, towards the camera; zero where unknown. A plane n.P = d has
+    w = (n/d).(x/z, y/z, 1), so n is along (gradient, w - gradient.ray).
+    """
     x, y = gradient
     z = inverse - x * rays[0] - y * rays[1]
     scale = x * x + y * y + z * z
@@ -298,11 +330,12 @@ def _fill_normals(
     parts = [part * scale for part in (x, y, z)]
     for part in parts:
         part[unknown] = 0
-    cv2.merge(parts, normals)
+    return parts
 
 
 @lru_cache(maxsize=LENSES_KEPT)
-def _ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
+def ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
+    """Returns x/z and y/z of the ray through every pixel."""
     return np.ascontiguousarray(camera.rays().transpose(2, 0, 1))
 
 
@@ -322,18 +355,22 @@ def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], cam
     the pixel, so strips are filled linearly from their near to their far side.
     """
     valid = depth.valid & (depth.depth_m > 0)
-    inverse = np.divide(1, depth.depth_m, out=np.zeros_like(depth.depth_m), where=valid)
-    result = np.zeros_like(inverse)
+    result = np.zeros_like(depth.depth_m)
     unknown = (~valid).view(np.uint8)
-    to_known = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_5)
     thick = cv2.morphologyEx(unknown, cv2.MORPH_OPEN, np.ones((MIN_STRIP_WIDTH_PX,) * 2, np.uint8))
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
+    to_known: Map | None = None
     for label in range(1, count):
         if boxes[label, cv2.CC_STAT_AREA] < MIN_STRIP_AREA_PX:
             continue
         part = _strip_window(boxes[label])
         strip = labels[part] == label
-        around = inverse[part] * _dilated(strip, BORDER_RADIUS_PX)
+        beside = valid[part] & _dilated(strip, BORDER_RADIUS_PX)
+        around = np.divide(1, depth.depth_m[part], out=np.zeros_like(result[part]), where=beside)
+        if not _steps_at_all(around, depth, camera):
+            continue
+        if to_known is None:  # takes as long as all else
+            to_known = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_5)
         if _may_be_grazing(strip, around, to_known[part], depth, camera):
             grazing, bridged = _bridge(strip, around, color[part], depth, camera)
             result[part][grazing] = bridged[grazing]
@@ -350,6 +387,15 @@ def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
     )
 
 
+def _steps_at_all(around: Map, depth: DepthImage, camera: CameraModel) -> bool:
+    """Whether inverse depth beside a strip (0 elsewhere) differs by more than even its border could explain."""
+    known = around[around > 0]
+    if not known.size:
+        return False
+    least = known.min(keepdims=True)
+    return bool(known.max() - least > jump_threshold(depth, camera, least, 2.0))
+
+
 def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, camera: CameraModel) -> bool:
     """Rules out most strips cheaply: no depth step beside them could make most of their pixels grazing.
 
@@ -357,8 +403,6 @@ def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, 
     strip is at least twice as wide there.
     """
     known = around[around > 0]
-    if not known.size:
-        return False
     least = np.full(int(strip.sum()), known.min())
     bearable = jump_threshold(depth, camera, least, 2 * to_known[strip])
     return bool((known.max() - known.min() > bearable).mean() > MIN_GRAZING_FRACTION)

@@ -4,6 +4,7 @@ import os
 import time
 
 from deltalight.benchmarks.gpu_check.record import Findings, Skipped
+from deltalight.protocol.errors import DeltalightError
 
 
 def fine(findings: Findings) -> str:
@@ -40,3 +41,13 @@ def packageless(findings: Findings) -> str:
     import no_such_package
 
     return str(no_such_package) + str(findings)
+
+
+def at_work(number: int) -> int:
+    if number > 0:
+        os.abort()
+    return number
+
+
+def at_fault(what: str) -> int:
+    raise DeltalightError(f"{what} is green")

@@ -5,6 +5,8 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
+from dataclasses import replace
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,16 +17,22 @@ import cv2
 import numpy as np
 import pytest
 
-from deltalight.benchmarks.gpu_check import beside_tests, packages
+from deltalight.benchmarks.gpu_check import beside_tests, compiling, packages
 from deltalight.benchmarks.gpu_check.beside_tests import ComparedPicture
 from deltalight.benchmarks.gpu_check.check import check_gpu
 from deltalight.benchmarks.gpu_check.child import take_step
+from deltalight.benchmarks.gpu_check.compiling import compile_everything
+from deltalight.benchmarks.gpu_check.gpu_tests import Recorder
+from deltalight.benchmarks.gpu_check.picture_check import compare_pictures
 from deltalight.benchmarks.gpu_check.plan import BUDGETS_S, MACHINE, STEPS, Step, choose_steps
+from deltalight.benchmarks.gpu_check.processes import spread
 from deltalight.benchmarks.gpu_check.record import Findings, Record, State
 from deltalight.benchmarks.gpu_check.report import Report
 from deltalight.protocol.errors import DeltalightError
-from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext, SharedPrograms
+from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.services.cli import run
+from tests.benchmarks import gpu_check_samples
 from tests.render_server import protected_scenes, shader_variants
 from tests.render_server.protected_scenes import Case
 
@@ -86,6 +94,7 @@ def test_an_unknown_step_is_one_sentence(capsys: pytest.CaptureFixture[str], tmp
 
 def test_every_package_that_is_asked_for_has_its_right_name() -> None:
     assert packages.missing_packages() == []
+    assert not packages._is_there("cv2/no_such_part")
     assert all(version(package) for package in packages.PACKAGES.values())
     assert set(BUDGETS_S) == {step.name for step in STEPS}
 
@@ -268,6 +277,7 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
         "def test_good(): pass",
         "def test_bad(): assert 1 == 2",
         "def test_skipped(): pytest.skip()",
+        "def test_packageless(): import no_such_package",
         "@pytest.mark.slow",
         "def test_slow(): pass",
     ]
@@ -287,12 +297,101 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
         timeout=120,
         check=False,
     )
-    assert "said: 1 passed, 1 failed, 1 skipped, 1 files left out for want of a package" in done.stdout, (
+    assert "said: 1 passed, 1 failed, 1 skipped, 2 left out for want of a package" in done.stdout, (
         done.stdout + done.stderr
     )
-    (fault,) = json.loads((tmp_path / "record.json").read_text())["faults"]
+    record = json.loads((tmp_path / "record.json").read_text())
+    (fault,) = record["faults"]
     assert "test_some.py::test_bad: " in fault
     assert "assert 1 == 2" in fault
+    left_out = sorted(record["figures"]["left_out"])
+    assert ["test_other.py" in left_out[0], "test_some.py::test_packageless" in left_out[1]] == [True, True]
+    assert " of 4 tests done" in record["sentence"]
+
+
+def test_a_module_of_the_project_is_no_package_that_is_missing(tmp_path: Path) -> None:
+    recorder = Recorder(findings(tmp_path))
+    for module in ("deltalight.nowhere", "tests.nowhere"):
+        report = Mock(when="call", passed=False, failed=True, outcome="failed", nodeid="test_it")
+        report.longreprtext = f"E   ModuleNotFoundError: No module named '{module}'"
+        recorder.pytest_runtest_logreport(report)
+    assert (recorder.counts["failed"], recorder.left_out) == (2, [])
+
+
+@pytest.mark.slow
+def test_several_processes_compile_what_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two small parts: in processes of their own, which know nothing of what is patched here."""
+    parts = ["image-based shading", "soft mattes"]
+    monkeypatch.setattr(shader_variants, "PARTS", {name: shader_variants.PARTS[name] for name in parts})
+    variants = []
+    for processes in (1, 2):
+        (tmp_path / str(processes)).mkdir()
+        step = findings(tmp_path / str(processes))
+        compile_everything(step, processes)
+        assert step.record.faults == []
+        assert step.record.sentence.endswith("2 of 2 scenes rendered")
+        variants.append(step.record.figures["variants"])
+    assert variants[0] == variants[1]
+    assert len(variants[0]) > 5
+
+
+def test_a_part_tells_what_it_would_compile(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    def part(gpu: GpuContext, folder: Path) -> None:
+        del folder
+        kernel = Kernel(gpu, "clear_buffer")
+        kernel.run((1,))
+        raise ValueError("of pictures that are worthless")
+
+    monkeypatch.setattr(shader_variants, "PARTS", {"part": part})
+    monkeypatch.setattr(
+        compiling, "opened_context", lambda: nullcontext(replace(gpu, programs=SharedPrograms()))
+    )
+    compile_shader = gpu.ctx.compute_shader
+    try:
+        asked = compiling.asked_variants("part")
+    finally:
+        gpu.ctx.compute_shader = compile_shader
+    assert list(asked) == ["clear_buffer"]
+    assert asked["clear_buffer"].startswith("#version")
+
+
+def test_variants_that_the_driver_refuses_are_named_each(
+    gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiling, "process_context", lambda: gpu)
+    head = "#version 430 core\nlayout(local_size_x = 1) in;\nvoid main() { %s }"
+    chunk = [("good", head % ""), ("bad", head % "odd();"), ("worse", head % "worse();")]
+    faults = compiling.compile_variants(chunk)
+    assert [fault.partition(": ")[0] for fault in faults] == ["bad", "worse"]
+    assert gpu.ctx.error == "GL_NO_ERROR"
+
+
+def test_variants_are_dealt_by_length() -> None:
+    found = {name: "x" * length for name, length in zip("abcde", (5, 1, 4, 2, 3), strict=True)}
+    dealt = compiling.dealt(found, 2)
+    assert [[label for label, _ in chunk] for chunk in dealt] == [["a", "e", "b"], ["c", "d"]]
+    assert len(compiling.dealt(found, 9)) == 5
+
+
+@pytest.mark.slow
+def test_a_process_that_ends_is_a_fault_of_what_it_left() -> None:
+    fine, *crashed = sorted(spread(gpu_check_samples.at_work, [0, 1, 2], 1), key=lambda done: done.item)
+    assert (fine.result, fine.fault) == (0, None)
+    assert all("BrokenProcessPool" in str(done.fault) for done in crashed)
+
+
+@pytest.mark.slow
+def test_what_is_raised_in_a_process_is_told() -> None:
+    (done,) = spread(gpu_check_samples.at_fault, ["the sky"], 1)
+    assert (done.result, done.fault) == (None, "the sky is green")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_picture")
+def test_pictures_are_compared_in_processes_of_their_own(tmp_path: Path) -> None:
+    step = findings(tmp_path)
+    assert compare_pictures(step, 2) == "1 of 1 pictures agree with their goldens"
+    assert step.record.sentence == "1 of 1 pictures compared"
 
 
 def test_leaks_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -194,9 +194,9 @@ def test_each_kind_of_method_is_measured_and_counted(method: str, gpu: GpuContex
 
 def test_figures_are_of_the_frames_in_which_a_stage_ran() -> None:
     times = [
-        FrameTimes(10, 9, 5, {"a": 1.0, "b": 4.0}),
-        FrameTimes(20, 19, 6, {"a": 3.0}),
-        FrameTimes(30, 28, 7, {"a": 2.0}),
+        FrameTimes(10, 9, 5, {"a": 1.0, "b": 4.0}, {"a": 0.5, "b": 3.0}),
+        FrameTimes(20, 19, 6, {"a": 3.0}, {"a": 0.7}),
+        FrameTimes(30, 28, 7, {"a": 2.0}, {"a": 0.6}),
     ]
     found = motion_figures(times, {"a": 4_000_000}, PEAKS, 15)
     assert (found.frame_ms.median, found.picture_ms.median, found.submit_ms.median) == (20, 19, 6)
@@ -206,6 +206,7 @@ def test_figures_are_of_the_frames_in_which_a_stage_ran() -> None:
     a, b = found.stages["a"], found.stages["b"]
     assert (a.ms.median, a.runs, a.moved_bytes, a.floor_ms, a.times_floor) == (2, 1, 4_000_000, 4, 0.5)
     assert (b.ms.median, b.runs, b.floor_ms, b.times_floor) == (4, 1 / 3, None, None)
+    assert [each.submit_ms.median for each in (a, b) if each.submit_ms is not None] == [0.6, 3]
 
 
 def test_peaks_are_measured(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,6 +61,19 @@ def test_rays_are_computed_once_and_read_only() -> None:
         model.rays()[0, 0] = 0
 
 
+@pytest.mark.parametrize("name", LENSES)
+def test_equal_cameras_share_their_rays(name: str) -> None:
+    model = LENSES[name]
+    same = CameraModel.from_dict(model.to_dict())
+    assert same == model
+    assert hash(same) == hash(model)
+    assert same.rays() is model.rays()
+    longer = model.matrix + np.diag([1.0, 0, 0])
+    other = CameraModel(model.width, model.height, longer, model.distortion_model, model.distortion)
+    assert other != model
+    assert not np.array_equal(other.rays(), model.rays())
+
+
 def test_points_behind_the_camera_have_no_pixel() -> None:
     pixels = camera("plumb_bob", FREIBURG1).project(np.array([[0, 0, -1.0], [0, 0, 0], [0, 0, 1.0]]))
     assert np.isnan(pixels[:2]).all()

@@ -259,6 +259,15 @@ def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
     return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
 
 
+def pass_times_ms(renderer: SceneRenderer) -> dict[str, float]:
+    """Times of the newest frame's passes: of a GPU, composites carry those of an earlier frame."""
+    assert renderer.graph is not None
+    timers = renderer.graph.timers
+    assert timers is not None
+    timers.wait()
+    return dict(timers.times_ms)
+
+
 def unlit(document: SceneDocument) -> SceneDocument:
     """Objects are drawn, and nothing else about the picture changes."""
     return document.replaced(method=NoneMethod())

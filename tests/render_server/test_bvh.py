@@ -110,6 +110,26 @@ def test_rays_find_the_closest_triangle(gpu: GpuContext, corners: np.ndarray) ->
     np.testing.assert_allclose(points, origins[both] + found[both, :1] * directions[both], atol=1e-3)
 
 
+def test_what_lies_before_the_first_triangle_is_none(gpu: GpuContext) -> None:
+    """Inner nodes hold -1: three texels back from row 0 are those of other triangles, at the end of that row."""
+    corners = soup(3000)
+    bvh = build_bvh(corners)
+    packed = np.frombuffer(bvh.packed_triangles(corners, vertices_of(corners)), np.float32).reshape(-1, 4)
+    corner, first_edge, second_edge = packed[1021:1024, :3]
+    origins, _ = random_rays()
+    share = np.random.default_rng(2).dirichlet((1, 1, 1), RAYS)[:, 1:]
+    directions = corner + share @ np.stack([first_edge, second_edge]) - origins
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    found, expected = (
+        traced(gpu, corners, origins, directions, bvh),
+        brute_force(corners, origins, directions),
+    )
+    hit = found[:, 1] >= 0
+    assert np.mean(hit != np.isfinite(expected)) < 0.002, "only rays along an edge may differ"
+    both = hit & np.isfinite(expected)
+    np.testing.assert_allclose(found[both, 0], expected[both], rtol=1e-4, atol=1e-4)
+
+
 def test_rays_do_not_slip_into_a_closed_mesh(gpu: GpuContext) -> None:
     ball = np.asarray(trimesh.creation.icosphere(4, 0.5).triangles, np.float32)
     origins, _ = random_rays()

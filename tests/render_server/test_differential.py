@@ -16,6 +16,7 @@ from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import DifferentialMethod, VoxelConeSettings
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.timers import QUERIES_IN_FLIGHT
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,
@@ -32,6 +33,7 @@ from tests.render_server.scenes import (
     floor,
     frame,
     noisy,
+    pass_times_ms,
     shifted,
     solve,
     sphere_light,
@@ -181,7 +183,10 @@ def test_what_objects_do_not_change_is_the_cameras(gpu: GpuContext, stage: Stage
     """Though both solutions are computed everywhere; and a still picture stays, at no cost."""
     document = differential(everyday(stage))
     renderer = SceneRenderer(gpu, document)
-    first, second = (renderer.render(frame(noisy())) for _ in range(2))
+    first = renderer.render(frame(noisy()))
+    times_ms = pass_times_ms(renderer)
+    second = [renderer.render(frame(noisy())) for _ in range(QUERIES_IN_FLIGHT)][-1]
+    ran = set(second.pass_times_ms)
     found = fields_of(renderer)
     renderer.release()
     fresh = composite(gpu, document, frame(noisy()))
@@ -193,10 +198,8 @@ def test_what_objects_do_not_change_is_the_cameras(gpu: GpuContext, stage: Stage
     assert not np.array_equal(first.color, noisy())
     assert np.array_equal(first.color, second.color)
     assert np.array_equal(first.color, fresh)
-    assert set(second.pass_times_ms) == {"upload", "composite", "readback"}
-    assert second.reused_pass_times_ms == {
-        name: time_ms for name, time_ms in first.pass_times_ms.items() if name not in second.pass_times_ms
-    }
+    assert ran == {"upload", "composite", "readback"}
+    assert second.reused_pass_times_ms == {name: ms for name, ms in times_ms.items() if name not in ran}
 
 
 @pytest.mark.slow

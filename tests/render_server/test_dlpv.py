@@ -32,6 +32,7 @@ from tests.render_server.scenes import (
     frame,
     look_at,
     noisy,
+    pass_times_ms,
     plain,
     shifted,
     solve,
@@ -141,8 +142,12 @@ def test_same_input_gives_the_same_bytes(gpu: GpuContext, stage: Stage, operator
 
 def test_a_still_frame_costs_nothing(gpu: GpuContext, stage: Stage) -> None:
     renderer = SceneRenderer(gpu, dlpv(everyday(stage)))
-    first, second = (renderer.render(frame(noisy())).pass_times_ms for _ in range(2))
+    times_ms = []
+    for _ in range(2):
+        renderer.render(frame(noisy()))
+        times_ms.append(pass_times_ms(renderer))
     renderer.release()
+    first, second = times_ms
     assert {"inject real", "propagate mu", "inject change", "propagate rho", "cones"} <= set(first)
     assert set(second) == {"upload", "composite", "readback"}
 
@@ -156,10 +161,11 @@ def test_a_moved_object_leaves_the_real_scenes_volume_alone(gpu: GpuContext, sta
     mu = graph_of(renderer)["propagate mu"]
     renderer.set_scene(moved)
     after = renderer.render(frame(noisy()))
+    ran = set(pass_times_ms(renderer))
     fresh = run(gpu, moved, frame(noisy()))
     assert graph_of(renderer)["propagate mu"] is mu
-    assert {"voxelize objects", "inject change"} <= set(after.pass_times_ms)
-    assert not {"voxelize real", "geometry volume real"} & set(after.pass_times_ms)
+    assert {"voxelize objects", "inject change"} <= ran
+    assert not {"voxelize real", "geometry volume real"} & ran
     assert np.array_equal(after.color, fresh.render(frame(noisy())).color)
     renderer.release()
     fresh.release()

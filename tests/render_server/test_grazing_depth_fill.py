@@ -81,7 +81,9 @@ def test_the_mesh_closes_the_lid_with_triangles_that_face_up_and_join_nothing_el
     depth, shown = shelf(ALONG)
     image, pose = measured(depth, shown == LID), ALONG.world_from_camera
     grazing = grazing_depth_fill(image, colored(shown), CAMERA)
-    open_, closed = (depth_mesh(image, CAMERA, pose, 80_000, grazing=each) for each in (None, grazing))
+    open_, closed = (
+        depth_mesh(image, CAMERA, pose, 80_000, grazing=each) for each in (None, lambda: grazing)
+    )
     inside = cv2.erode((shown == LID).astype(np.uint8), np.ones((5, 41))) > 0
     counts = []
     for mesh in (open_, closed):

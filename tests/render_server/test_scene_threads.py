@@ -76,11 +76,8 @@ def test_the_coarse_mesh_is_made_once_and_when_asked_for(
         return mesh_depth(*given, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(real_geometry, "depth_mesh", counted)
-    pose = look_at((0.25, -0.9, 0.65))
-    seen = frame(checkered(), pose=pose, depth=depth_image(floor_depth(pose)))
     real = RealGeometry(gpu, RealScene(), BUDGET)
-    assert seen.pose is not None
-    assert real.update([PosedFrame(seen, CameraView(seen.camera, seen.pose.world_from_camera))])
+    assert real.update([_floor_from(0.25)])
     assert real.state is not None
     assert budgets == [BUDGET]
     coarse = real.state.coarse_corners
@@ -88,3 +85,25 @@ def test_the_coarse_mesh_is_made_once_and_when_asked_for(
     assert real.state.coarse_corners is coarse
     assert 0 < len(coarse) < len(real.state.corners)
     real.release()
+
+
+def test_a_coarse_mesh_that_is_begun_before_it_is_asked_for_is_that_of_its_frame(gpu: GpuContext) -> None:
+    moving, standing = (RealGeometry(gpu, RealScene(), BUDGET) for _ in range(2))
+    before = None
+    for x in (0.25, 0.35, 0.45):
+        assert moving.update([_floor_from(x)])
+        assert moving.state is not None
+        coarse = moving.state.coarse_corners
+        assert before is None or not np.array_equal(coarse, before)
+        before = coarse
+    standing.update([_floor_from(0.45)])
+    assert standing.state is not None
+    assert np.array_equal(standing.state.coarse_corners, before)
+    moving.release()
+    standing.release()
+
+
+def _floor_from(x: float) -> PosedFrame:
+    pose = look_at((x, -0.9, 0.65))
+    seen = frame(checkered(), pose=pose, depth=depth_image(floor_depth(pose)))
+    return PosedFrame(seen, CameraView(seen.camera, pose.world_from_camera))

@@ -202,7 +202,8 @@ def test_without_anything_known_a_pose_stays() -> None:
     nothing = DepthSurface(
         np.zeros((120, 160), np.float32),
         np.zeros((2, 120, 160), np.float32),
-        np.zeros((120, 160, 3), np.float32),
+        np.zeros((120, 160), np.float32),
+        at.camera,
     )
     assert not scene.add(PosedSurface(nothing, at, SIGMA))
     assert scene.meshes(1000) == [[]]

@@ -1,0 +1,51 @@
+"""The protected pictures beside their goldens, on all cores."""
+
+from collections.abc import Iterable
+from math import isfinite
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from deltalight.benchmarks.gpu_check.beside_tests import ComparedPicture, compare_picture, protected_cases
+from deltalight.benchmarks.gpu_check.failed_pictures import FailedPictures
+from deltalight.benchmarks.gpu_check.processes import Done, guarded, opened_context, process_context, spread
+from deltalight.benchmarks.gpu_check.record import Findings
+
+if TYPE_CHECKING:
+    from deltalight.render_server.gpu.context import GpuContext
+
+
+def compare_pictures(findings: Findings, processes: int) -> str:
+    """Render and compare every case; note those that differ, and show them in a picture."""
+    cases = protected_cases()
+    if processes > 1:
+        return _note(findings, spread(compare_here, cases, processes), len(cases))
+    with opened_context() as gpu:
+        compared = (Done(case, *guarded(lambda one: _compare(gpu, one), case)) for case in cases)
+        return _note(findings, compared, len(cases))
+
+
+def _note(findings: Findings, compared: "Iterable[Done[Any, ComparedPicture]]", total: int) -> str:
+    shown, psnr_db = FailedPictures(findings.out), dict[str, float]()
+    for count, done in enumerate(compared, start=1):
+        one = done.result
+        if one is None:
+            findings.fault(f"{done.item}: {done.fault}")
+        else:
+            if isfinite(one.psnr_db):  # neither the same to the bit nor without a golden
+                psnr_db[one.name] = round(one.psnr_db, 2)
+            if not one.is_alike:
+                shown.add(one)
+                findings.fault(f"{one.name}: {one.complaint}")
+        findings.keep(f"{count} of {total} pictures compared", compared=count, psnr_db=psnr_db)
+    return f"{total - len(findings.record.faults)} of {total} pictures agree with their goldens"
+
+
+def compare_here(case: Any) -> ComparedPicture:  # noqa: ANN401 (of the tests, as `protected_cases`)
+    """Render and compare a case in this process's context."""
+    return _compare(process_context(), case)
+
+
+def _compare(gpu: "GpuContext", case: Any) -> ComparedPicture:  # noqa: ANN401
+    with TemporaryDirectory() as folder:
+        return compare_picture(gpu, case, Path(folder))

@@ -1,0 +1,45 @@
+"""What is kept of one camera's frames."""
+
+import numpy as np
+import pytest
+
+from deltalight.protocol.frames import DepthImage
+from deltalight.render_server.camera_history import SAMPLE_STEP, CameraHistory
+from deltalight.render_server.view import CameraView, PosedFrame
+from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at
+
+
+def typical_depth(depth: DepthImage) -> float:
+    pose = look_at((0.25, -0.9, 0.65))
+    seen = frame(checkered(), pose=pose, depth=depth)
+    history = CameraHistory(keeps_world=False, has_depth=True)
+    view = CameraView(seen.camera, pose.world_from_camera)
+    history.update(PosedFrame(seen, view), is_unknown=True)
+    return history.scan(view.size).typical_depth
+
+
+def floor() -> DepthImage:
+    return depth_image(floor_depth(look_at((0.25, -0.9, 0.65))))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.9, 0.3, 0.001])
+def test_the_typical_depth_is_the_median(share: float) -> None:
+    depth = floor()
+    random = np.random.default_rng(7)
+    for _ in range(5):  # even and odd numbers of pixels
+        depth.valid[:] = random.random(depth.valid.shape) < share
+        assert depth.valid.any()
+        assert typical_depth(depth) == np.median(depth.depth_m[depth.valid])
+
+
+def test_the_typical_depth_is_the_median_where_a_sample_tells_another() -> None:
+    depth = floor()
+    depth.depth_m.ravel()[::SAMPLE_STEP] = 9.0
+    depth.valid[:] = True
+    assert typical_depth(depth) == np.median(depth.depth_m)
+
+
+def test_without_depth_it_is_a_metre() -> None:
+    depth = floor()
+    depth.valid[:] = False
+    assert typical_depth(depth) == 1.0
