@@ -27,7 +27,9 @@ SOFTWARE_WALKERS = 1024
 SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
 MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
-GPU_WALKERS = 2**18  # 4096 workgroups: as many threads as the largest GPUs hold at a time; idle ones cost microseconds
+GPU_WALKERS = (
+    2**18
+)  # 4096 workgroups: as many threads as the largest GPUs hold at a time; idle ones cost microseconds
 CLEARING_GROUPS = 4096  # of workgroups at most; they stride over larger buffers
 WORD_BYTES = 4
 GL_INT = 0x1404
