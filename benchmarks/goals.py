@@ -27,7 +27,13 @@ from deltalight.render_server.renderer import SceneRenderer
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 WORLD_FROM_CAMERA = looking((0.25, -0.9, 0.65), (0.0, 0.0, 0.06))
-METHOD = {"volume_size": 32, "volume_edge_m": 0.7, "cone_scale": 1, "rsm_size": 512}
+METHOD = {
+    "volume_size": 32,
+    "volume_edge_m": 0.7,
+    "cone_scale": 1,
+    "rsm_size": 512,
+    "triangle_budget": 40_000,
+}
 GREY = 150  # code of the picture
 SURROUNDINGS = 0.25  # radiance, over the floor that a depth camera sees
 INSIDE = 0.99  # of the delta, which fades towards the volume's border

@@ -26,6 +26,7 @@ SOFTWARE_WALKERS = 1024
 # cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
+MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
 GPU_WALKERS = 2**18  # 4096 workgroups: what the largest GPUs hold at a time; idle threads cost microseconds
 CLEARING_GROUPS = 4096  # of workgroups at most; they stride over larger buffers
 WORD_BYTES = 4
@@ -445,7 +446,7 @@ def list_threads(gpu: GpuContext, longest: int | None = None) -> int:
     cut off.
     """
     if not gpu.is_software:
-        return longest or GPU_WALKERS
+        return min(longest or GPU_WALKERS, MOST_WALKERS)
     longest = longest or LIST_WALKERS
     return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
 

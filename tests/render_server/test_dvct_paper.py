@@ -109,10 +109,12 @@ def camera_radiance() -> float:
     return float(decode_lut(None)[CODE, 0])
 
 
+@pytest.mark.parametrize("rsm_size", [512, 1024, 4096])
 def test_the_delta_holds_the_flux_that_the_box_reflects_and_what_the_floor_lost(
-    gpu: GpuContext, assets: Path
+    gpu: GpuContext, assets: Path, rsm_size: int
 ) -> None:
-    with rendered(gpu, scene(assets)) as graph:
+    """However fine the light's map is: of its finest texels one brings half a step of fixed point."""
+    with rendered(gpu, scene(assets, rsm_size=rsm_size)) as graph:
         cells = level_0(graph["filter"].delta) * np.pi * VOXEL_M**2
     albedo = np.pi * camera_radiance() / (IRRADIANCE + np.pi * AMBIENT)
     gained = np.clip(cells, 0, None).sum(axis=(0, 1, 2))

@@ -130,8 +130,14 @@ def test_what_another_camera_sees_lights_the_object(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_frame_that_comes_twice_counts_once(made: Callable[..., SceneRenderer], method: str) -> None:
-    """Two cameras at one place know what one knows: light and obstacles must not add up."""
+def test_a_frame_that_comes_twice_counts_once(
+    made: Callable[..., SceneRenderer], gpu: GpuContext, method: str
+) -> None:
+    """Two cameras at one place know what one knows: light and obstacles must not add up.
+
+    Their mean depth differs from either's in the last bit, which moves points on a border from voxel to voxel: by one
+    code of the picture in software, by two as a GPU does it.
+    """
     settings, geometry = METHODS[method], "fused" if method == "dlpv" else "depth"
     view = seen_room(FACING)
     one = made(geometry, **settings, triangle_budget=EVERY_PIXEL).render(view)
@@ -140,7 +146,7 @@ def test_a_frame_that_comes_twice_counts_once(made: Callable[..., SceneRenderer]
     )
     assert np.abs(one.color.astype(int) - view.color).max() > 40
     for each in pair:
-        assert np.abs(each.color.astype(int) - one.color).max() <= 1
+        assert np.abs(each.color.astype(int) - one.color).max() <= (1 if gpu.is_software else 2)
         assert (each.color != one.color).mean() < 0.01
 
 
@@ -281,10 +287,11 @@ def test_a_frame_that_is_not_shown_lights_the_room_and_one_left_out_does_not(
 
 
 def test_the_gpu_holds_what_the_cameras_of_the_newest_frame_need(made: Callable[..., SceneRenderer]) -> None:
+    """But for timer queries, of which those of the longest frames stay for the next ones."""
     renderer, held = made("depth"), []
     for poses in ((BEHIND, FACING), (BEHIND,)) * 2:
         for number in range(2):
             renderer.render_views([seen_room(pose, number) for pose in poses])
-        held.append(sum(count_gl_objects().values()))
+        held.append(sum(number for kind, number in count_gl_objects().items() if kind != "Query"))
     assert held[1] < held[0]
     assert held[2:] == held[:2], "nothing is kept for cameras that left"

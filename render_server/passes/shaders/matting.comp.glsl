@@ -17,6 +17,7 @@ const float STEP = 3.0;    // pixels from sample to sample along a ray; farther 
 const float GROWTH = 0.125;
 const int TAKEN = 4;       // samples of either kind along a ray, the nearest
 const int FRACTIONS = 17;  // at which the posterior is evaluated
+const float END_PRIOR = float(FRACTIONS - 2);   // of the fractions 0 and 1 each, where that of the others is 1
 const float TURN = 6.28318530718 / float(RAYS);
 
 // Samples along one ray.
@@ -45,11 +46,15 @@ void look_around(ivec2 pixel, float z, out Side front, out Side back) {
     finish(back);
 }
 
+// A pivot of Cholesky's decomposition. It is at least the noise in exact arithmetic (both covariances are positive
+// semidefinite), so that bounding it keeps rounding from a root of nothing or less.
+float root(float pivot) { return sqrt(max(pivot, NOISE)); }
+
 // xyz: s^-1 d; w: half of the logarithm of the determinant of s. By Cholesky's decomposition, because s may be nearly singular.
 vec4 solved(mat3 s, vec3 d) {
-    float l00 = sqrt(s[0][0]), l10 = s[0][1] / l00, l20 = s[0][2] / l00;
-    float l11 = sqrt(s[1][1] - l10 * l10), l21 = (s[1][2] - l20 * l10) / l11;
-    float l22 = sqrt(s[2][2] - l20 * l20 - l21 * l21);
+    float l00 = root(s[0][0]), l10 = s[0][1] / l00, l20 = s[0][2] / l00;
+    float l11 = root(s[1][1] - l10 * l10), l21 = (s[1][2] - l20 * l10) / l11;
+    float l22 = root(s[2][2] - l20 * l20 - l21 * l21);
     float y0 = d.x / l00, y1 = (d.y - l10 * y0) / l11, y2 = (d.z - l20 * y0 - l21 * y1) / l22;
     float x2 = y2 / l22, x1 = (y1 - l21 * x2) / l11, x0 = (y0 - l10 * x1 - l20 * x2) / l00;
     return vec4(x0, x1, x2, log(l00 * l11 * l22));
@@ -59,21 +64,23 @@ mat3 covariance(float a, Side front, Side back) {
     return a * a * front.squares + (1.0 - a) * (1.0 - a) * back.squares + NOISE * mat3(1.0);
 }
 
-// The thing's fraction by its posterior, and the variance of that.
+// The logarithm of the likelihood of a fraction.
+float log_likelihood(float a, vec3 colour, Side front, Side back) {
+    vec3 d = colour - mix(back.colour, front.colour, a);
+    vec4 x = solved(covariance(a, front, back), d);
+    return -0.5 * dot(d, x.xyz) - x.w;
+}
+
+// The thing's fraction by its posterior, and the variance of that. The moments are kept relative to the greatest
+// likelihood so far.
 vec2 posterior(vec3 colour, Side front, Side back) {
-    float likelihoods[FRACTIONS], greatest = -1e30;
-    for (int i = 0; i < FRACTIONS; ++i) {
-        float a = float(i) / float(FRACTIONS - 1);
-        vec3 d = colour - mix(back.colour, front.colour, a);
-        vec4 x = solved(covariance(a, front, back), d);
-        likelihoods[i] = -0.5 * dot(d, x.xyz) - x.w;
-        greatest = max(greatest, likelihoods[i]);
-    }
-    vec3 sum = vec3(0.0);
-    for (int i = 0; i < FRACTIONS; ++i) {
-        float a = float(i) / float(FRACTIONS - 1);
-        float prior = i == 0 || i == FRACTIONS - 1 ? float(FRACTIONS - 2) : 1.0;
-        sum += prior * exp(likelihoods[i] - greatest) * vec3(1.0, a, a * a);
+    float greatest = log_likelihood(0.0, colour, front, back);
+    vec3 sum = vec3(END_PRIOR, 0.0, 0.0);
+    for (int i = 1; i < FRACTIONS; ++i) {
+        float a = float(i) / float(FRACTIONS - 1), found = log_likelihood(a, colour, front, back);
+        float prior = i < FRACTIONS - 1 ? 1.0 : END_PRIOR;
+        sum = sum * exp(min(greatest - found, 0.0)) + prior * exp(min(found - greatest, 0.0)) * vec3(1.0, a, a * a);
+        greatest = max(greatest, found);
     }
     float mean = sum.y / sum.x;
     return settled(mean, max(sum.z / sum.x - mean * mean, 0.0));

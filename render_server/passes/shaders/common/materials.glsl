@@ -1,4 +1,5 @@
 // Materials of meshes. MATERIAL_MAPS: some have maps or alpha (scene/materials.py): two arrays of textures with mip levels.
+#include "common/even_noise.glsl"
 #ifndef MATERIAL_MAPS
 #pragma switch MATERIAL_MAPS
 #else
@@ -121,9 +122,6 @@ bool is_cut_out(int index, float opacity, float even) {
     float mode = materials[index].alpha.x;
     return mode != 0.0 && (mode == MASKED ? opacity < 0.5 : opacity <= even);
 }
-
-// Evenly distributed 0..1 over any few neighbours on the integer grid (Jimenez 2014, interleaved gradient noise).
-float even_noise(vec2 place) { return fract(52.9829189 * fract(dot(place, vec2(0.06711056, 0.00583715)))); }
 
 #else
 struct Material {
