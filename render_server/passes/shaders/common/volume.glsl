@@ -46,24 +46,7 @@ vec4 volume_sample(sampler3D mipmap, int first, int n, vec3 q, int level, int k)
     return textureLod(mipmap, c / vec3(textureSize(mipmap, 0)), 0.0);
 }
 
-// A plane at a multiple of the voxels' edge lies on the border of two voxels, and the last bit of a quotient decides to
-// which of them it belongs. GPUs' quotients may be 2.5 units off (GLSL 4.30, 4.7.1), so what is left of the division, found
-// without rounding (Dekker 1971), corrects them: voxels are the same everywhere.
-#ifdef EXACT_QUOTIENTS
-vec3 quotient(vec3 a, float b) { return a / b; }
-#else
-const float HALVES = 4097.0;   // 2^12 + 1 splits a float into two of half its bits
-
-vec3 quotient(vec3 a, float b) {
-    precise vec3 q = a / b, high = HALVES * q - (HALVES * q - q), low = q - high;
-    precise float b_high = HALVES * b - (HALVES * b - b), b_low = b - b_high;
-    precise vec3 product = q * b, lost = ((high * b_high - product) + high * b_low + low * b_high) + low * b_low;
-    precise vec3 left = (a - product) - lost;
-    return q + left / b;
-}
-#endif
-
-vec3 volume_coordinate(vec3 p) { return quotient(p - volume_origin, voxel_edge); }
+vec3 volume_coordinate(vec3 p) { return (p - volume_origin) / voxel_edge; }
 
 bool inside_cube(vec3 q, float edge) { return all(greaterThan(q, vec3(0.0))) && all(lessThan(q, vec3(edge))); }
 
