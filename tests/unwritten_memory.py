@@ -10,24 +10,27 @@ MOST_BYTES = 2**30
 
 
 class FilledContext:
-    """Fills new buffers and textures of a context that are given no content; `filled` counts them."""
+    """Fills new buffers and textures of a context that are given no content; `filled` counts them.
+
+    `unfilled` is that context.
+    """
 
     def __init__(self, ctx: moderngl.Context, content: bytes = POISON) -> None:
-        self._ctx, self._content, self.filled = ctx, content, 0
+        self.unfilled, self._content, self.filled = ctx, content, 0
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401
-        return getattr(self._ctx, name)
+        return getattr(self.unfilled, name)
 
     def buffer(
         self, data: bytes | None = None, *, reserve: int = 0, dynamic: bool = False
     ) -> moderngl.Buffer:
         if reserve > MOST_BYTES:  # no device has it, nor this process
-            return self._ctx.buffer(data, reserve=reserve, dynamic=dynamic)
+            return self.unfilled.buffer(data, reserve=reserve, dynamic=dynamic)
         self.filled += data is None
-        return self._ctx.buffer(self._content * reserve if data is None else data, dynamic=dynamic)
+        return self.unfilled.buffer(self._content * reserve if data is None else data, dynamic=dynamic)
 
     def _filled(self, kind: str, data: bytes | None, args: tuple[Any, ...], more: dict[str, Any]) -> Any:  # noqa: ANN401
-        texture = getattr(self._ctx, kind)(*args, data, **more)
+        texture = getattr(self.unfilled, kind)(*args, data, **more)
         if data is None:
             self.filled += 1
             size, components = args
