@@ -1,4 +1,4 @@
-"""The protected pictures beside their goldens, on all cores."""
+"""The protected pictures beside their goldens, on all cores; those that failed come into one picture."""
 
 from collections.abc import Iterable
 from math import isfinite
@@ -6,13 +6,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from deltalight.benchmarks.gpu_check.beside_tests import ComparedPicture, compare_picture, protected_cases
-from deltalight.benchmarks.gpu_check.failed_pictures import FailedPictures
+import cv2
+import numpy as np
+
+from deltalight.benchmarks.gpu_check.beside_tests import (
+    ComparedPicture,
+    Picture,
+    compare_picture,
+    protected_cases,
+)
 from deltalight.benchmarks.gpu_check.processes import Done, guarded, opened_context, process_context, spread
 from deltalight.benchmarks.gpu_check.record import Findings
+from deltalight.protocol.files import write_png
 
 if TYPE_CHECKING:
     from deltalight.render_server.gpu.context import GpuContext
+
+SHEET = "failed_pictures.png"
+LABEL_WIDTH = 240
+WHITE = (255, 255, 255)
+GAIN = 8  # of the difference, so that a code or two can be seen
 
 
 def compare_pictures(findings: Findings, processes: int) -> str:
@@ -49,3 +62,26 @@ def compare_here(case: Any) -> ComparedPicture:  # noqa: ANN401 (of the tests, a
 def _compare(gpu: "GpuContext", case: Any) -> ComparedPicture:  # noqa: ANN401
     with TemporaryDirectory() as folder:
         return compare_picture(gpu, case, Path(folder))
+
+
+class FailedPictures:
+    """Writes SHEET into a folder anew with every picture that is added."""
+
+    def __init__(self, out: Path) -> None:
+        self._path = out / SHEET
+        self._rows: list[Picture] = []
+
+    def add(self, one: ComparedPicture) -> None:
+        """Add a row: label, picture, golden (black where missing), difference eight times as strong."""
+        golden = np.zeros_like(one.picture) if one.golden is None else one.golden
+        difference = np.abs(one.picture.astype(int) - golden) * GAIN
+        clipped = np.minimum(difference, 255).astype(np.uint8)
+        self._rows.append(np.hstack([_label(one), one.picture, golden, clipped]))
+        write_png(self._path, np.vstack(self._rows))
+
+
+def _label(one: ComparedPicture) -> Picture:
+    label = np.zeros((one.picture.shape[0], LABEL_WIDTH, 3), np.uint8)
+    for line, text in enumerate((one.name, one.complaint.split(",")[0])):
+        cv2.putText(label, text, (6, 24 + 24 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.4, WHITE, 1, cv2.LINE_AA)
+    return label

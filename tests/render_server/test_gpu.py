@@ -17,19 +17,16 @@ from hypothesis import strategies as st
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_method import DifferentialMethod, DvctMethod
 from deltalight.render_server.gpu import shader_source as shader_text
-from deltalight.render_server.gpu import timers as timers_module
 from deltalight.render_server.gpu.context import (
     NEEDED,
     GpuContext,
     check_limits,
-    count_gl_objects,
     explain_context_failure,
     is_software_renderer,
     limits_of,
 )
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.gpu.textures import AsyncReadback, gpu_objects, sizes_bytes, texture_2d
-from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.methods.differential import SolutionVoxels
 from deltalight.render_server.methods.dvct import InjectedVoxels
 from deltalight.render_server.methods.voxel_volumes import DeltaVoxels
@@ -44,7 +41,7 @@ from deltalight.render_server.passes.voxels import (
     volume_memory_bytes,
 )
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.scenes import Stage, cube, directional, floor, frame, pass_times_ms
+from tests.render_server.scenes import Stage, cube, directional, floor, frame
 
 ROOT = Path(__file__).parents[2]
 TEXELS = Path(__file__).with_name("mipmap_texels")
@@ -133,7 +130,7 @@ def test_uniforms_arrive_and_removed_ones_do_not_matter(gpu: GpuContext, tmp_pat
     kernel.release()
 
 
-# Readback and timers
+# Readback
 
 
 def test_readback_gives_each_texture_once_and_in_order(gpu: GpuContext) -> None:
@@ -172,86 +169,6 @@ def test_what_was_read_back_is_as_old_as_the_push(gpu: GpuContext) -> None:
     assert [int(reader.pop().max()) for _ in range(2)] == [1, 2]
     reader.release()
     texture.release()
-
-
-def test_timers_sum_a_pass_by_name_and_begin_anew_each_frame(gpu: GpuContext) -> None:
-    timers = PassTimers(gpu)
-    for _ in range(5):
-        for name in ("a", "b", "a"):
-            with timers.measure(name):
-                gpu.ctx.finish()
-        times = timers.end_frame()
-    assert set(times) == {"a", "b"}
-    assert all(0 <= value < 1e4 for value in times.values())
-    timers.end_frame()
-    timers.wait()
-    assert timers.times_ms == {}
-    timers.release()
-
-
-@pytest.fixture
-def queried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Passes are timed by queries, as on a GPU; in software these read zero."""
-    monkeypatch.setattr(timers_module, "has_timer_queries", lambda _: True)
-
-
-def timed(gpu: GpuContext, timers: PassTimers, frames: int) -> None:
-    for _ in range(frames):
-        for name in ("a", "b", "a"):
-            with timers.measure(name):
-                gpu.ctx.finish()
-        timers.end_frame()
-
-
-@pytest.mark.usefixtures("queried")
-def test_queries_pass_from_timers_to_timers(gpu: GpuContext) -> None:
-    counts = []
-    for _ in range(3):
-        timers = PassTimers(gpu)
-        timed(gpu, timers, frames=4)
-        with pytest.raises(ZeroDivisionError), timers.measure("c"):
-            _ = 1 // 0
-        with timers.measure("d"):  # of a frame that does not end
-            pass
-        timers.release()
-        counts.append(count_gl_objects()["Query"])
-    assert counts[0] > 0
-    assert counts == counts[:1] * 3
-
-
-@pytest.mark.usefixtures("queried")
-def test_whoever_waits_knows_the_newest_frame(gpu: GpuContext) -> None:
-    timers = PassTimers(gpu)
-    timed(gpu, timers, frames=1)
-    assert timers.times_ms == {}
-    timers.wait()
-    assert set(timers.times_ms) == set(timers.submit_ms) == {"a", "b"}
-    timers.release()
-
-
-@pytest.mark.usefixtures("queried")
-def test_a_renderer_leaves_no_queries(gpu: GpuContext, tmp_path: Path) -> None:
-    stage, counts = Stage(tmp_path), []
-    document = stage.document([stage.virtual(cube())], [directional()], floor())
-    for _ in range(2):
-        renderer = SceneRenderer(gpu, document)
-        renderer.render(frame())
-        assert "cones" in pass_times_ms(renderer)
-        renderer.release()
-        counts.append(count_gl_objects()["Query"])
-    assert counts[0] == counts[1]
-
-
-def test_what_the_cpu_takes_for_a_pass_is_told_apart_from_what_the_gpu_takes(gpu: GpuContext) -> None:
-    timers = PassTimers(gpu)
-    timed(gpu, timers, frames=1)
-    timers.wait()
-    assert set(timers.submit_ms) == {"a", "b"}
-    if not timers_module.has_timer_queries(gpu):
-        assert all(timers.submit_ms[name] <= ms for name, ms in timers.times_ms.items())
-    timers.end_frame()
-    assert timers.submit_ms == {}
-    timers.release()
 
 
 # Context errors

@@ -80,16 +80,16 @@ def audit(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 
 @pytest.fixture
-def readers(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[str]]:
-    """Modules that read a buffer or texture, or map a buffer to clear it."""
-    found: set[str] = set()
+def readers(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Modules that read a buffer or texture, or map a buffer to clear it, in order."""
+    found: list[str] = []
     kinds: list[tuple[type, str]] = [(moderngl.Buffer, "read"), (moderngl.Buffer, "clear")]
     kinds += [(kind, "read") for kind in (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray)]
     for kind, name in [*kinds, (moderngl.Framebuffer, "read")]:
         original = getattr(kind, name)
 
         def noted(*args: Any, _original: Any = original, **more: Any) -> Any:  # noqa: ANN401
-            found.add(sys._getframe(1).f_globals["__name__"])
+            found.append(sys._getframe(1).f_globals["__name__"])
             return _original(*args, **more)
 
         monkeypatch.setattr(kind, name, noted)
@@ -101,14 +101,20 @@ def test_the_paths_of_gpus_make_the_same_picture_without_waiting(
     made: tuple[Case, list[np.ndarray]],
     tmp_path: Path,
     audit: list[str],
-    readers: set[str],
+    readers: list[str],
 ) -> None:
-    """And bind nothing twice that is written. Only finished pictures are read back, and what first fills a volume."""
+    """And bind nothing twice that is written.
+
+    Only finished pictures are read back, and before the first how many pairs fill a volume.
+    """
     case, expected = made
     pictures, dispatches = pictures_of(replace(gpu, is_software=False), case, tmp_path, checks=True)
     assert min(psnr_db(one, other) for one, other in zip(pictures, expected, strict=True)) >= LEAST_PSNR_DB
     assert audit == []
-    assert readers - {"deltalight.render_server.passes.voxelize"} == {"deltalight.render_server.gpu.textures"}
+    pictures_read = "deltalight.render_server.gpu.textures"
+    first = readers.index(pictures_read)
+    assert set(readers[:first]) <= {"deltalight.render_server.passes.voxelize"}
+    assert set(readers[first:]) == {pictures_read}
     assert any(one.kernel.startswith("mirror_smooth") for part in dispatches for one in part) == (
         case.method in ("exact", "differential", "dlpv")
     )
