@@ -77,36 +77,59 @@ class PlacedObject:
     moves: bool = False
 
 
-CoarseMesh = tuple[MeshBuffers, GpuMesh]  # what buffers hold
+@dataclass(frozen=True, eq=False)
+class DrawnMesh:
+    """Triangles in buffers, until others are written there.
+
+    `made` is what was uploaded or, for triangles that the GPU made of depth, makes the same on the CPU.
+    """
+
+    buffers: MeshBuffers
+    made: GpuMesh | Callable[[], GpuMesh]
+
+    @cached_property
+    def mesh(self) -> GpuMesh:
+        """The triangles on the CPU; may take time."""
+        return self.made() if callable(self.made) else self.made
+
+    @cached_property
+    def corners(self) -> Corners:
+        """Corners of all triangles, m; takes time."""
+        return self.mesh.corners
 
 
 @dataclass(frozen=True, eq=False)
 class GeometryState:
     """One set of triangles in the world; another set is another object.
 
-    `buffers` hold `mesh` until the next set is written there; `points` enclose the set.
+    `points` enclose the set.
     `swept_points` enclose it at all times of its animations: what is fitted around them stands still while it moves.
     """
 
-    buffers: MeshBuffers
-    mesh: GpuMesh
+    drawn: DrawnMesh
     points: Float64[np.ndarray, "n 3"]
     materials: MaterialTable
-    coarse: Callable[[], CoarseMesh] | None = None  # makes fewer triangles for what lies far; None: all serve
+    coarse: Callable[[], DrawnMesh] | None = None  # makes fewer triangles for what lies far; None: all serve
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
     extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
-    fronts_of: DepthViews | None = None  # what is solid as cameras see it: backs are not in it
+    is_open: bool = False  # what is solid as cameras see it: backs are not in it
+    seen_by: DepthViews | None = None  # several cameras, which tell where backs cannot be
 
     @property
     def is_measured(self) -> bool:
         """Whether cameras saw it, so that there are many small triangles, and others with every frame."""
         return self.coarse is not None
 
-    @cached_property
+    @property
+    def buffers(self) -> MeshBuffers:
+        """Vertices and triangles on the GPU."""
+        return self.drawn.buffers
+
+    @property
     def corners(self) -> Corners:
         """Corners of all triangles, m; takes time."""
-        return self.mesh.corners
+        return self.drawn.corners
 
     @property
     def parts(self) -> tuple[VoxelizedMesh, ...]:
@@ -114,28 +137,27 @@ class GeometryState:
         return (VoxelizedMesh(self.buffers),)
 
     @cached_property
-    def coarse_mesh(self) -> CoarseMesh:
-        """Fewer triangles, and the buffers that hold them; made when first asked for."""
-        return (self.buffers, self.mesh) if self.coarse is None else self.coarse()
+    def coarse_mesh(self) -> DrawnMesh:
+        """Fewer triangles; made when first asked for."""
+        return self.drawn if self.coarse is None else self.coarse()
 
     @property
     def coarse_parts(self) -> tuple[VoxelizedMesh, ...]:
         """Fewer triangles, for what lies far."""
-        return (VoxelizedMesh(self.coarse_mesh[0]),)
+        return (VoxelizedMesh(self.coarse_mesh.buffers),)
 
     def solid_parts(self, voxel_edge: float) -> tuple[VoxelizedMesh, ...]:
         """Returns `parts` for voxels of that edge (m), with coarse backs if cameras saw the fronts alone.
 
         What is thinner than two voxels has none where another camera sees that nothing is there.
         """
-        if self.fronts_of is None:
+        if not self.is_open:
             return self.parts
-        buffers, mesh = self.coarse_mesh
-        chosen = None
-        if len(self.fronts_of.frames) > 1:
-            middles = back_faces(mesh.corners, voxel_edge).mean(axis=1, dtype=np.float64)
-            chosen = np.flatnonzero(~self.fronts_of.in_free_space(middles)).astype(np.int32)
-        return *self.parts, VoxelizedMesh(buffers, BACK_OFFSET_VOXELS * voxel_edge, chosen)
+        coarse, chosen = self.coarse_mesh, None
+        if self.seen_by is not None:
+            middles = back_faces(coarse.corners, voxel_edge).mean(axis=1, dtype=np.float64)
+            chosen = np.flatnonzero(~self.seen_by.in_free_space(middles)).astype(np.int32)
+        return *self.parts, VoxelizedMesh(coarse.buffers, BACK_OFFSET_VOXELS * voxel_edge, chosen)
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

@@ -11,10 +11,16 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import ModelGeometry, RealScene
 from deltalight.render_server.camera_history import CameraHistory
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import CoarseMesh, GeometryState
+from deltalight.render_server.gpu_scene import DrawnMesh, GeometryState
+from deltalight.render_server.passes.depth_mesh import DepthMesher
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
-from deltalight.render_server.scene.depth_mesh import depth_mesh
-from deltalight.render_server.scene.depth_surface import DepthSurface, grazing_depth_fill, noise_sigma
+from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, REAL_MATERIAL, bound_points, depth_mesh
+from deltalight.render_server.scene.depth_surface import (
+    DepthSurface,
+    depth_surface,
+    grazing_depth_fill,
+    noise_sigma,
+)
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.threads import begun
@@ -23,22 +29,38 @@ from deltalight.render_server.scene.tsdf_mesh import TsdfScene
 from deltalight.render_server.view import CameraView, PosedFrame
 
 COARSE_DIVISOR = 8  # of the triangles, for the coarse volume: its voxels are several times larger
-BOUND_POINTS = 4000  # sampled from a mesh for fitting light views
 # Frames averaged while nothing moves: their noise is a quarter of one frame's. Then the average is frozen, so
 # that a scene at rest gives the same picture bit for bit.
 STILL_FRAMES = 16
+EMPTY_MESH = TriangleMesh(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 3), np.int32),
+    None,
+    REAL_MATERIAL,
+)
 
 
 class RealGeometry:
     """Holds the real scene of all cameras in a room, and rebuilds it when it moves (CameraHistory).
 
-    `state` is a new object whenever the triangles change. `cameras` are in the order of the frames.
+    `state` is a new object whenever the triangles change. `cameras` are in the order of the frames. `meshes_on_gpu`:
+    the GPU makes the triangles of one camera's depth; default: if it is one, because numpy is quicker than Mesa's
+    software renderer.
     """
 
     def __init__(
-        self, gpu: GpuContext, real: RealScene, triangle_budget: int, *, keeps_world: bool = False
+        self,
+        gpu: GpuContext,
+        real: RealScene,
+        triangle_budget: int,
+        *,
+        keeps_world: bool = False,
+        meshes_on_gpu: bool | None = None,
     ) -> None:
         self._gpu = gpu
+        on_gpu = not gpu.is_software if meshes_on_gpu is None else meshes_on_gpu
+        self._mesher = DepthMesher(gpu) if on_gpu else None
         self.budget = triangle_budget
         self._keeps_world = keeps_world
         self._buffers, self._coarse_buffers = MeshBuffers(gpu), MeshBuffers(gpu)
@@ -151,6 +173,9 @@ class RealGeometry:
 
         What several cameras see is kept of the one that shows it largest.
         """
+        if self._mesher is not None and len(self.cameras) == 1:
+            self._mesh_on_gpu(self._mesher, self.cameras[0].seen)
+            return
         seen = [camera.seen for camera in self.cameras]
         grazing = [begun(partial(_grazing_depth, each)) for each in seen]  # while surfaces are fitted
         shown = DepthViews(tuple(map(_posed_surface, self.cameras, seen)))
@@ -168,14 +193,41 @@ class RealGeometry:
         if not any(len(mesh.triangles) for mesh in fine):
             self.state = None
             return
-        self._build(fine, coarse, fronts_of=shown)
+        self._build(fine, coarse, is_open=True, seen_by=shown if len(seen) > 1 else None)
 
-    def _begun_coarse(self, make: Callable[[], GpuMesh]) -> Callable[[], CoarseMesh]:
+    def _mesh_on_gpu(self, mesher: DepthMesher, seen: PosedFrame) -> None:
+        """Lets the GPU mesh a depth image; the CPU makes the same triangles only when asked for them."""
+        depth, view = seen.frame.depth, seen.view
+        assert depth is not None
+        grazing = begun(partial(_grazing_depth, seen))
+        points = bound_points(depth, view.camera, view.world_from_camera)
+        mesher.take(depth, view.camera, grazing.result())
+        if not len(points):
+            self.state = None
+            return
+        empty = merge_for_gpu([EMPTY_MESH])
+
+        def drawn(buffers: MeshBuffers, budget: int) -> DrawnMesh:
+            mesher.fill(buffers, view.world_from_camera, budget, empty)
+            surface = partial(depth_surface, depth, view.camera)
+            return DrawnMesh(
+                buffers, lambda: merge_for_gpu([_depth_mesh(seen, surface(), grazing.result, budget)])
+            )
+
+        self._show(
+            drawn(self._buffers, self.budget),
+            points,
+            empty,
+            lambda: drawn(self._coarse_buffers, self.budget // COARSE_DIVISOR),
+            is_open=True,
+        )
+
+    def _begun_coarse(self, make: Callable[[], GpuMesh]) -> Callable[[], DrawnMesh]:
         """Returns what makes coarse triangles when asked; begun now if the last ones were asked for too."""
         meanwhile = begun(make) if self._used_coarse else None
         self._used_coarse = False
 
-        def coarse() -> CoarseMesh:
+        def coarse() -> DrawnMesh:
             self._used_coarse = True
             return self._uploaded(make() if meanwhile is None else meanwhile.result())
 
@@ -184,35 +236,45 @@ class RealGeometry:
     def _build(
         self,
         meshes: list[TriangleMesh],
-        coarse: Callable[[], CoarseMesh] | None,
+        coarse: Callable[[], DrawnMesh] | None,
         *,
-        fronts_of: DepthViews | None = None,
+        is_open: bool = False,
+        seen_by: DepthViews | None = None,
     ) -> None:
         """Merges the meshes and uploads them."""
         merged = merge_for_gpu(meshes)
         self._buffers.write(merged)
-        if self._materials is None:
-            self._materials = MaterialTable(self._gpu, merged, draws_maps=False)
-        self.state = GeometryState(
-            self._buffers,
-            merged,
-            _sample(merged.vertices[:, :3]),
-            self._materials,
-            coarse,
-            fronts_of=fronts_of,
-        )
+        points = _sample(merged.vertices[:, :3])
+        drawn = DrawnMesh(self._buffers, merged)
+        self._show(drawn, points, merged, coarse, is_open=is_open, seen_by=seen_by)
 
-    def _uploaded(self, coarse: GpuMesh) -> CoarseMesh:
+    def _show(
+        self,
+        drawn: DrawnMesh,
+        points: Float64[np.ndarray, "n 3"],
+        materials: GpuMesh,
+        coarse: Callable[[], DrawnMesh] | None,
+        *,
+        is_open: bool,
+        seen_by: DepthViews | None = None,
+    ) -> None:
+        """Sets the state."""
+        if self._materials is None:
+            self._materials = MaterialTable(self._gpu, materials, draws_maps=False)
+        self.state = GeometryState(drawn, points, self._materials, coarse, is_open=is_open, seen_by=seen_by)
+
+    def _uploaded(self, coarse: GpuMesh) -> DrawnMesh:
         """Uploads the mesh of what lies far."""
         self._coarse_buffers.write(coarse)
-        return self._coarse_buffers, coarse
+        return DrawnMesh(self._coarse_buffers, coarse)
 
     def release(self) -> None:
         """Frees the GL objects."""
         self._buffers.release()
         self._coarse_buffers.release()
-        if self._materials is not None:
-            self._materials.release()
+        for each in (self._materials, self._mesher):
+            if each is not None:
+                each.release()
 
 
 def _grazing_depth(seen: PosedFrame) -> Float32[np.ndarray, "h w"]:

@@ -13,7 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Animation, AnyMaterial, SceneObject
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent, PlacedObject
+from deltalight.render_server.gpu_scene import DrawnMesh, GeometryState, ObjectExtent, PlacedObject
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip
@@ -159,8 +159,7 @@ class VirtualObjects:
         materials = self._material_table(merged)
         self._buffers.cutouts = materials.bindings
         return GeometryState(
-            self._buffers,
-            merged,
+            DrawnMesh(self._buffers, merged),
             np.vstack(points),
             materials,
             objects=tuple(objects),

@@ -124,6 +124,8 @@ def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray
 
 
 NO_CUTOUTS: Bindings = {"CUTOUTS": False}
+NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
+VERTEX_BYTES, TRIANGLE_BYTES = 48, 12  # of a row of VERTEX_LAYOUT, and of three indices
 
 
 class MeshBuffers:
@@ -139,13 +141,9 @@ class MeshBuffers:
         self._sides = gpu.ctx.buffer(reserve=4)
         self._second_uv: moderngl.Buffer | None = None
         self._arrays: dict[int, moderngl.VertexArray] = {}
-        self.triangles: Int32[np.ndarray, "m 3"] = np.zeros((0, 3), np.int32)
+        self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
+        self.triangle_count = 0  # of those that are drawn, with any without area
         self.cutouts = NO_CUTOUTS
-
-    @property
-    def triangle_count(self) -> int:
-        """How many triangles are drawn."""
-        return len(self.triangles)
 
     @property
     def storage(self) -> dict[str, Binding]:
@@ -160,17 +158,24 @@ class MeshBuffers:
     def write(self, mesh: GpuMesh) -> None:
         """Replaces the contents by those of `mesh`."""
         vertices = np.ascontiguousarray(mesh.vertices, np.float32)
+        self.reserve(len(vertices), len(mesh.triangles), mesh)
         self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
-        if vertices.nbytes > self._vertices.size or self.triangles.nbytes > self._indices.size:
-            self.release()
-            self._vertices = self._ctx.buffer(reserve=max(vertices.nbytes, 4))
-            self._indices = self._ctx.buffer(reserve=max(self.triangles.nbytes, 4))
-            self._sides = self._ctx.buffer(reserve=4)
         if self.triangle_count:
             self._vertices.write(vertices)
             self._indices.write(self.triangles)
-            self._write_sides(mesh.material_table[:, DOUBLE_SIDED])
         self._write_second_uv(mesh.second_uv)
+
+    def reserve(self, vertex_count: int, triangle_count: int, materials: GpuMesh) -> None:
+        """Makes room for triangles of the materials of a mesh, which a kernel is to write (`solid`)."""
+        vertex_bytes, index_bytes = vertex_count * VERTEX_BYTES, triangle_count * TRIANGLE_BYTES
+        if vertex_bytes > self._vertices.size or index_bytes > self._indices.size:
+            self.release()
+            self._vertices = self._ctx.buffer(reserve=max(vertex_bytes, 4))
+            self._indices = self._ctx.buffer(reserve=max(index_bytes, 4))
+            self._sides = self._ctx.buffer(reserve=4)
+        self.triangles, self.triangle_count = NO_TRIANGLES, triangle_count
+        if triangle_count:
+            self._write_sides(materials.material_table[:, DOUBLE_SIDED])
 
     def _write_sides(self, double_sided: Float32[np.ndarray, " k"]) -> None:
         if self._sides.size != double_sided.nbytes:

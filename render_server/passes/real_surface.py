@@ -5,53 +5,13 @@ from collections.abc import Callable
 import moderngl
 import numpy as np
 
-from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.depth_mesh import DepthFit, upload_depth
 from deltalight.render_server.passes.gbuffer import GeometryBuffer
-from deltalight.render_server.scene.depth_surface import DepthSurface, jump_terms, window_radius
-
-
-class DepthFit:
-    """Fits a plane to the surroundings of every pixel: on the GPU what scene/depth_surface.py does in numpy."""
-
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._size = size
-        self._inverse = texture_2d(gpu, size, 1, "f4")
-        self._row_moments = texture_2d(gpu, size, 4, "f4")
-        self._row_depth = texture_2d(gpu, size, 2, "f4")
-        self._fits = texture_2d(gpu, size, 4, "f4")
-        self._invert = Kernel(gpu, "depth_inverse")
-        self._sum_rows = Kernel(gpu, "depth_rows")
-        self._fit = Kernel(gpu, "depth_columns")
-
-    def run(self, depth_map: moderngl.Texture, depth: DepthImage, camera: CameraModel) -> dict[str, Binding]:
-        """Fits `depth_map` (R32F, m, 0 unknown; the pixels of `depth`); returns what fitted_normal.glsl reads."""
-        found: dict[str, Binding] = {
-            "inverse_depth": self._inverse,
-            "window_radius": window_radius(depth, camera),
-            "window_fits": self._fits,
-        }
-        jumps = {"jump_threshold": jump_terms(depth, camera)}
-        self._invert.run(self._size, jumps, depth_map=depth_map, inverse_out=self._inverse)
-        self._sum_rows.run(
-            self._size, found, jumps, row_moments_out=self._row_moments, row_depth_out=self._row_depth
-        )
-        self._fit.run(
-            self._size,
-            found,
-            row_moments=self._row_moments,
-            row_depth=self._row_depth,
-            window_fits_out=self._fits,
-        )
-        return found
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(self._inverse, self._row_moments, self._row_depth, self._fits)
-        release_all(self._invert, self._sum_rows, self._fit)
+from deltalight.render_server.scene.depth_surface import DepthSurface
 
 
 class RealSurface:
@@ -83,8 +43,7 @@ class RealSurface:
 
     def from_depth(self, depth: DepthImage, fitted: Callable[[], DepthSurface], scene: Bindings) -> None:
         """Fills it from the clean, registered depth map; `fitted` fits it on the CPU if need be."""
-        known = np.where(depth.valid, depth.depth_m, np.float32(0))
-        self._depth.write(known.astype(np.float32, copy=False), alignment=1)
+        upload_depth(self._depth, depth)
         self._from_depth.run(
             self.size, scene, self._normals(depth, fitted), depth_map=self._depth, **self._images()
         )

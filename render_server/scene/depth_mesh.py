@@ -26,6 +26,9 @@ from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import LENSES_KEPT
 
 CELL_SAMPLES = 6
+BOUND_POINTS = 4000  # for fitting light views
+OUTLIER_SHARE = 1 / 9  # of a cell's known samples, at either end of their range
+KNOWN_SHARE = 1 / 4  # of a cell's samples: where fewer are known, outliers would not stand out
 # Pixels of two neighbouring nodes are at most this many cells apart: two in each direction.
 MAX_CELL_DISTANCE = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
@@ -82,6 +85,70 @@ def depth_mesh(
     return _world_mesh(nodes, _triangles_of_quads(nodes.inverse_depth, limit, slack), world_from_camera)
 
 
+def bound_points(
+    depth: DepthImage, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Returns at most BOUND_POINTS that enclose what a depth image shows (world, m), without its outliers; quickly.
+
+    Eight for each cell of the picture: its corners at the nearest and farthest depths of samples in it and beside it,
+    of which the outermost do not count.
+    """
+    cell = 1
+    while 8 * (-(-camera.width // cell)) * (-(-camera.height // cell)) > BOUND_POINTS:
+        cell += 1
+    least, most = _sampled_range(depth, cell)
+    beside = np.ones((3, 3), np.uint8)
+    nearest, farthest = cv2.dilate(most, beside).ravel(), -cv2.dilate(-least, beside).ravel()
+    known = np.flatnonzero(nearest > 0)
+    corners = _cell_corners(camera, cell)[:, known]
+    local = np.stack([corners / inverse[known, None] for inverse in (nearest, farthest)])
+    return np.asarray(local.reshape(-1, 3) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
+
+
+def _sampled_range(
+    depth: DepthImage, cell: int
+) -> tuple[Float64[np.ndarray, "a b"], Float64[np.ndarray, "a b"]]:
+    """Returns nearly the least and greatest inverse depth of samples of each cell; infinite and 0 without enough.
+
+    The last cells of rows and columns reach back into those before them, rather than over the border.
+    """
+    height, width = depth.depth_m.shape
+    shape = -(-height // cell), -(-width // cell)
+    steps = np.unique(np.linspace(0, cell - 1, min(cell, CELL_SAMPLES)).round().astype(int))
+    rows, columns = (
+        (np.clip(np.arange(count)[:, None] * cell, 0, max(length - cell, 0)) + steps).ravel()
+        for count, length in zip(shape, (height, width), strict=True)
+    )
+    chosen = np.ix_(rows, columns)
+    metres = np.where(depth.valid[chosen], depth.depth_m[chosen], 0).astype(np.float64)
+    inverse = np.divide(1, metres, out=np.zeros_like(metres), where=metres > 0)
+    across = len(steps)
+    ordered = inverse.reshape(shape[0], across, shape[1], across).transpose(0, 2, 1, 3).reshape(*shape, -1)
+    ordered.sort(axis=2)
+    count = np.count_nonzero(ordered, axis=2)
+    left_out = (count * OUTLIER_SHARE).astype(int)
+    last = ordered.shape[2] - 1
+    least, most = (
+        np.take_along_axis(ordered, np.minimum(place, last)[..., None], axis=2)[..., 0]
+        for place in (last + 1 - count + left_out, last - left_out)
+    )
+    is_known = count >= max(KNOWN_SHARE * (last + 1), 1)
+    return np.where(is_known, least, np.inf), np.where(is_known, most, 0)
+
+
+@lru_cache(maxsize=LENSES_KEPT)
+def _cell_corners(camera: CameraModel, cell: int) -> Float64[np.ndarray, "4 n 3"]:
+    """Returns points at a depth of 1 on the rays through the corners of cells of the picture."""
+    columns, rows = (
+        np.minimum(np.arange(0, length + cell, cell)[: -(-length // cell) + 1], length) - 0.5
+        for length in (camera.width, camera.height)
+    )
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    rays = camera.unproject(pixels.reshape(-1, 2)).reshape(pixels.shape)
+    points = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
+    return np.stack([points[corner].reshape(-1, 3) for corner in QUAD_CORNERS])
+
+
 def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
     """Returns the least cell edge in pixels whose grid has at most `triangle_budget` triangles."""
     stride = 1
@@ -91,7 +158,7 @@ def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
 
 
 def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
-    pixels, rays = _node_rays(camera, stride)
+    pixels, rays = node_rays(camera, stride)
     depth, all_rays = surface.fitted_depth, ray_planes(camera)
     inverse, normals = (np.empty((*parts, *rays.shape[1:]), np.float32) for parts in ((), (3,)))
 
@@ -147,10 +214,10 @@ def _slopes(
 
 
 @lru_cache(maxsize=2 * LENSES_KEPT)  # meshes are made fine and coarse
-def _node_rays(
+def node_rays(
     camera: CameraModel, stride: int
 ) -> tuple[Float32[np.ndarray, "gh gw 2"], Float32[np.ndarray, "2 gh gw"]]:
-    """Returns pixel coordinates and rays of the cells' centres (those of cells cut by the border as well)."""
+    """Returns pixel coordinates and rays (x/z, y/z) of the centres of cells, also of those that the border cuts."""
     columns = _cell_centres(camera.width, stride)
     rows = _cell_centres(camera.height, stride)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)

@@ -117,12 +117,12 @@ def test_a_coarse_mesh_that_is_begun_before_it_is_asked_for_is_that_of_its_frame
     for x in (0.25, 0.35, 0.45):
         assert moving.update([_floor_from(x)])
         assert moving.state is not None
-        coarse = moving.state.coarse_mesh[1].corners
+        coarse = moving.state.coarse_mesh.corners
         assert before is None or not np.array_equal(coarse, before)
         before = coarse
     standing.update([_floor_from(0.45)])
     assert standing.state is not None
-    assert np.array_equal(standing.state.coarse_mesh[1].corners, before)
+    assert np.array_equal(standing.state.coarse_mesh.corners, before)
     moving.release()
     standing.release()
 

@@ -31,13 +31,19 @@ mat2 rays_by_pixel(ivec2 pixel) {
     return mat2(across / float(high.x - low.x), down / float(high.y - low.y));
 }
 
+vec2 ray_at(ivec2 pixel) { return texelFetch(picture_rays, pixel, 0).xy; }
+
+// Turns a change by pixel into a change by ray coordinate.
+vec2 by_ray(ivec2 pixel, vec2 slope) { return slope * inverse(rays_by_pixel(pixel)); }
+
 // A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along (gradient by ray, w - gradient.ray).
+vec3 plane_normal(float w, vec2 gradient, vec2 ray) { return -normalize(vec3(gradient, w - dot(gradient, ray))); }
+
 vec3 fitted_normal(ivec2 pixel) {
     float w = texelFetch(inverse_depth, pixel, 0).r;
     vec3 slope = slope_at(pixel);
-    vec2 gradient = slope.xy * inverse(rays_by_pixel(pixel));
-    vec3 n = vec3(gradient, w - dot(gradient, texelFetch(picture_rays, pixel, 0).xy));
-    return w > 0.0 && slope.z > 0.5 ? -normalize(n) : vec3(0.0);
+    bool known = w > 0.0 && slope.z > 0.5;
+    return known ? plane_normal(w, by_ray(pixel, slope.xy), ray_at(pixel)) : vec3(0.0);
 }
 #else
 uniform sampler2D fitted_normals;
