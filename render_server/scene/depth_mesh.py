@@ -132,8 +132,12 @@ def _sampled_range(
         np.take_along_axis(ordered, np.minimum(place, last)[..., None], axis=2)[..., 0]
         for place in (last + 1 - count + left_out, last - left_out)
     )
+    trimmed = (most - least) * (OUTLIER_SHARE / (1 - 2 * OUTLIER_SHARE))  # of a surface without outliers
     is_known = count >= max(KNOWN_SHARE * (last + 1), 1)
-    return np.where(is_known, least, np.inf), np.where(is_known, most, 0)
+    return (
+        np.where(is_known, np.maximum(least - trimmed, least / 2), np.inf),
+        np.where(is_known, most + trimmed, 0),
+    )
 
 
 @lru_cache(maxsize=LENSES_KEPT)

@@ -121,7 +121,7 @@ def test_points_enclose_what_depth_shows_without_its_outliers(camera: CameraMode
     for pick, sign in ((np.min, 1), (np.max, -1)):
         beyond = sign * (pick(shown, axis=0) - pick(points, axis=0))
         assert (beyond > -1e-3).all()
-        assert (beyond < 0.03).all()
+        assert (beyond < 0.05).all()
 
 
 def test_nothing_known_has_no_points() -> None:
