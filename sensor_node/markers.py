@@ -112,7 +112,9 @@ class BoardDetector:
         world = np.concatenate(list(self._corners.values()))
         return self._projected(np.linalg.inv(world_from_camera), world)
 
-    def _find(self, color: UInt8[np.ndarray, "h w 3"], region: tuple[slice, slice] | None) -> _Matches | None:
+    def _find(
+        self, color: UInt8[np.ndarray, "h w 3"], region: tuple[slice, slice] | None = None
+    ) -> _Matches | None:
         gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
         quads, unread = self._finder.seen(gray, self._corners, region)
         if not quads:
