@@ -155,7 +155,7 @@ def _inverse(
 ) -> Float32[np.ndarray, "h w"]:
     """Return 1/values, 0 where unknown."""
     beyond = np.full(values.shape, np.inf, np.float32)
-    return np.reciprocal(np.asarray(cv2.copyTo(values, known.view(np.uint8), beyond)))
+    return np.asarray(np.reciprocal(cv2.copyTo(values, known.view(np.uint8), beyond)))
 
 
 def _fillable(
