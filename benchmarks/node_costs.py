@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
+import cv2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -66,7 +67,8 @@ def measure_node(size: tuple[int, int], rounds: int, say: Callable[[str], None])
     Raises:
         DeltalightError: the demo's recording is missing.
     """
-    keep_freed_memory()  # as a node does
+    keep_freed_memory()  # as a node does, and the next
+    cv2.setNumThreads(1)
     motions = {}
     with TemporaryDirectory(prefix="deltalight-bench-") as folder:
         for name, frames in {"rests": STANDING, "moves": MOVING}.items():
