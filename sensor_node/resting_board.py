@@ -57,7 +57,7 @@ class RestingBoard:
     """
 
     def __init__(self, gray: UInt8[np.ndarray, "h w"], corners: Float64[np.ndarray, "n 2"]) -> None:
-        height, width = gray.shape
+        height, width = (size // BLOCK_PX * BLOCK_PX for size in gray.shape)
         inside = ((corners >= 1) & (corners <= (width - 2, height - 2))).all(axis=1)
         self._region = _blocks_around(corners[inside], width, height)
         self._corners = corners[inside] - (self._region[1].start, self._region[0].start)

@@ -11,7 +11,7 @@ from deltalight.protocol.frames import BoardPose
 from deltalight.sensor_node.board_tracker import MOST_REUSED, BoardTracker
 from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, SyntheticNoise, default_camera
 from deltalight.sensor_node.markers import BoardDetector
-from deltalight.sensor_node.resting_board import REST_PX
+from deltalight.sensor_node.resting_board import REST_PX, RestingBoard
 
 Picture = UInt8[np.ndarray, "h w 3"]
 NOISE_CODES = 1.5
@@ -127,6 +127,18 @@ def test_a_jump_by_one_marker_is_no_rest(
     ]
     assert misses_px(noisy(still, 0)) < 1e-3
     assert misses_px(noisy(shifted(still, *(seen[1] - seen[0])), 1)) < DETECTION_PX
+
+
+@pytest.mark.parametrize("size", [(160, 120), (163, 125), (90, 70)])
+def test_corners_at_the_border_and_outside_do_not_count(size: tuple[int, int]) -> None:
+    """Whatever the size: blocks that are not whole are left out, and too few corners never rest."""
+    width, height = size
+    picture = cv2.resize(np.random.default_rng(1).integers(0, 256, (12, 16), np.uint8), size)
+    x, y = np.meshgrid(np.linspace(-20, width + 20, 9), np.linspace(0, height - 1, 7))
+    corners = np.column_stack([x.ravel(), y.ravel()])
+    assert RestingBoard(picture, corners).rests_in(picture)
+    assert not RestingBoard(picture, corners[corners[:, 0] < 0]).rests_in(picture)
+    assert not RestingBoard(picture, corners * np.nan).rests_in(picture)
 
 
 def hands(still: Picture, corners: Float64[np.ndarray, "n 2"]) -> Iterator[Picture]:
