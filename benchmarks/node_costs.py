@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Final, Literal
 
 import cv2
 import numpy as np
@@ -36,7 +36,7 @@ PARTS = ("reading", "pose", "clean depth", "messages")
 class NodeReport(StrictModel):
     """What `bench node` measured: medians of processor time of a frame's parts and of all of it, ms, by motion."""
 
-    report: Final = REPORT
+    report: Literal["deltalight bench node"] = REPORT
     version: str
     size: tuple[int, int]
     rounds: int
