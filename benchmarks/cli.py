@@ -115,6 +115,23 @@ def views(
 
 
 @bench.command()
+def node(
+    *,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the camera's pictures.")] = "320x240",
+    rounds: Annotated[int, typer.Option(min=1, max=1000, help="How often each frame is measured.")] = 4,
+    out: ReportFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Time what a frame costs a sensor node, by part, while the camera rests and while it moves."""
+    from deltalight.services.commands.options import parse_size
+
+    size_px = parse_size(size)
+    from deltalight.benchmarks.node_costs import run_node_costs
+
+    run_node_costs(size_px, rounds, out=out, as_json=as_json)
+
+
+@bench.command()
 def sweep(
     *,
     full: Annotated[

@@ -107,7 +107,7 @@ def clean_depth(
     if settings.filter_radius_px:
         smooth = smoothed.explains(inverse, SMOOTH_CONFIDENCE, settings.edge_sigmas)
         taken = filled | (smooth & (smoothed.inverse_depth > 0))
-    cleaned = np.where(taken, smoothed.inverse_depth, inverse)
+    cleaned = np.asarray(cv2.copyTo(smoothed.inverse_depth, taken.view(np.uint8), inverse))
     if settings.edge_reach_px:
         cleaned, known = assign_edges(
             cleaned,
@@ -154,7 +154,8 @@ def _inverse(
     values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
     """Return 1/values, 0 where unknown."""
-    return np.asarray(known / np.where(known, values, np.float32(1)))
+    beyond = np.full(values.shape, np.inf, np.float32)
+    return np.asarray(np.reciprocal(cv2.copyTo(values, known.view(np.uint8), beyond)))
 
 
 def _fillable(
@@ -177,10 +178,12 @@ def _small_holes(
     valid: Bool[np.ndarray, "h w"], area_px: int
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
     """Return rows and columns of the unknown pixels whose connected area is at most `area_px`."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats((~valid).view(np.uint8), connectivity=4)
-    places = np.flatnonzero(~valid)
-    areas = stats[labels.ravel()[places], cv2.CC_STAT_AREA]
-    rows, columns = np.divmod(places[areas <= area_px], valid.shape[1])
+    unknown = ~valid
+    _, labels = cv2.connectedComponents(unknown.view(np.uint8), connectivity=4)
+    places = np.flatnonzero(unknown)
+    holes = labels.ravel()[places]
+    small = np.bincount(holes) <= area_px
+    rows, columns = np.divmod(places[small[holes]], valid.shape[1])
     return rows, columns
 
 

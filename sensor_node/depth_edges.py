@@ -103,7 +103,7 @@ def assign_edges(
     """
     offsets = _spiral(reach_px)
     margin = int(np.ceil(SIGHT_PER_REACH * reach_px)) + VOTE_RADIUS_PX
-    picture = _pad(np.where(known, inverse_depth, 0), color, margin, contrast)
+    picture = _pad(cv2.copyTo(inverse_depth, known.view(np.uint8)), color, margin, contrast)
     rows, columns = np.divmod(_rim(known, reach_px), known.shape[1])
     places = (rows + margin) * picture.stride + columns + margin
     parts = [_seen(picture, part, offsets, noise, sigmas) for part in _chunks(places)]
@@ -111,8 +111,9 @@ def assign_edges(
         seen = _Surfaces(*(np.concatenate(values) for values in zip(*parts, strict=True)))
         _assign(picture, _without_own(picture, seen), reach_px)
     inside = slice(margin, -margin)
-    result = picture.inverse_depth.reshape(-1, picture.stride)[inside, inside]
-    return np.where(known, inverse_depth, result), known | (result > 0)
+    result = np.ascontiguousarray(picture.inverse_depth.reshape(-1, picture.stride)[inside, inside])
+    assigned = known | (result > 0)
+    return np.asarray(cv2.copyTo(inverse_depth, known.view(np.uint8), result)), assigned
 
 
 def _without_own(picture: _Padded, seen: _Surfaces) -> _Surfaces:
@@ -153,6 +154,8 @@ def _grow(
     for _ in range(reach_px):
         beside = picture.inverse_depth[places + _square(picture.stride, 1)]
         touches = ((beside > 0) & (np.abs(beside - value) < near_by)).any(axis=0)
+        if not touches.any():
+            return
         picture.inverse_depth[places[touches]] = value[touches]
         places, value, near_by = places[~touches], value[~touches], near_by[~touches]
 
@@ -194,28 +197,31 @@ def _seen(
     """Split the samples around pixels into two surfaces and compare colours; drop pixels without two."""
     shifts = (offsets.y * picture.stride + offsets.x).astype(np.int64)[:, None]
     samples = picture.inverse_depth.take(places + shifts)
-    split = _split(samples, offsets.weight)
-    nearer = (samples > split).astype(np.float32)
     unknown = (samples == 0).astype(np.float32)
-    farther = 1 - unknown - nearer
-    near, near_stray = _continued(samples - split, nearer, offsets)
-    far, far_stray = _continued(samples - split, farther, offsets)
+    known = 1 - unknown
+    split = _split(samples, known, offsets.weight)
+    nearer = (samples > split).astype(np.float32)
+    farther = known - nearer
+    from_split = samples - split
+    near, near_stray = _continued(from_split, nearer, offsets)
+    far, far_stray = _continued(from_split, farther, offsets)
     step = near - far
     two = (step > sigmas * noise.of_inverse_depth(split)) & (near_stray + far_stray < STRAY_FRACTION * step)
     two &= np.minimum(nearer.sum(axis=0), farther.sum(axis=0)) >= LEAST_SAMPLES
-    places = places[two]
+    chosen = np.flatnonzero(two)
+    places = places[chosen]
     match = _match(picture.color, places + shifts, places)
     near_match, far_match, own_match = (
-        _mean(match, part[:, two], offsets.weight) + ALIEN_MATCH for part in (nearer, farther, unknown)
+        _mean(match, part.take(chosen, axis=1), offsets.weight) + ALIEN_MATCH
+        for part in (nearer, farther, unknown)
     )
     own = own_match > OWN_ODDS * np.maximum(near_match, far_match)
     return _Surfaces(places, (near + split)[two], (far + split)[two], np.log(near_match / far_match), own)
 
 
-def _split(samples: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
+def _split(samples: Samples, known: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
     """Return the inverse depth between nearer and farther samples: the mean of both means, starting half-way."""
-    known = (samples > 0).astype(np.float32)
-    least = np.where(samples > 0, samples, np.float32(np.inf)).min(axis=0)
+    least = (samples + (1 - known) * np.finfo(np.float32).max).min(axis=0)
     most = samples.max(axis=0)
     split = np.asarray((np.minimum(least, most) + most) / 2)
     for _ in range(SPLIT_ROUNDS):
@@ -259,9 +265,14 @@ def _match(
 
     The long tail still tells which of two colours a mixture of them, far from both, is closer to.
     """
-    difference = color.take(around, axis=0) - color[places]
-    alike = 1 + np.einsum("snc,snc->sn", difference, difference)
-    return np.asarray(1 / (alike * alike))
+    squares = color.take(around, axis=0)
+    squares -= color[places]
+    squares *= squares
+    alike = squares[..., 0] + squares[..., 1]  # faster than a sum along an axis of four
+    alike += squares[..., 2]
+    alike += 1
+    alike *= alike
+    return np.asarray(np.divide(1, alike, out=alike))
 
 
 def _voted(picture: _Padded, seen: _Surfaces) -> PerPixel:

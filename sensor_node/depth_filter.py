@@ -94,21 +94,17 @@ class SmoothedDepth:
 
         Large where surfaces of different depth reach the pixel.
         """
-        rows, columns, reach = rows // 2, columns // 2, self._reach
-        weights, values = [], []
-        for row in (rows - reach, rows, rows + reach):
-            for column in (columns - reach, columns, columns + reach):
-                window = (
-                    np.clip(row, 0, self._weight.shape[0] - 1),
-                    np.clip(column, 0, self._weight.shape[1] - 1),
-                )
-                weights.append(self._weight[window])
-                values.append(
-                    self._fits.slope_x[window] * self._cells.x[0, columns]
-                    + self._fits.slope_y[window] * self._cells.y[rows, 0]
-                    + self._fits.level[window]
-                )
-        weight, value = np.array(weights), np.array(values)
+        rows, columns, (height, width) = rows // 2, columns // 2, self._weight.shape
+        steps = np.array([[-self._reach], [0], [self._reach]])
+        window_rows, window_columns = (
+            np.clip(centres + steps, 0, size - 1) for centres, size in ((rows, height), (columns, width))
+        )
+        windows = (window_rows[:, None] * width + window_columns).reshape(9, -1)
+        slope_x, slope_y, level, weight = (
+            each.take(windows)
+            for each in (self._fits.slope_x, self._fits.slope_y, self._fits.level, self._weight)
+        )
+        value = slope_x * self._cells.x[0, columns] + slope_y * self._cells.y[rows, 0] + level
         normalized = weight / np.maximum(weight.sum(axis=0), EMPTY)
         mean = (normalized * value).sum(axis=0)
         return np.asarray(np.sqrt((normalized * (value - mean) ** 2).sum(axis=0)))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Literal, TypedDict
 
 import numpy as np
@@ -76,7 +77,7 @@ def fitting_step_m(depth: DepthImage) -> float:
 
 def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stamps) -> list[bytes]:
     """Return the pose message, which states if no pose is known."""
-    described = None if board is None else board.model_dump(mode="json", exclude_none=True)
+    described = None if board is None else _described(board)
     if pose is None:
         return encode(PoseMessage(**stamps, status="no_board", board=described))
     message = PoseMessage(
@@ -88,6 +89,12 @@ def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stam
         board=described,
     )
     return encode(message)
+
+
+@lru_cache(maxsize=1)
+def _described(board: BoardSpec) -> dict[str, object]:
+    """Return a board's fields; a node sends the same with each frame."""
+    return board.model_dump(mode="json", exclude_none=True)
 
 
 def color_multipart(

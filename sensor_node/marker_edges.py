@@ -55,12 +55,17 @@ class _Picture(NamedTuple):
     light: Float32[np.ndarray, "h w"]
     camera: CameraModel
 
-    def at(self, points: Float64[np.ndarray, "*size 2"]) -> Float64[np.ndarray, "*size"]:
+    def at(
+        self, x: Float64[np.ndarray, "*size across"], y: Float64[np.ndarray, "*size across"]
+    ) -> Float64[np.ndarray, "*size across"]:
         focal = self.camera.matrix[0, 0]
-        pixels = self.camera.project(_homogeneous(points).reshape(-1, 3) / (focal, focal, 1))
-        columns, rows = pixels.astype(np.float32).reshape(-1, points.shape[-2], 2).transpose(2, 0, 1)
-        values = cv2.remap(self.light, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(values, np.float64).reshape(points.shape[:-1])
+        points = np.ones((x.size, 3))
+        for axis, values in enumerate((x, y)):
+            points[:, axis] = values.ravel() / focal
+        pixels = self.camera.project(points).astype(np.float32)
+        columns, rows = pixels.reshape(-1, x.shape[-1], 2).transpose(2, 0, 1)
+        found = cv2.remap(self.light, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found, np.float64).reshape(x.shape)
 
 
 def _refined(
@@ -90,9 +95,12 @@ def _edge_offsets(
     reach_px: Float64[np.ndarray, " m"],
 ) -> tuple[Float64[np.ndarray, "m 4 k"], Float64[np.ndarray, "m 4 k"]]:
     """Return the outward distance of the true edge from the assumed one, in pixels, and the contrast found there."""
-    on_edge = starts[:, :, None] + (ends - starts)[:, :, None] * FRACTIONS[:, None]
-    steps = outward[:, :, None, None] * (ACROSS[:, None] * reach_px[:, None, None, None, None])
-    profiles = picture.at(on_edge[:, :, :, None] + steps)
+    places = []
+    across_px = ACROSS * reach_px[:, None, None, None]
+    for axis in (0, 1):  # each by itself: NumPy is slow along rows of two
+        start, end, step = (each[:, :, axis, None] for each in (starts, ends, outward))
+        places.append((start + (end - start) * FRACTIONS)[..., None] + step[..., None] * across_px)
+    profiles = picture.at(*places)
     rises = np.maximum(np.diff(profiles, axis=-1), 0)
     contrast = rises.sum(axis=-1)
     middle = (ACROSS[1:] + ACROSS[:-1]) / 2

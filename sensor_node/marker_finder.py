@@ -22,6 +22,8 @@ WINDOW_HALF_PX = (2, 8)
 WINDOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
 # Narrower markers cannot be read.
 LEAST_SIDE_PX = 10
+# Length of the shortest outline that may be a marker, as a fraction of the picture's longer edge (OpenCV's default).
+LEAST_OUTLINE = 0.03
 
 Quads = dict[int, Float64[np.ndarray, "4 2"]]
 
@@ -43,11 +45,25 @@ class MarkerFinder:
         """Return the corners of every wanted marker that is large enough to be read, by id."""
         return self.seen(gray, wanted).quads
 
-    def seen(self, gray: UInt8[np.ndarray, "h w"], wanted: Collection[int]) -> Seen:
-        """Return the wanted markers that are large enough to be read, and what may be others, of the same size."""
-        found, ids, others = self._detector.detectMarkers(gray)
+    def seen(
+        self,
+        gray: UInt8[np.ndarray, "h w"],
+        wanted: Collection[int],
+        region: tuple[slice, slice] | None = None,
+    ) -> Seen:
+        """Return the wanted markers that are large enough to be read, and what may be others, of the same size.
+
+        With a `region` (rows, columns), only what lies there, as the search of the whole picture finds it.
+        """
+        part = gray if region is None else np.ascontiguousarray(gray[region])
+        if not part.size:
+            return Seen({}, _stacked(()))
+        self._parameters.minMarkerPerimeterRate = LEAST_OUTLINE * max(gray.shape) / max(part.shape)
+        self._detector.setDetectorParameters(self._parameters)
+        found, ids, others = self._detector.detectMarkers(part)
         names = [] if ids is None else ids.ravel().tolist()
-        quads, unread = _stacked(found), _stacked(others)
+        corner = (0, 0) if region is None else (region[1].start, region[0].start)
+        quads, unread = _stacked(found) + corner, _stacked(others) + corner
         read = zip(names, quads, shortest_sides(quads), strict=True)
         return Seen(
             {name: quad for name, quad, side in read if name in wanted and side >= LEAST_SIDE_PX},
@@ -87,10 +103,14 @@ class MarkerFinder:
 
     @cached_property
     def _detector(self) -> Any:  # noqa: ANN401 - cv2 has no types
+        return cv2.aruco.ArucoDetector(self._board.opencv_dictionary(), self._parameters)
+
+    @cached_property
+    def _parameters(self) -> Any:  # noqa: ANN401 - cv2 has no types
         parameters = cv2.aruco.DetectorParameters()
         parameters.markerBorderBits = self._board.border_bits
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-        return cv2.aruco.ArucoDetector(self._board.opencv_dictionary(), parameters)
+        return parameters
 
     @cached_property
     def _charuco(self) -> Any:  # noqa: ANN401 - cv2 has no types
@@ -116,7 +136,8 @@ def linear_luminance(
 ) -> Float32[np.ndarray, "h w"]:
     """Return the linear luminance of a coded picture: a sum of three look-ups."""
     table = (decode_lut(response) * LUMINANCE).astype(np.float32)
-    red, green, blue = (table[:, channel][color[..., channel]] for channel in range(3))
+    planes = cv2.split(color)
+    red, green, blue = (cv2.LUT(plane, table[:, channel]) for channel, plane in enumerate(planes))
     return np.asarray(red + green + blue)
 
 

@@ -71,20 +71,22 @@ class BoardDetector:
         self._chessboard = board.chessboard_corners()
         self._previous: Float64[np.ndarray, "4 4"] | None = None
 
-    def detect(self, color: UInt8[np.ndarray, "h w 3"]) -> BoardPose | None:
+    def detect(
+        self, color: UInt8[np.ndarray, "h w 3"], region: tuple[slice, slice] | None = None
+    ) -> BoardPose | None:
         """Return the pose in a picture (RGB), or None if the board is not visible.
 
         `reprojection_error_px` is the mean distance between the corners found and the board's corners.
 
+        Args:
+            color: the picture.
+            region: rows and columns to search; None = all.
+
         Raises:
             DeltalightError: the picture has not the camera's size.
         """
-        if color.shape[:2] != (self._camera.height, self._camera.width):
-            raise DeltalightError(
-                f"the picture has {color.shape[1]}x{color.shape[0]} pixels but its camera "
-                f"{self._camera.width}x{self._camera.height}; correct calibration/rgb.yaml."
-            )
-        matches = self._find(color)
+        self.require_size(color)
+        matches = self._find(color, region)
         solutions = [] if matches is None else self._solve_seen(matches)
         if not solutions:
             return None
@@ -93,9 +95,28 @@ class BoardDetector:
         alternative = None if other is None else np.linalg.inv(other.camera_from_world)
         return BoardPose(self._previous, best.error_px, alternative)
 
-    def _find(self, color: UInt8[np.ndarray, "h w 3"]) -> _Matches | None:
+    def require_size(self, color: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Check that a picture is of the camera's size.
+
+        Raises:
+            DeltalightError: it is not.
+        """
+        if color.shape[:2] != (self._camera.height, self._camera.width):
+            raise DeltalightError(
+                f"the picture has {color.shape[1]}x{color.shape[0]} pixels but its camera "
+                f"{self._camera.width}x{self._camera.height}; correct calibration/rgb.yaml."
+            )
+
+    def corners_at(self, world_from_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "n 2"]:
+        """Return where a camera sees the corners of all markers, in the picture or not; NaN behind it."""
+        world = np.concatenate(list(self._corners.values()))
+        return self._projected(np.linalg.inv(world_from_camera), world)
+
+    def _find(
+        self, color: UInt8[np.ndarray, "h w 3"], region: tuple[slice, slice] | None = None
+    ) -> _Matches | None:
         gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
-        quads, unread = self._finder.seen(gray, self._corners)
+        quads, unread = self._finder.seen(gray, self._corners, region)
         if not quads:
             return None
         light = linear_luminance(color, self._response)

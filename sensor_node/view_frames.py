@@ -9,6 +9,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose, DepthImage, LampPose, SensorFrame, ViewFrame
 from deltalight.protocol.poses import require_rigid
 from deltalight.protocol.source import Source
+from deltalight.sensor_node.board_tracker import BoardTracker
 from deltalight.sensor_node.cameras.base import Camera
 from deltalight.sensor_node.depth import DepthSettings, clean_depth, estimate_noise_sigma
 from deltalight.sensor_node.depth_registration import register_depth
@@ -37,7 +38,8 @@ class ViewFrameBuilder:
 
     The pose is the one given with the frame, else the board's, else none. The reference exposure and, if unknown, the
     depth noise are those of the source's first frame, so that a frame's result does not depend on where a run began;
-    of a live camera, those of the first frame delivered.
+    of a live camera, those of the first frame delivered. A board that rests before a live camera keeps its pose
+    (`BoardTracker`); frames of a source are examined one by one.
 
     Args:
         rig: where the frames come from.
@@ -60,7 +62,7 @@ class ViewFrameBuilder:
     ) -> None:
         self._rig, self._settings = rig, settings or DepthSettings()
         self._reference = None if isinstance(rig, Camera) else _Reference.of(rig[0])
-        self._detector: BoardDetector | None = None
+        self._detector: BoardDetector | BoardTracker | None = None
         from_rgb = rig.extrinsics.depth_from_rgb
         self._color_from_depth = np.eye(4) if from_rgb is None else np.linalg.inv(from_rgb)
         self._needs_depth, self._needs_light = needs_depth, needs_light
@@ -124,7 +126,8 @@ class ViewFrameBuilder:
         if self._rig.board is None:
             return None
         if self._detector is None:
-            self._detector = BoardDetector(self._rig.board, self._rig.camera, frame.response)
+            detector = BoardDetector(self._rig.board, self._rig.camera, frame.response)
+            self._detector = BoardTracker(detector) if isinstance(self._rig, Camera) else detector
         return self._detector.detect(frame.color)
 
     def _pose_alone(self, frame: SensorFrame) -> BoardPose | None:

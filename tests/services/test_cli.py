@@ -69,6 +69,7 @@ COMMANDS = {
     "bench rest",
     "bench soak",
     "bench sweep",
+    "bench node",
     "bench views",
     "gpu-check",
     "virtual-camera",
