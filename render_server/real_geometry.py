@@ -214,13 +214,9 @@ class RealGeometry:
                 buffers, lambda: merge_for_gpu([_depth_mesh(seen, surface(), grazing.result, budget)])
             )
 
-        self._show(
-            drawn(self._buffers, self.budget),
-            points,
-            empty,
-            lambda: drawn(self._coarse_buffers, self.budget // COARSE_DIVISOR),
-            is_open=True,
-        )
+        fine = drawn(self._buffers, self.budget)
+        coarse = drawn(self._coarse_buffers, self.budget // COARSE_DIVISOR)  # takes as good as no time
+        self._show(fine, points, empty, lambda: coarse, is_open=True)
 
     def _begun_coarse(self, make: Callable[[], GpuMesh]) -> Callable[[], DrawnMesh]:
         """Returns what makes coarse triangles when asked; begun now if the last ones were asked for too."""

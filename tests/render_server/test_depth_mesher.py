@@ -1,6 +1,7 @@
 """Triangles that the GPU makes of depth are those of `depth_mesh`, and the points that bound them do."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,14 +10,16 @@ from jaxtyping import Float32
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.scene_objects import RealScene
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.depth_mesh import DepthMesher
 from deltalight.render_server.passes.gbuffer import MeshBuffers
-from deltalight.render_server.real_geometry import EMPTY_MESH
+from deltalight.render_server.real_geometry import EMPTY_MESH, RealGeometry
 from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, bound_points, depth_mesh
 from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
 from tests.render_server.test_real_surface import room
 from tests.render_server.test_scene_depth_mesh import LENS, NORMAL, PINHOLE, image, plane_depth
+from tests.render_server.test_scene_threads import floor_from
 
 WORLD_FROM_CAMERA = np.array([[0, 0, 1.0, 0.3], [-1, 0, 0, 0.2], [0, -1, 0, 0.1], [0, 0, 0, 1]])
 SHAPE = PINHOLE.height, PINHOLE.width
@@ -126,3 +129,22 @@ def test_points_enclose_what_depth_shows_without_its_outliers(camera: CameraMode
 
 def test_nothing_known_has_no_points() -> None:
     assert not len(bound_points(image(np.zeros(SHAPE, np.float32)), PINHOLE, WORLD_FROM_CAMERA))
+
+
+def test_a_room_meshed_by_the_gpu_tells_the_same_triangles_to_the_cpu(gpu: GpuContext) -> None:
+    """Which makes them only when asked; and depth in which nothing is known leaves no room."""
+    by_gpu, by_numpy = (RealGeometry(gpu, RealScene(), 8_000, meshes_on_gpu=on) for on in (True, False))
+    seen = floor_from(0.25)
+    assert seen.frame.depth is not None
+    lost = replace(seen.frame.depth, depth_m=np.zeros_like(seen.frame.depth.depth_m))
+    by_gpu.update([replace(seen, frame=replace(seen.frame, depth=lost))])
+    assert by_gpu.state is None
+    for real in (by_gpu, by_numpy):
+        assert real.update([seen])
+    assert by_gpu.state is not None
+    assert by_numpy.state is not None
+    assert np.array_equal(by_gpu.state.corners, by_numpy.state.corners)
+    assert by_gpu.state.coarse_mesh.buffers.triangle_count < by_gpu.state.buffers.triangle_count / 4
+    assert np.array_equal(by_gpu.state.coarse_mesh.corners, by_numpy.state.coarse_mesh.corners)
+    for real in (by_gpu, by_numpy):
+        real.release()

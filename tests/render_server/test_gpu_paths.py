@@ -118,3 +118,16 @@ def test_the_paths_of_gpus_make_the_same_picture_without_waiting(
     assert any(one.kernel.startswith("mirror_smooth") for part in dispatches for one in part) == (
         case.method in ("exact", "differential", "dlpv")
     )
+
+
+def test_depth_that_the_gpu_meshes_makes_nearly_the_same_picture(
+    gpu: GpuContext, tmp_path_factory: pytest.TempPathFactory, audit: list[str]
+) -> None:
+    """Its triangles are the same; the points that bound them, and so the lights' maps, lie elsewhere."""
+    case = Case("exact", "depth", "mirror")
+    (expected,), _ = pictures_of(gpu, case, tmp_path_factory.mktemp("software"))
+    folder = tmp_path_factory.mktemp("gpu")
+    (picture,), dispatches = pictures_of(replace(gpu, is_software=False), case, folder, checks=True)
+    assert {"depth_nodes", "depth_triangles"} <= {one.kernel for part in dispatches for one in part}
+    assert psnr_db(picture, expected) >= LEAST_PSNR_DB - 10
+    assert audit == []

@@ -67,8 +67,9 @@ def test_normals_do_not_depend_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> 
     assert np.array_equal(found[0].normals, found[1].normals)
 
 
+@pytest.mark.parametrize("on_gpu", [False, True], ids=["numpy", "GPU"])
 def test_no_array_of_a_measured_room_s_triangles_is_made(
-    gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
+    gpu: GpuContext, monkeypatch: pytest.MonkeyPatch, *, on_gpu: bool
 ) -> None:
     """Voxels and shadow views of a new frame: shaders read the mesh's own buffers."""
 
@@ -76,8 +77,8 @@ def test_no_array_of_a_measured_room_s_triangles_is_made(
         raise AssertionError("an array of all triangles' corners")
 
     monkeypatch.setattr(GpuMesh, "corners", property(refuse))
-    real = RealGeometry(gpu, RealScene(), BUDGET)
-    real.update([_floor_from(0.25)])
+    real = RealGeometry(gpu, RealScene(), BUDGET, meshes_on_gpu=on_gpu)
+    real.update([floor_from(0.25)])
     assert real.state is not None
     fronts, backs = real.state.solid_parts(0.01)
     assert fronts.triangle_count > backs.triangle_count > 0
@@ -100,8 +101,8 @@ def test_the_coarse_mesh_is_made_once_and_when_asked_for(
         return mesh_depth(*given, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(real_geometry, "depth_mesh", counted)
-    real = RealGeometry(gpu, RealScene(), BUDGET)
-    assert real.update([_floor_from(0.25)])
+    real = RealGeometry(gpu, RealScene(), BUDGET, meshes_on_gpu=False)
+    assert real.update([floor_from(0.25)])
     assert real.state is not None
     assert budgets == [BUDGET]
     (coarse,) = real.state.coarse_parts
@@ -112,22 +113,22 @@ def test_the_coarse_mesh_is_made_once_and_when_asked_for(
 
 
 def test_a_coarse_mesh_that_is_begun_before_it_is_asked_for_is_that_of_its_frame(gpu: GpuContext) -> None:
-    moving, standing = (RealGeometry(gpu, RealScene(), BUDGET) for _ in range(2))
+    moving, standing = (RealGeometry(gpu, RealScene(), BUDGET, meshes_on_gpu=False) for _ in range(2))
     before = None
     for x in (0.25, 0.35, 0.45):
-        assert moving.update([_floor_from(x)])
+        assert moving.update([floor_from(x)])
         assert moving.state is not None
         coarse = moving.state.coarse_mesh.corners
         assert before is None or not np.array_equal(coarse, before)
         before = coarse
-    standing.update([_floor_from(0.45)])
+    standing.update([floor_from(0.45)])
     assert standing.state is not None
     assert np.array_equal(standing.state.coarse_mesh.corners, before)
     moving.release()
     standing.release()
 
 
-def _floor_from(x: float) -> PosedFrame:
+def floor_from(x: float) -> PosedFrame:
     pose = look_at((x, -0.9, 0.65))
     seen = frame(checkered(), pose=pose, depth=depth_image(floor_depth(pose)))
     return PosedFrame(seen, CameraView(seen.camera, pose.world_from_camera))
