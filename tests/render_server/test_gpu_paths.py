@@ -125,9 +125,10 @@ def test_depth_that_the_gpu_meshes_makes_nearly_the_same_picture(
 ) -> None:
     """Its triangles are the same; the points that bound them, and so the lights' maps, lie elsewhere."""
     case = Case("exact", "depth", "mirror")
-    (expected,), _ = pictures_of(gpu, case, tmp_path_factory.mktemp("software"))
+    expected, _ = pictures_of(gpu, case, tmp_path_factory.mktemp("software"))
     folder = tmp_path_factory.mktemp("gpu")
-    (picture,), dispatches = pictures_of(replace(gpu, is_software=False), case, folder, checks=True)
+    pictures, dispatches = pictures_of(replace(gpu, is_software=False), case, folder, checks=True)
     assert {"depth_nodes", "depth_triangles"} <= {one.kernel for part in dispatches for one in part}
-    assert psnr_db(picture, expected) >= LEAST_PSNR_DB - 10
+    least_psnr_db = min(psnr_db(one, other) for one, other in zip(pictures, expected, strict=True))
+    assert least_psnr_db >= LEAST_PSNR_DB - 10
     assert audit == []
