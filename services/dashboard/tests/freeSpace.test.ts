@@ -1,4 +1,5 @@
-import { describe, expect, it } from "vitest";
+import { describe, expect, it, vi } from "vitest";
+import { ProblemError } from "../src/api/http";
 import type { PickAnswer, Pose, Vector } from "../src/api/types";
 import type { Bounds } from "../src/math/bounds";
 import { isInPicture, meetPlane, type Pixel, type View } from "../src/math/camera";
@@ -85,7 +86,13 @@ describe("room for a new object", () => {
         look(() => ({ normal: [1, 0, 0] })),
       ),
     ).toBeNull();
-    expect(await freePlace(wanted(), () => Promise.resolve(undefined))).toBeNull();
+  });
+
+  it("is not looked for any longer when the service refuses to look", async () => {
+    const busy = new ProblemError(503, "render-server", "The render server does not answer.");
+    const refuse = vi.fn(() => Promise.reject(busy));
+    await expect(freePlace(wanted(), refuse)).rejects.toBe(busy);
+    expect(refuse.mock.calls.length).toBeLessThanOrEqual(5); // of one place, at the same time
   });
 });
 

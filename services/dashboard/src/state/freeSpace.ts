@@ -4,7 +4,8 @@ import { corners, isSteep, restOn, type Bounds } from "../math/bounds";
 import { eyeOf, isInPicture, meetPlane, project, type Pixel, type View } from "../math/camera";
 import { length, subtract, UP } from "../math/vector";
 
-export type Look = (pixel: Pixel) => Promise<PickAnswer | undefined>;
+/** What is at a pixel; a refusal ends the search, since other questions would wait as long. */
+export type Look = (pixel: Pixel) => Promise<PickAnswer>;
 
 /** What an object covers of the ground, around its upright axis. */
 export interface Footprint {

@@ -29,13 +29,16 @@ function onBoard(pixel: Pixel): Vector {
   return (view.value && meetPlane(view.value, pixel, [0, 0, 0], UP)) ?? [0, 0, 0];
 }
 
-/** The free place nearest to the picture's middle. */
+/** The free place nearest to the picture's middle; a search that the service refused is told and ends. */
 export async function roomInMiddle(pose: Pose, bounds: Bounds | null): Promise<Vector> {
-  if (!view.value) return [0, 0, 0];
-  const start = await startAt(view.value, centre(), pick);
-  const found = start && (await roomNear(start, pose, bounds));
+  const seen = view.value;
+  if (!seen) return [0, 0, 0];
+  const found = await attempt(async () => {
+    const start = await startAt(seen, centre(), lookAt);
+    return start && (await roomNear(start, pose, bounds));
+  });
   if (found) return found;
-  toast("There is no free space, so the object was placed in the middle of the picture. Drag it where you want it.");
+  tellElsewhere(found, "the object was placed in the middle of the picture");
   return onBoard(centre());
 }
 
@@ -43,16 +46,20 @@ export async function roomInMiddle(pose: Pose, bounds: Bounds | null): Promise<V
 export async function roomBeside({ id, pose, frame }: SceneObject): Promise<Vector> {
   const bounds = boundsByObject.value.get(id) ?? null;
   const foot = footOf(pose, bounds, UP);
-  const found = frame === "world" ? await roomNear(foot, pose, bounds) : null;
+  const found = frame === "world" ? await attempt(() => roomNear(foot, pose, bounds)) : null;
   if (found) return found;
-  toast(
-    "There is no free space, so the copy was placed beside the original at the same height. Drag it where you want it.",
-  );
+  tellElsewhere(found, "the copy was placed beside the original at the same height");
   return add(foot, [2 * footprintOf(pose, bounds).radius + GAP_M, 0, 0]);
 }
 
+/** Tell where something was put without free space: none is there (null), or the search was refused. */
+function tellElsewhere(found: null | undefined, where: string): void {
+  const why = found === null ? "There is no free space" : "Free space was not found";
+  toast(`${why}, so ${where}. Drag it where you want it.`);
+}
+
 async function roomNear(start: Vector, pose: Pose, bounds: Bounds | null): Promise<Vector | null> {
-  return view.value && freePlace({ view: view.value, start, pose, bounds, taken: footprints() }, pick);
+  return view.value && freePlace({ view: view.value, start, pose, bounds, taken: footprints() }, lookAt);
 }
 
 function footprints(): Footprint[] {
