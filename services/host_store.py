@@ -13,7 +13,7 @@ from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument, load_scene
 from deltalight.protocol.source import Source
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.settings import load_configuration
-from deltalight.services.storage.faults import ConflictError
+from deltalight.services.storage.faults import ConflictError, NotFoundError
 from deltalight.services.storage.store import Store
 
 FIRST_SCENE = "First scene"
@@ -64,7 +64,8 @@ def activate_first(store: Store, document: SceneDocument) -> None:
     before = {head.id for head in store.scenes.all()}
     scene_id = import_document(store, document)
     if not store.scenes.activate_first(scene_id) and scene_id not in before:
-        with suppress(ConflictError):  # the faster one shows this very scene
+        # The faster one shows this very scene, or another slow one that shared it was first to delete it.
+        with suppress(ConflictError, NotFoundError):
             store.scenes.delete(scene_id)
 
 
@@ -98,8 +99,9 @@ def import_document(store: Store, document: SceneDocument, what: str = "imported
     """Import a document whose assets are absolute paths, like `import_scene`."""
     kept = document.with_assets(lambda _place, asset: _keep(store, asset))
     for head in store.scenes.all():
-        if _same(store.scenes.get(head.id).document, kept):
-            return head.id
+        with suppress(NotFoundError):  # another process may have deleted it meanwhile
+            if _same(store.scenes.get(head.id).document, kept):
+                return head.id
     return store.scenes.create(kept.model_dump(mode="json"), what).head.id
 
 

@@ -142,6 +142,21 @@ def test_of_several_that_start_one_makes_the_first_scene(tmp_path: Path, databas
         assert [head.is_active for head in store.scenes.all()] == [True]
 
 
+def test_a_process_whose_first_scene_another_deleted_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Store(tmp_path, probe=trusting_probe) as store:
+        activate_first(store, SceneDocument(name="Faster"))
+
+        def deleted_meanwhile(scene_id: str) -> bool:
+            store.scenes.delete(scene_id)
+            return False
+
+        monkeypatch.setattr(store.scenes, "activate_first", deleted_meanwhile)
+        activate_first(store, SceneDocument(name="Slower"))
+        assert [head.name for head in store.scenes.all()] == ["Faster"]
+
+
 def test_feeds_reach_all_but_the_sender_and_outlive_killed_ones(tmp_path: Path, database: str | None) -> None:
     heard: dict[str, list[str]] = {"a": [], "b": [], "c": []}
     with Store(tmp_path, database=database) as store, ExitStack() as open_feeds:
