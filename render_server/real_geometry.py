@@ -199,20 +199,22 @@ class RealGeometry:
         """Lets the GPU mesh a depth image; the CPU makes the same triangles only when asked for them."""
         depth, view = seen.frame.depth, seen.view
         assert depth is not None
-        grazing = begun(partial(_grazing_depth, seen))
+        grazing = begun(partial(_grazing_depth, seen))  # while points are sampled
         points = bound_points(depth, view.camera, view.world_from_camera)
-        mesher.take(depth, view.camera, grazing.result())
         if not len(points):
             self.state = None
             return
+        mesher.take(depth, view.camera, grazing.result())
         empty = merge_for_gpu([EMPTY_MESH])
 
         def drawn(buffers: MeshBuffers, budget: int) -> DrawnMesh:
             mesher.fill(buffers, view.world_from_camera, budget, empty)
-            surface = partial(depth_surface, depth, view.camera)
-            return DrawnMesh(
-                buffers, lambda: merge_for_gpu([_depth_mesh(seen, surface(), grazing.result, budget)])
-            )
+
+            def made() -> GpuMesh:
+                surface = depth_surface(depth, view.camera)
+                return merge_for_gpu([_depth_mesh(seen, surface, grazing.result, budget)])
+
+            return DrawnMesh(buffers, made)
 
         fine = drawn(self._buffers, self.budget)
         coarse = drawn(self._coarse_buffers, self.budget // COARSE_DIVISOR)  # takes as good as no time
