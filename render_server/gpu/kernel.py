@@ -12,6 +12,7 @@ from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
+from weakref import ref
 
 import moderngl
 import numpy as np
@@ -34,6 +35,7 @@ GL_INT = 0x1404
 CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
 Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
+PLAIN = (float, int, bool, tuple, list)  # values of uniforms that moderngl takes as they are
 Value = float | int | bool | Sequence[float] | Sequence[Sequence[float]] | np.ndarray[Any, Any]
 Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
 Bindings = Mapping[str, Binding]
@@ -82,14 +84,23 @@ class Dispatch:
     written: Mapping[str, object]
 
 
+def _nothing() -> None:
+    """Stands where no texture was checked yet."""
+
+
 @dataclass(eq=False)
 class _Slot:
-    """An active resource of a linked program with its unit or binding point."""
+    """An active resource of a linked program with its unit or binding point.
+
+    `checked` returns the texture that was last found to fit, while it lives; `last` is what a uniform holds.
+    """
 
     name: str
     member: Any
     kind: int = 0
     place: int = 0
+    checked: Callable[[], object] = _nothing
+    last: bytes | Value | None = None
 
 
 class _Program:
@@ -109,8 +120,6 @@ class _Program:
         self._storage: list[_Slot] = []
         self._blocks: list[_Slot] = []
         self._uniforms: list[_Slot] = []
-        self._last: dict[str, bytes | Value] = {}
-        self._formats: dict[int, str] = {}
         for name in program:
             self._adopt(name, program[name])
         self._assign()
@@ -121,7 +130,8 @@ class _Program:
             (self._blocks, self._bind_block),
             (self._uniforms, self._write),
         )
-        self._needed = {slot.name for slots, _ in self._binders for slot in slots}
+        self._needed = frozenset(slot.name for slots, _ in self._binders for slot in slots)
+        self._switches = frozenset(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:
         slot = _Slot(name, member, getattr(member, "gl_type", 0))
@@ -153,9 +163,9 @@ class _Program:
         Raises:
             BindingError: a name or value does not fit.
         """
-        for name in own:
-            if name not in self._declared.names:
-                raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
+        if not own.keys() <= self._declared.names:
+            name = next(name for name in own if name not in self._declared.names)
+            raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
         self._require(self._needed, known)
         for slots, bind in self._binders:
             for slot in slots:
@@ -172,9 +182,10 @@ class _Program:
         Raises:
             BindingError: one is missing.
         """
-        switches = self._declared.switches
-        self._require(set(switches), known)
-        return tuple(name for name in switches if known[name])
+        if not self._switches:
+            return ()
+        self._require(self._switches, known)
+        return tuple(name for name in self._declared.switches if known[name])
 
     def _nearest(self, name: str) -> str:
         close = get_close_matches(name, self._declared.names, 1)
@@ -184,30 +195,41 @@ class _Program:
         return BindingError(f"Kernel {self.label}: `{slot.name}` is {wanted}, not a {type(value).__name__}.")
 
     def _bind_sampler(self, slot: _Slot, value: Binding) -> None:
+        texture: Any = self._gpu.empty_texture(*SAMPLERS[slot.kind]) if value is None else value
+        if slot.checked() is not texture:
+            self._check_sampled(slot, texture)
+        texture.use(location=slot.place)
+
+    def _check_sampled(self, slot: _Slot, texture: object) -> None:
         kind, texels = SAMPLERS[slot.kind]
-        texture: Any = self._gpu.empty_texture(kind, texels) if value is None else value
         if not isinstance(texture, Texture) or not isinstance(texture, kind):
-            raise self._wrong(slot, value, f"a {kind.__name__} that is sampled")
+            raise self._wrong(slot, texture, f"a {kind.__name__} that is sampled")
         if (
             texture.dtype[0].replace("n", "f") != texels
         ):  # n: integers that are read as fractions of their greatest
             raise BindingError(
                 f"Kernel {self.label}: `{slot.name}` samples texels of type {texels}, not {texture.dtype}."
             )
-        texture.use(location=slot.place)
+        slot.checked = ref(texture)
 
     def _bind_image(self, slot: _Slot, value: Binding) -> None:
+        texture: Any = value
+        if value is None or slot.checked() is not value:
+            self._check_image(slot, value)
+        texture.bind_to_image(slot.place)
+
+    def _check_image(self, slot: _Slot, texture: object) -> None:
         kind = IMAGES[slot.kind]
-        if not isinstance(value, Texture) or not isinstance(value, kind):
-            raise self._wrong(slot, value, f"a {kind.__name__} that is written or read texel by texel")
+        if not isinstance(texture, Texture) or not isinstance(texture, kind):
+            raise self._wrong(slot, texture, f"a {kind.__name__} that is written or read texel by texel")
         wanted = self._declared.formats[slot.name]
-        found = image_format(value)
+        found = image_format(texture)
         if wanted and found not in wanted:
             raise BindingError(
                 f"Kernel {self.label}: `{slot.name}` is declared {' or '.join(sorted(wanted))}, "
                 f"but the texture is {found}."
             )
-        value.bind_to_image(slot.place, read=True, write=True)
+        slot.checked = ref(texture)
 
     def _bind_storage(self, slot: _Slot, value: Binding) -> None:
         is_written = slot.name in self._declared.written
@@ -233,11 +255,13 @@ class _Program:
         if isinstance(value, np.ndarray):
             ordered = value.T if value.ndim == 2 and slot.member.matrix else value
             data = np.ascontiguousarray(ordered, dtype="f4").tobytes()
-        elif isinstance(value, bool | int | float | tuple | list | np.generic):
-            data = value.item() if isinstance(value, np.generic) else value
+        elif isinstance(value, PLAIN):
+            data = value
+        elif isinstance(value, np.generic):
+            data = value.item()
         else:
             raise self._wrong(slot, value, "a uniform")
-        if self._last.get(slot.name) == data and slot.name in self._last:
+        if slot.last == data:
             return
         try:
             if isinstance(data, bytes):
@@ -248,7 +272,7 @@ class _Program:
             raise BindingError(
                 f"Kernel {self.label}: `{slot.name}` cannot take {value!r} ({error})."
             ) from error
-        self._last[slot.name] = data
+        slot.last = data
 
     @property
     def local_size(self) -> tuple[int, int, int]:
@@ -363,8 +387,8 @@ class Kernel(_Shader):
             BindingError: a name is undeclared or missing, or its value is of the wrong kind or format.
         """
         program, known = self._bound(own, shared)
-        counts = [*threads, 1, 1][:3]
-        groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self.local_size, strict=True))
+        counts = zip((*threads, 1, 1), self.local_size, strict=False)
+        groups = tuple([max(1, -(-count // size)) for count, size in counts])
         program.compute.run(*groups)
         self._gpu.ctx.memory_barrier()
         program.report(groups, partial(program.written, known))
