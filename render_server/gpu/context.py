@@ -50,6 +50,7 @@ UNLISTED: Final = {  # limits that moderngl does not list
 NO_ERROR, OUT_OF_MEMORY = "GL_NO_ERROR", "GL_OUT_OF_MEMORY"  # as moderngl names them
 
 OBJECT_KINDS = ("Buffer", "Texture", "Sampler", "Program", "Shader", "Framebuffer", "VertexArray", "Query")
+COPY_WRITE_BUFFER, R32UI, RED_INTEGER, UNSIGNED_INT = 0x8F37, 0x8236, 0x8D94, 0x1405  # OpenGL's numbers
 HIGHEST_NAME = 8192  # drivers name objects from 1 on and use freed names again; some hundreds live at a time
 
 
@@ -203,6 +204,32 @@ class GpuContext:
                 f"A buffer of {size / 1e6:.0f} MB is needed, and shaders of this GPU reach {limit / 1e6:.0f} MB "
                 f"of one: lower {lower}."
             )
+
+    def clear_buffer(self, buffer: moderngl.Buffer, size: int | None = None) -> None:
+        """Sets the first `size` bytes of a buffer to zero (a multiple of 4; default: all), on the GPU.
+
+        `Buffer.clear` maps the buffer, so it waits for the GPU; `Buffer.write` lets drivers move the buffer to where
+        the CPU writes faster.
+        """
+        bind, clear = self._clearing
+        bind(COPY_WRITE_BUFFER, buffer.glo)
+        clear(
+            COPY_WRITE_BUFFER,
+            R32UI,
+            0,
+            buffer.size if size is None else size,
+            RED_INTEGER,
+            UNSIGNED_INT,
+            None,
+        )
+
+    @cached_property
+    def _clearing(self) -> tuple[Callable[..., None], Callable[..., None]]:
+        """glBindBuffer and glClearBufferSubData, which moderngl lacks."""
+        load, number, size = self.ctx.mglo._context.load, ctypes.c_uint, ctypes.c_ssize_t
+        bind = ctypes.CFUNCTYPE(None, number, number)
+        clear = ctypes.CFUNCTYPE(None, number, number, size, size, number, number, ctypes.c_void_p)
+        return bind(load("glBindBuffer")), clear(load("glClearBufferSubData"))
 
     @cached_property
     def spare_queries(self) -> list[moderngl.Query]:

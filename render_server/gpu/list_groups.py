@@ -3,7 +3,10 @@
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import WORD_BYTES, common_kernel
+from deltalight.render_server.gpu.kernel import common_kernel
+
+LIST_HEADER_BYTES = 4  # of shaders/common/work_list.glsl: the number of items
+GROUPS_BYTES = 12
 
 
 class ListGroups:
@@ -11,7 +14,7 @@ class ListGroups:
 
     def __init__(self, gpu: GpuContext, per_group: int) -> None:
         self._per_group = per_group
-        self._groups = gpu.ctx.buffer(reserve=3 * WORD_BYTES)
+        self._groups = gpu.ctx.buffer(reserve=GROUPS_BYTES)
         self._kernel = common_kernel(gpu, "count_groups")
 
     def count(self, texels: moderngl.Buffer) -> moderngl.Buffer:

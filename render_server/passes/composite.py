@@ -9,10 +9,11 @@ from jaxtyping import UInt8
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.coverage import SURFACE_REACH
-from deltalight.render_server.passes.gbuffer import CameraImage, rgba_bytes
+from deltalight.render_server.passes.gbuffer import CameraImage, rgba
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
 from deltalight.render_server.passes.shading import DirectLight
@@ -29,6 +30,7 @@ class ChangeRatio:
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._gpu = gpu
         self.ratio = texture_2d(gpu, size, 4, "f2")
         self.texels = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
         self._ratio = Kernel(gpu, "change_ratio", RATIO=1)
@@ -57,7 +59,7 @@ class ChangeRatio:
             change_ratio_out=self.ratio,
             Texels=None,
         )
-        self.texels.write(bytes(4))
+        self._gpu.clear_buffer(self.texels, LIST_HEADER_BYTES)
         self._near.run(grid.size, sample_pixels=grid.pixels, change_ratio=self.ratio, Texels=self.texels)
 
     def release(self) -> None:
@@ -114,7 +116,7 @@ class Composite:
         `additive`, `relights_real`, `filmic`, `store_linear` (fills `linear`) and `whole` (composes every pixel, not
         only those near a change).
         """
-        self.code.write(image.bytes, alignment=1)
+        self.code.write(image.codes, alignment=1)
         cones, direct = layers.cones, layers.direct
         self._kernel.run(
             (self._threads,),
@@ -149,7 +151,7 @@ class Composite:
 
         Without options of `run`, and without smooth surfaces: what these show depends on more than the ratio.
         """
-        self.code.write(image.bytes, alignment=1)
+        self.code.write(image.codes, alignment=1)
         self._again.run(
             (self._threads,),
             scene,
@@ -187,7 +189,7 @@ class Enlarge:
         coverage: moderngl.Texture,
     ) -> None:
         """Enlarges the composite `small` of `image`; `color` is the camera's picture at this size."""
-        self._picture.write(rgba_bytes(color), alignment=1)
+        self._picture.write(rgba(color), alignment=1)
         self._kernel.run(
             self.size,
             picture=self._picture,

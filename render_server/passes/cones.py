@@ -7,7 +7,8 @@ import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES
+from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.passes.voxels import VoxelMipmap
 
 
@@ -19,6 +20,7 @@ class LowResGrid:
     """
 
     def __init__(self, gpu: GpuContext, picture_size: tuple[int, int], scale: int) -> None:
+        self._gpu = gpu
         self.picture_size, self.scale = picture_size, scale
         self.size = (-(-picture_size[0] // scale), -(-picture_size[1] // scale))
         self.pixels = texture_2d(gpu, self.size, 4, "i2")
@@ -41,12 +43,12 @@ class LowResGrid:
         needed = 4 * (1 + self.texel_count)
         if texels.size < needed:
             texels.orphan(needed)
-        texels.write(bytes(4))
+        self._gpu.clear_buffer(texels, LIST_HEADER_BYTES)
 
     def run(self, scene: Bindings) -> None:
         """Selects the pixels."""
         self.empty_list(self.virtual_texels)
-        self.shown_pixels.write(bytes(4))
+        self._gpu.clear_buffer(self.shown_pixels, LIST_HEADER_BYTES)
         self._kernel.run(
             self.size,
             scene,
@@ -155,6 +157,7 @@ class TraceCones:
     ) -> None:
         self._gpu = gpu
         self._mu, self._rho, self._irradiance = (texture_2d(gpu, size, 4, "f2") for _ in range(3))
+        self._target = gpu.ctx.framebuffer([self._irradiance])
         self._filter = BilateralConeFilter(gpu, reuses=reuses)
         self._real = Kernel(gpu, "trace_cones", REAL=1, **defines)
         self._virtual = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
@@ -190,7 +193,8 @@ class TraceCones:
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
         """Traces E_rho and the specular cone of virtual surfaces."""
-        self._irradiance.write(bytes(8 * grid.texel_count))
+        self._target.use()
+        self._target.clear()
         listed: Bindings = {**grid.bindings, "Texels": grid.virtual_texels}
         if self._reuse is not None:
             self._reuse.run(grid.size, listed, scene, irradiance=self._irradiance)
@@ -211,6 +215,7 @@ class TraceCones:
 
     def release(self) -> None:
         """Frees the GL objects."""
+        release_target(self._target)
         release_all(self._mu, self._rho, self._irradiance, self._filter, self._texels)
         release_all(self._real, self._virtual, self._reuse, self._select)
 

@@ -4,6 +4,7 @@ import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
 from deltalight.render_server.view import CameraView, Rectangle
@@ -105,8 +106,9 @@ class ObjectCoverage:
     """Fraction of each pixel that shows an object (R16F); a work list of the pixels at `edges` of real things."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._size = size
+        self._gpu = gpu
         self.texture = texture_2d(gpu, size, 1, "f2")
+        self._target = gpu.ctx.framebuffer([self.texture])
         self.edges = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
         self._kernel = Kernel(gpu, "object_coverage")
 
@@ -117,8 +119,9 @@ class ObjectCoverage:
 
         `sample_coverage` is the texture of `SampleCoverage`; None: the geometry buffer has one sample per pixel.
         """
-        self.texture.write(bytes(2 * self._size[0] * self._size[1]), alignment=1)
-        self.edges.write(bytes(4))
+        self._target.use()
+        self._target.clear()
+        self._gpu.clear_buffer(self.edges, LIST_HEADER_BYTES)
         x, y, width, height = rectangle
         if width <= 0 or height <= 0:
             return
@@ -134,6 +137,7 @@ class ObjectCoverage:
 
     def release(self) -> None:
         """Frees the GL objects."""
+        release_target(self._target)
         release_all(self.texture, self.edges, self._kernel)
 
 

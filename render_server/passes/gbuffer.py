@@ -52,7 +52,7 @@ class CameraImage:
         self.inverse_response = texture_2d(gpu, (INVERSE_SIZE, 1), 4, "f4")
         self.rays = texture_2d(gpu, size, 2, "f4")
         self.exposure_scale = 1.0
-        self.bytes = b""
+        self.codes = gpu.ctx.buffer(reserve=4 * size[0] * size[1], dynamic=True)  # as textures take them
         self.is_linear = False  # whether `linear` shows the picture that was uploaded last
         self._linearize = Kernel(gpu, "linearize")
         self._rays_of: object = None
@@ -65,8 +65,9 @@ class CameraImage:
 
     def upload(self, frame: ViewFrame) -> None:
         """Uploads a frame's picture; `linear` shows the one before until `linearize`."""
-        self.bytes, self.is_linear = rgba_bytes(frame.color), False
-        self.code.write(self.bytes, alignment=1)
+        self.is_linear = False
+        self.codes.write(rgba(frame.color))
+        self.code.write(self.codes, alignment=1)
         self._write_response(decode_lut(frame.response), frame.exposure_scale)
         if self._rays_of != frame.camera:
             self.rays.write(np.ascontiguousarray(frame.camera.rays(), np.float32).tobytes(), alignment=1)
@@ -104,13 +105,19 @@ class CameraImage:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(
-            self.code, self.linear, self.code_radiance, self.inverse_response, self.rays, self._linearize
+            self.code,
+            self.codes,
+            self.linear,
+            self.code_radiance,
+            self.inverse_response,
+            self.rays,
+            self._linearize,
         )
 
 
-def rgba_bytes(color: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Returns a picture as the bytes of an opaque RGBA texture."""
-    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2RGBA)).tobytes()
+def rgba(color: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 4"]:
+    """Returns a picture as the texels of an opaque RGBA texture."""
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2RGBA))
 
 
 def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:

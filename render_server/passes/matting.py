@@ -4,6 +4,7 @@ import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing, ObjectCoverage
 from deltalight.render_server.view import Rectangle
@@ -20,7 +21,7 @@ class Matting:
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._threads = list_threads(gpu)
+        self._gpu, self._threads = gpu, list_threads(gpu)
         blocks = -(-size[0] // BLOCK), -(-size[1] // BLOCK)
         self._size = size
         self._nearest, self._within_reach = (texture_2d(gpu, blocks, 4, "f4") for _ in range(2))
@@ -43,7 +44,7 @@ class Matting:
 
         `reach_px` is rounded up to whole blocks; the other arguments are those of `ObjectCoverage.run`.
         """
-        self._band.write(bytes(4))
+        self._gpu.clear_buffer(self._band, LIST_HEADER_BYTES)
         if rectangle[2] <= 0 or rectangle[3] <= 0:
             return
         own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}

@@ -7,7 +7,7 @@ import moderngl
 from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
-from deltalight.render_server.gpu.list_groups import ListGroups
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGroups
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -46,7 +46,7 @@ class MirrorRays:
         *,
         of_objects: bool = False,
     ) -> None:
-        self._grid, self._objects = grid, objects
+        self._gpu, self._grid, self._objects = gpu, grid, objects
         if of_objects:
             defines = {**defines, "OF_OBJECTS": 1}
         self.reflection = texture_2d(gpu, grid.picture_size, 4, "f2")
@@ -84,7 +84,7 @@ class MirrorRays:
 
     def _list_pixels(self, scene: Bindings) -> None:
         """Lists the pixels that need rays; the others reflect nothing."""
-        _clear_list(self._pixels)
+        self._gpu.clear_buffer(self._pixels, LIST_HEADER_BYTES)
         self._select.run(
             self._grid.picture_size,
             scene,
@@ -101,7 +101,7 @@ class MirrorRays:
     def _gather_light(self, light: Bindings, scene: Bindings) -> None:
         """Computes the light at reflected points, at the resolution of the cones."""
         grid = self._grid
-        _clear_list(self._texels)
+        self._gpu.clear_buffer(self._texels, LIST_HEADER_BYTES)
         self._hits.run(
             grid.size,
             self._objects.bindings,
@@ -143,7 +143,7 @@ class MirrorRays:
     def release(self) -> None:
         """Frees the GL objects."""
         for item in vars(self).values():
-            if hasattr(item, "release") and item not in (self._grid, self._objects):
+            if hasattr(item, "release") and item not in (self._gpu, self._grid, self._objects):
                 item.release()
 
 
@@ -162,7 +162,7 @@ class ScreenCones:
         march: Mapping[str, float | str] | None,
         tier: QualityTier,
     ) -> None:
-        self._grid = grid
+        self._gpu, self._grid = gpu, grid
         self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
         self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
         voxels = {} if march is None else {"VOXELS": 1, **march}
@@ -198,7 +198,7 @@ class ScreenCones:
         `object_rays`: what rays saw of the objects (`MirrorRays.reflection`), so that cones leave them out.
         """
         if self._list_quads is not None:
-            self._pixels.write(bytes(4))
+            self._gpu.clear_buffer(self._pixels, LIST_HEADER_BYTES)
             texels: Bindings = {"Texels": self._grid.virtual_texels, "scale": self._grid.scale}
             self._list_quads.run((self._threads,), texels, scene, ShownPixels=self._pixels)
         rays: Bindings = {"OBJECT_RAYS": object_rays is not None, "object_rays": object_rays}
@@ -277,8 +277,3 @@ class TransmittedLight:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.radiance, self._kernel)
-
-
-def _clear_list(texels: moderngl.Buffer) -> None:
-    """Clears a list of shaders/common/work_list.glsl."""
-    texels.write(bytes(4))
