@@ -95,7 +95,8 @@ class _Counter:
         self.counts.buffer_clear_bytes += buffer.size - offset if size < 0 else size
 
     def _upload(self, _: object, data: Any, *__: object, **___: object) -> None:  # noqa: ANN401 (any buffer)
-        self.counts.uploaded_bytes += memoryview(data).nbytes
+        if not isinstance(data, moderngl.Buffer):  # what the GPU has is copied there
+            self.counts.uploaded_bytes += memoryview(data).nbytes
 
     def _make_buffer(self, _: object, data: Any = None, **__: object) -> None:  # noqa: ANN401 (any buffer)
         if data is not None:
