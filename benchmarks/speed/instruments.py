@@ -8,6 +8,7 @@ from typing import Any
 
 import moderngl
 
+from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import AsyncReadback, DelayedRead, sizes_bytes
 
 Wrap = Callable[[Any], Any]
@@ -129,7 +130,7 @@ DRAWS = ((moderngl.VertexArray, "render"), (moderngl.VertexArray, "render_indire
 BYTE_READS = tuple((owner, "read") for owner in (moderngl.Buffer, *TEXTURES))
 READS_INTO = tuple((owner, "read_into") for owner in (moderngl.Buffer, *TEXTURES))
 READS = (*BYTE_READS, *READS_INTO, (moderngl.Framebuffer, "read"))
-CLEARS = ((moderngl.Framebuffer, "clear"), (moderngl.Buffer, "clear"))
+CLEARS = ((moderngl.Framebuffer, "clear"), (moderngl.Buffer, "clear"), (GpuContext, "clear_buffer"))
 MIPMAPS = tuple((owner, "build_mipmaps") for owner in TEXTURES)
 
 
