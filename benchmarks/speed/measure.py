@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 
 from rich.progress import Progress
 
@@ -32,6 +33,7 @@ from deltalight.services.offline import with_output
 Keep = Callable[[SpeedReport], None]
 
 WARM_UP_FRAMES = 3  # drivers compile and specialise shaders in the first frames
+GPU_WARM_UP_S = 1.0  # a GPU that was idle runs at a fraction of its clock for about so long
 
 
 @dataclass(frozen=True)
@@ -139,14 +141,15 @@ class _Shown:
     def __init__(self, progress: Progress, job: SpeedJob) -> None:
         self._progress, self._frames = progress, job.frames
         self._motions, self._done = len(job.methods) * len(job.motions), 0
-        self._task = progress.add_task("", total=self._motions * (WARM_UP_FRAMES + job.frames))
+        self._task = progress.add_task("", total=self._motions * job.frames)
 
     def frame(self, name: str, motion: str, number: int) -> None:
-        """Another frame begins, counted from 0."""
-        measured = number - WARM_UP_FRAMES + 1
-        which = "warming up" if measured < 1 else f"frame {measured} of {self._frames}"
+        """Another frame begins, counted from 1; 0: one of those before."""
+        which = f"frame {number} of {self._frames}" if number else "warming up"
         place = f"motion {self._done + 1} of {self._motions}"
-        self._progress.update(self._task, description=f"{name}: {motion} ({place}), {which}", advance=1)
+        self._progress.update(
+            self._task, description=f"{name}: {motion} ({place}), {which}", advance=number > 0
+        )
 
     def motion(self, name: str, motion: str, found: MotionFigures) -> None:
         """A motion is done."""
@@ -184,12 +187,22 @@ class _Run:
         self.keep(self.report)
 
     def _motion(self, name: str, motion: str, scene: SceneDocument, renderer: SceneRenderer) -> MotionFigures:
+        steps = steps_of(motion, self.take, scene)
+        self.shown.frame(name, motion, 0)
+        self._warm_up(renderer, steps)
         times: list[FrameTimes] = []
-        for number, step in enumerate(steps_of(motion, self.take, scene, WARM_UP_FRAMES + self.job.frames)):
+        for number, step in enumerate(islice(steps, self.job.frames), start=1):
             self.shown.frame(name, motion, number)
             times.append(time_step(renderer, step))
         moved = {} if renderer.graph is None else stage_bytes(renderer.graph)
-        return motion_figures(times[WARM_UP_FRAMES:], moved, self.report.peaks, self.report.budget_ms)
+        return motion_figures(times, moved, self.report.peaks, self.report.budget_ms)
+
+    def _warm_up(self, renderer: SceneRenderer, steps: Iterator[Step]) -> None:
+        until_s = time.monotonic() + (0.0 if self.gpu.is_software else GPU_WARM_UP_S)
+        for number, step in enumerate(steps, start=1):
+            time_step(renderer, step)
+            if number >= WARM_UP_FRAMES and time.monotonic() >= until_s:
+                return
 
 
 def time_step(renderer: SceneRenderer, step: Step) -> FrameTimes:

@@ -88,8 +88,8 @@ def parse_motions(text: str) -> list[str]:
     return names
 
 
-def steps_of(motion: str, take: Take, scene: SceneDocument, frames: int) -> Iterator[Step]:
-    """Return that many frames of a motion; each is a new object with a capture time of its own."""
+def steps_of(motion: str, take: Take, scene: SceneDocument, frames: int | None = None) -> Iterator[Step]:
+    """Yield that many frames of a motion, None: without end; each is a new object with a capture time of its own."""
     for number, step in enumerate(islice(MOTIONS[motion](take, scene), frames)):
         frame = replace(step.frame, frame_id=number, timestamp_ns=(number + 1) * FRAME_NS)
         yield Step(frame, step.scene)
