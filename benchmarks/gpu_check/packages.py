@@ -28,6 +28,7 @@ PACKAGES = {
     "google": "protobuf",
     "moderngl": "moderngl",
     "trimesh": "trimesh",
+    "sqlalchemy": "sqlalchemy",  # of services/storage, which the demo needs
     "scipy": "scipy",
     "PIL": "pillow",
     "OpenEXR": "OpenEXR",
