@@ -1,5 +1,6 @@
 """Triangle mesh of one depth image, and back faces for it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,8 +28,6 @@ from deltalight.render_server.view import LENSES_KEPT
 
 CELL_SAMPLES = 6
 BOUND_POINTS = 4000  # for fitting light views
-OUTLIER_SHARE = 1 / 9  # of a cell's known samples, at either end of their range
-KNOWN_SHARE = 1 / 4  # of a cell's samples: where fewer are known, outliers would not stand out
 # Pixels of two neighbouring nodes are at most this many cells apart: two in each direction.
 MAX_CELL_DISTANCE = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
@@ -88,69 +87,45 @@ def depth_mesh(
 def bound_points(
     depth: DepthImage, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Returns at most BOUND_POINTS that enclose what a depth image shows (world, m), without its outliers; quickly.
+    """Returns at most BOUND_POINTS points of what a depth image shows (world, m), without its outliers; quickly.
 
-    Eight for each cell of the picture: its corners at the nearest and farthest depths of samples in it and beside it,
-    of which the outermost do not count.
+    They lie on a grid of pixels that begins and ends at the picture's border.
     """
-    cell = 1
-    while 8 * (-(-camera.width // cell)) * (-(-camera.height // cell)) > BOUND_POINTS:
-        cell += 1
-    least, most = _sampled_range(depth, cell)
-    beside = np.ones((3, 3), np.uint8)
-    nearest, farthest = cv2.dilate(most, beside).ravel(), -cv2.dilate(-least, beside).ravel()
-    known = np.flatnonzero(nearest > 0)
-    corners = _cell_corners(camera, cell)[:, known]
-    local = np.stack([corners / inverse[known, None] for inverse in (nearest, farthest)])
-    return np.asarray(local.reshape(-1, 3) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
-
-
-def _sampled_range(
-    depth: DepthImage, cell: int
-) -> tuple[Float64[np.ndarray, "a b"], Float64[np.ndarray, "a b"]]:
-    """Returns nearly the least and greatest inverse depth of samples of each cell; infinite and 0 without enough.
-
-    The last cells of rows and columns reach back into those before them, rather than over the border.
-    """
-    height, width = depth.depth_m.shape
-    shape = -(-height // cell), -(-width // cell)
-    steps = np.unique(np.linspace(0, cell - 1, min(cell, CELL_SAMPLES)).round().astype(int))
-    rows, columns = (
-        (np.clip(np.arange(count)[:, None] * cell, 0, max(length - cell, 0)) + steps).ravel()
-        for count, length in zip(shape, (height, width), strict=True)
-    )
+    rows, columns, rays = _bound_grid(camera)
     chosen = np.ix_(rows, columns)
     metres = np.where(depth.valid[chosen], depth.depth_m[chosen], 0).astype(np.float64)
-    inverse = np.divide(1, metres, out=np.zeros_like(metres), where=metres > 0)
-    across = len(steps)
-    ordered = inverse.reshape(shape[0], across, shape[1], across).transpose(0, 2, 1, 3).reshape(*shape, -1)
-    ordered.sort(axis=2)
-    count = np.count_nonzero(ordered, axis=2)
-    left_out = (count * OUTLIER_SHARE).astype(int)
-    last = ordered.shape[2] - 1
-    least, most = (
-        np.take_along_axis(ordered, np.minimum(place, last)[..., None], axis=2)[..., 0]
-        for place in (last + 1 - count + left_out, last - left_out)
-    )
-    trimmed = (most - least) * (OUTLIER_SHARE / (1 - 2 * OUTLIER_SHARE))  # of a surface without outliers
-    is_known = count >= max(KNOWN_SHARE * (last + 1), 1)
-    return (
-        np.where(is_known, np.maximum(least - trimmed, least / 2), np.inf),
-        np.where(is_known, most + trimmed, 0),
+    known = _are_among_neighbours(np.divide(1, metres, out=np.zeros_like(metres), where=metres > 0))
+    local = rays[known] * metres[known][:, None]
+    return np.asarray(local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
+
+
+def _are_among_neighbours(inverse_depth: Float64[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
+    """Returns which points (0: unknown) lie in the range of medians around them, or beyond it by no more than it.
+
+    An end of a slanted plane is a step of it beyond; an outlier in front of a surface is far beyond.
+    """
+    median = cv2.medianBlur(inverse_depth.astype(np.float32), 3)
+    beside = np.ones((3, 3), np.uint8)
+    most = cv2.dilate(median, beside)
+    least = -cv2.dilate(np.where(median > 0, -median, -np.inf), beside)
+    spread = np.where(most > 0, most - least, 0)
+    return np.asarray(
+        (inverse_depth > 0) & (inverse_depth >= least - spread) & (inverse_depth <= most + spread)
     )
 
 
 @lru_cache(maxsize=LENSES_KEPT)
-def _cell_corners(camera: CameraModel, cell: int) -> Float64[np.ndarray, "4 n 3"]:
-    """Returns points at a depth of 1 on the rays through the corners of cells of the picture."""
-    columns, rows = (
-        np.minimum(np.arange(0, length + cell, cell)[: -(-length // cell) + 1], length) - 0.5
-        for length in (camera.width, camera.height)
+def _bound_grid(
+    camera: CameraModel,
+) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"], Float64[np.ndarray, "a b 3"]]:
+    """Returns rows and columns of a grid of at most BOUND_POINTS pixels, and points at a depth of 1 on their rays."""
+    share = min(1.0, math.sqrt(BOUND_POINTS / (camera.width * camera.height)))
+    rows, columns = (
+        np.linspace(0, length - 1, max(1, int(share * length))).round().astype(np.int64)
+        for length in (camera.height, camera.width)
     )
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
-    rays = camera.unproject(pixels.reshape(-1, 2)).reshape(pixels.shape)
-    points = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
-    return np.stack([points[corner].reshape(-1, 3) for corner in QUAD_CORNERS])
+    rays = camera.rays()[np.ix_(rows, columns)]
+    return rows, columns, np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
 
 
 def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
