@@ -44,6 +44,23 @@ def test_motion_of_the_camera_counts_from_half_a_pixel_on(
     assert tracker.update(FrameSamples(frame(1, shift_m, turn_rad))) is expected
 
 
+def test_a_turned_camera_asks_for_no_colour() -> None:
+    tracker, samples = MotionDetector(), [FrameSamples(frame(0)), FrameSamples(frame(1, turn_rad=0.01))]
+    assert all(tracker.update(each) for each in samples)
+    assert not any("color" in vars(each) for each in samples)
+
+
+def test_the_nearest_things_move_the_picture_most() -> None:
+    """The wall moves by 0.3 pixels, the tenth of it that is five times nearer by 1.5."""
+    still, moved = frame(0), frame(1, shift_m=0.002)
+    for each in (still, moved):
+        assert each.depth is not None
+        each.depth.depth_m[:12] = 0.2
+    tracker = MotionDetector()
+    tracker.update(FrameSamples(still))
+    assert tracker.update(FrameSamples(moved))
+
+
 def test_slow_drift_adds_up() -> None:
     tracker = MotionDetector()
     answers = [tracker.update(FrameSamples(frame(step, shift_m=0.001 * step))) for step in range(9)]
