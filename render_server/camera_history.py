@@ -1,13 +1,16 @@
 """What one camera saw of the real scene: when something last moved, and when the scene was built from it."""
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
 from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.frame import Measurement, Scan
+from deltalight.render_server.gpu.kernel import Binding
 from deltalight.render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
 from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
+from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.view import PosedFrame
 
 # A voxel's surface cuts the corner where two surfaces meet at a right angle, by up to sqrt(2) / 4 of its edge.
@@ -20,19 +23,21 @@ SETTLING_NS = 1_500_000_000
 SAMPLE_STEP = 61
 MEDIAN_SHARES = (0.45, 0.55)
 
+FittedOnGpu = Callable[[DepthImage], dict[str, Binding] | None]
+
 
 class CameraHistory:
     """Frames of one camera, as far as the real scene depends on them.
 
     With `keeps_world`, the real scene is built only when it no longer explains what the camera sees (KeptWorld), and
     once more from the frame in which everything comes to rest. `has_depth`: it is built from depth, not given as a
-    model.
+    model. `on_gpu` returns what the GPU has fitted to a depth image already (DepthFit); None if it has not.
     """
 
-    def __init__(self, *, keeps_world: bool, has_depth: bool) -> None:
+    def __init__(self, *, keeps_world: bool, has_depth: bool, on_gpu: FittedOnGpu | None = None) -> None:
         self._motion = MotionDetector()
         self._kept = KeptWorld() if keeps_world else None
-        self._has_depth = has_depth
+        self._has_depth, self._on_gpu = has_depth, on_gpu
         self._newest: FrameSamples | None = None
         self._last: FrameSamples | None = None  # in which anything moved
         self._seen: PosedFrame | None = None
@@ -45,7 +50,7 @@ class CameraHistory:
 
     def update(self, taken: PosedFrame, *, is_unknown: bool) -> bool:
         """Takes a frame; returns whether anything moved in it. `is_unknown`: there is no real scene yet."""
-        self._newest = samples = FrameSamples.of(taken.frame)
+        self._newest = samples = FrameSamples(taken.frame)
         # Depth without a surface (a camera that starts) explains nothing: the next frame counts as another scene.
         self.moved = self._motion.update(samples) or is_unknown
         if self.moved:
@@ -122,13 +127,16 @@ class CameraHistory:
         """
         depth, fitted = taken.frame.depth if self._has_depth else None, partial(self.surface_of, taken)
         if depth is None:
-            return Scan(None, fitted, 0.0, 1.0, None)
-        typical_depth = _median_depth(depth)
-        rounded_m = ROUNDED_VOXELS * (self.voxel_m or 0.0)
-        sigma = max(noise_sigma(depth), rounded_m / (3 * typical_depth**2))
-        # The fused surface agrees with depth up to half a voxel, and three standard deviations of the depth's noise.
-        tolerance = None if self.voxel_m is None else (0.5 * self.voxel_m, 3 * sigma)
-        return Scan(depth, fitted, sigma, typical_depth, tolerance)
+            return Scan(None, fitted, lambda: None, 0.0, lambda: 1.0, None)
+        median, sigma, tolerance = begun(partial(_median_depth, depth)).result, noise_sigma(depth), None
+        if self.voxel_m is not None:
+            sigma = max(sigma, ROUNDED_VOXELS * self.voxel_m / (3 * median() ** 2))
+            # The fused surface agrees with depth up to half a voxel, and three standard deviations of its noise.
+            tolerance = 0.5 * self.voxel_m, 3 * sigma
+        return Scan(depth, fitted, partial(self._found_on_gpu, depth), sigma, median, tolerance)
+
+    def _found_on_gpu(self, depth: DepthImage) -> dict[str, Binding] | None:
+        return None if self._on_gpu is None else self._on_gpu(depth)
 
     def surface_of(self, taken: PosedFrame) -> DepthSurface:
         """Returns the surface fitted to a frame's depth."""

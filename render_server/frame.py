@@ -37,16 +37,23 @@ BIAS_SIGMAS = 3.0  # of depth noise: keeps real surfaces from shadowing themselv
 class Scan:
     """The camera's measurement of the real scene, taken when something last moved.
 
-    `depth` is None if the scene gives a model; `fitted` fits a surface to it, once. `noise_sigma` is the depth noise
-    at 1 m (m, grows with z^2), `typical_depth` the median depth (m). `tolerance` bounds the difference at which the
-    fused surface still agrees with the depth (m, and m at 1 m); None if nothing is fused.
+    `depth` is None if the scene gives a model; `fitted` fits a surface to it, once; `on_gpu` returns what DepthFit
+    found in it, None if it holds another. `noise_sigma` is the depth noise at 1 m (m, grows with z^2); `median_depth`
+    waits for the median depth (m), which another thread finds. `tolerance` bounds the difference at which the fused
+    surface still agrees with the depth (m, and m at 1 m); None if nothing is fused.
     """
 
     depth: DepthImage | None
     fitted: Callable[[], DepthSurface]
+    on_gpu: Callable[[], dict[str, Binding] | None]
     noise_sigma: float
-    typical_depth: float
+    median_depth: Callable[[], float]
     tolerance: tuple[float, float] | None
+
+    @property
+    def typical_depth(self) -> float:
+        """The median depth, m."""
+        return self.median_depth()
 
     @property
     def bias_m(self) -> float:
@@ -148,7 +155,7 @@ class ObservationBuffers:
             ),
         }
         if scan.depth is not None:
-            self.real_surface.from_depth(scan.depth, scan.fitted, raster_scene)
+            self.real_surface.from_depth(scan.depth, scan.fitted, raster_scene, on_gpu=scan.on_gpu())
         if scan.depth is None or scan.tolerance is not None:
             if self._model_raster is None:
                 self._model_raster = GeometryBuffer(self._gpu, view.raster[1])

@@ -112,7 +112,8 @@ class RealGeometry:
         return self._rebuild([camera.renew(each) for camera, each in pairs])
 
     def _new_camera(self) -> CameraHistory:
-        return CameraHistory(keeps_world=self._keeps_world, has_depth=not self.is_model)
+        on_gpu = None if self._mesher is None else self._mesher.fitted
+        return CameraHistory(keeps_world=self._keeps_world, has_depth=not self.is_model, on_gpu=on_gpu)
 
     def _rebuild(self, taken: Sequence[PosedFrame]) -> bool:
         """Builds the real scene from the frames in which anything last moved; returns whether it changed."""
@@ -199,12 +200,13 @@ class RealGeometry:
         """Lets the GPU mesh a depth image; the CPU makes the same triangles only when asked for them."""
         depth, view = seen.frame.depth, seen.view
         assert depth is not None
-        grazing = begun(partial(_grazing_depth, seen))  # while points are sampled
-        points = bound_points(depth, view.camera, view.world_from_camera)
+        grazing = begun(partial(_grazing_depth, seen))  # while depth is uploaded
+        bounds = begun(partial(bound_points, depth, view.camera, view.world_from_camera))
+        mesher.take(depth, view.camera, grazing.result)
+        points = bounds.result()
         if not len(points):
             self.state = None
             return
-        mesher.take(depth, view.camera, grazing.result())
         empty = merge_for_gpu([EMPTY_MESH])
 
         def drawn(buffers: MeshBuffers, budget: int) -> DrawnMesh:

@@ -213,7 +213,7 @@ def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
     if depth is not None:
         depth = DepthImage(
             cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_NEAREST),
-            cv2.resize(depth.valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool),
+            cv2.resize(depth.valid.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).view(bool),
             camera,
             depth.noise_sigma_m,
         )

@@ -1,8 +1,8 @@
-"""Planes fitted to a depth image, and its triangles: on the GPU what render_server/scene does in numpy."""
+"""Triangles of a depth image: on the GPU what render_server/scene/depth_mesh.py does in numpy."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64
 
@@ -12,56 +12,11 @@ from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.depth_fit import DepthFit
 from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.scene.depth_mesh import node_rays, stride_for_budget
-from deltalight.render_server.scene.depth_surface import jump_terms, window_radius
+from deltalight.render_server.scene.depth_surface import jump_terms
 from deltalight.render_server.scene.triangle_mesh import GpuMesh
-
-
-def upload_depth(texture: moderngl.Texture, depth: DepthImage) -> None:
-    """Fills a texture (R32F) with a depth image, m; 0 where it is unknown."""
-    known = np.where(depth.valid, depth.depth_m, np.float32(0))
-    texture.write(known.astype(np.float32, copy=False), alignment=1)
-
-
-class DepthFit:
-    """Fits a plane to the surroundings of every pixel, as scene/depth_surface.py does."""
-
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._size = size
-        self._inverse = texture_2d(gpu, size, 1, "f4")
-        self._row_moments = texture_2d(gpu, size, 4, "f4")
-        self._row_depth = texture_2d(gpu, size, 2, "f4")
-        self._fits = texture_2d(gpu, size, 4, "f4")
-        self._invert = Kernel(gpu, "depth_inverse")
-        self._sum_rows = Kernel(gpu, "depth_rows")
-        self._fit = Kernel(gpu, "depth_columns")
-
-    def run(self, depth_map: moderngl.Texture, depth: DepthImage, camera: CameraModel) -> dict[str, Binding]:
-        """Fits `depth_map` (R32F, m, 0 unknown; the pixels of `depth`); returns what fitted_normal.glsl reads."""
-        found: dict[str, Binding] = {
-            "inverse_depth": self._inverse,
-            "window_radius": window_radius(depth, camera),
-            "window_fits": self._fits,
-        }
-        jumps = {"jump_threshold": jump_terms(depth, camera)}
-        self._invert.run(self._size, jumps, depth_map=depth_map, inverse_out=self._inverse)
-        self._sum_rows.run(
-            self._size, found, jumps, row_moments_out=self._row_moments, row_depth_out=self._row_depth
-        )
-        self._fit.run(
-            self._size,
-            found,
-            row_moments=self._row_moments,
-            row_depth=self._row_depth,
-            window_fits_out=self._fits,
-        )
-        return found
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(self._inverse, self._row_moments, self._row_depth, self._fits)
-        release_all(self._invert, self._sum_rows, self._fit)
 
 
 class _PixelGrid:
@@ -70,25 +25,25 @@ class _PixelGrid:
     def __init__(self, gpu: GpuContext, camera: CameraModel) -> None:
         size = camera.width, camera.height
         self.camera = camera
-        self._depth, self._grazing = texture_2d(gpu, size, 1, "f4"), texture_2d(gpu, size, 1, "f4")
+        self._grazing = texture_2d(gpu, size, 1, "f4")
         self._rays = texture_2d(gpu, size, 2, "f4", data=camera.rays().astype(np.float32).tobytes())
         self._fit = DepthFit(gpu, size)
 
-    def take(self, depth: DepthImage, grazing: Float32[np.ndarray, "h w"]) -> dict[str, Binding]:
-        """Returns what depth_nodes reads of each pixel."""
-        upload_depth(self._depth, depth)
-        has_grazing = bool(grazing.any())
+    def take(self, depth: DepthImage, grazing: Callable[[], Float32[np.ndarray, "h w"]]) -> "_Taken":
+        fitted, oblique = self._fit.take(depth, self.camera), grazing()
+        has_grazing = bool(oblique.any())
         if has_grazing:
-            self._grazing.write(grazing, alignment=1)
-        return {
-            **self._fit.run(self._depth, depth, self.camera),
+            self._grazing.write(oblique, alignment=1)
+        read: dict[str, Binding] = {
+            **fitted,
             "picture_rays": self._rays,
             "grazing_depth": self._grazing,
             "GRAZING": has_grazing,
         }
+        return _Taken(depth, fitted, read, jump_terms(depth, self.camera))
 
     def release(self) -> None:
-        release_all(self._depth, self._grazing, self._rays, self._fit)
+        release_all(self._grazing, self._rays, self._fit)
 
 
 class _NodeGrid:
@@ -109,8 +64,10 @@ class _NodeGrid:
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """A depth image that was taken: what kernels read of its pixels, and its jump threshold by pixel."""
+    """A depth image that was taken: what is fitted to it, what depth_nodes reads, its jump threshold by pixel."""
 
+    depth: DepthImage
+    fitted: dict[str, Binding]
     bindings: dict[str, Binding]
     jump_terms: tuple[float, float]
 
@@ -128,8 +85,12 @@ class DepthMesher:
         self._grids: dict[int, _NodeGrid] = {}
         self._taken: _Taken | None = None
 
-    def take(self, depth: DepthImage, camera: CameraModel, grazing: Float32[np.ndarray, "h w"]) -> None:
+    def take(
+        self, depth: DepthImage, camera: CameraModel, grazing: Callable[[], Float32[np.ndarray, "h w"]]
+    ) -> None:
         """Takes a clean depth image, registered to `camera`, and the inverse depth of its grazing surfaces.
+
+        `grazing` is asked for that once the GPU is at work.
 
         Raises:
             DeltalightError: depth and camera differ in size.
@@ -139,7 +100,14 @@ class DepthMesher:
         if self._pixels is None or self._pixels.camera != camera:
             self._forget_camera()
             self._pixels = _PixelGrid(self._gpu, camera)
-        self._taken = _Taken(self._pixels.take(depth, grazing), jump_terms(depth, camera))
+        self._taken = None
+        self._taken = self._pixels.take(depth, grazing)
+
+    def fitted(self, depth: DepthImage) -> dict[str, Binding] | None:
+        """Returns what DepthFit found in a depth image if it was the last to be taken, until the next one is."""
+        if self._pixels is None or self._taken is None or self._taken.depth is not depth:
+            return None
+        return self._taken.fitted if self._pixels.camera == depth.camera else None
 
     def fill(
         self,

@@ -9,7 +9,7 @@ from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
-from deltalight.render_server.passes.depth_mesh import DepthFit, upload_depth
+from deltalight.render_server.passes.depth_fit import DepthFit, upload_depth
 from deltalight.render_server.passes.gbuffer import GeometryBuffer
 from deltalight.render_server.scene.depth_surface import DepthSurface
 
@@ -25,14 +25,15 @@ class RealSurface:
         self.size = size
         self.position = texture_2d(gpu, size, 4, "f4")
         self.normal = texture_2d(gpu, size, 4, "f2")
-        self._depth = texture_2d(gpu, size, 1, "f4")
-        self._fit: DepthFit | None = None
+        self._gpu = gpu
+        self._fits_depth = not gpu.is_software if fits_depth is None else fits_depth
+        self._fit: DepthFit | None = None  # made when asked to fit what nobody has fitted yet
+        self._depth: moderngl.Texture | None = None
         self._fitted: moderngl.Texture | None = None
-        if not gpu.is_software if fits_depth is None else fits_depth:
-            self._fit = DepthFit(gpu, size)
+        if self._fits_depth:
             self._from_depth = Kernel(gpu, "real_surface", FITS_DEPTH=1)
         else:
-            self._fitted = texture_2d(gpu, size, 3, "f4")
+            self._depth, self._fitted = texture_2d(gpu, size, 1, "f4"), texture_2d(gpu, size, 3, "f4")
             self._from_depth = Kernel(gpu, "real_surface")
         self._from_model = Kernel(gpu, "real_surface_model")
 
@@ -41,20 +42,35 @@ class RealSurface:
         """Its textures by GLSL name."""
         return {"real_surface_position": self.position, "real_surface_normal": self.normal}
 
-    def from_depth(self, depth: DepthImage, fitted: Callable[[], DepthSurface], scene: Bindings) -> None:
-        """Fills it from the clean, registered depth map; `fitted` fits it on the CPU if need be."""
-        upload_depth(self._depth, depth)
-        self._from_depth.run(
-            self.size, scene, self._normals(depth, fitted), depth_map=self._depth, **self._images()
-        )
+    def from_depth(
+        self,
+        depth: DepthImage,
+        fitted: Callable[[], DepthSurface],
+        scene: Bindings,
+        *,
+        on_gpu: dict[str, Binding] | None = None,
+    ) -> None:
+        """Fills it from the clean, registered depth map.
 
-    def _normals(self, depth: DepthImage, fitted: Callable[[], DepthSurface]) -> dict[str, Binding]:
-        """Returns what fitted_normal.glsl reads."""
-        if self._fit is not None:
-            return self._fit.run(self._depth, depth, depth.camera)
+        `fitted` fits it on the CPU if need be; `on_gpu`: what DepthFit found in it if it has taken it already.
+        """
+        if not self._fits_depth:
+            found = self._fitted_by_cpu(depth, fitted)
+        else:
+            found = self._fitted_by_gpu(depth) if on_gpu is None else on_gpu
+        self._from_depth.run(self.size, scene, found, **self._images())
+
+    def _fitted_by_gpu(self, depth: DepthImage) -> dict[str, Binding]:
+        if self._fit is None:
+            self._fit = DepthFit(self._gpu, self.size)
+        return self._fit.take(depth, depth.camera)
+
+    def _fitted_by_cpu(self, depth: DepthImage, fitted: Callable[[], DepthSurface]) -> dict[str, Binding]:
+        assert self._depth is not None
         assert self._fitted is not None
+        upload_depth(self._depth, depth)
         self._fitted.write(np.ascontiguousarray(fitted().normals, np.float32), alignment=1)
-        return {"fitted_normals": self._fitted}
+        return {"depth_map": self._depth, "fitted_normals": self._fitted}
 
     def from_model(
         self, raster: GeometryBuffer, scene: Bindings, *, tolerance: tuple[float, float] | None = None

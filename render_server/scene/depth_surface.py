@@ -10,6 +10,7 @@ it has lost its depth for another reason (black, shiny) and stays unknown; so do
 beside it, the occlusion shadow of stereo.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -37,6 +38,7 @@ MIN_STRIP_WIDTH_PX = 3
 MIN_STRIP_AREA_PX = 64
 # Surfaces beside a strip are sampled up to this distance, in windows of this radius.
 BORDER_RADIUS_PX = 4
+WINDOW_MARGIN_PX = 2 * BORDER_RADIUS_PX  # around a strip
 # Colours mix this far across a strip's border: lenses and demosaicing blur edges over a pixel or two.
 MIXED_BORDER_PX = 2
 # Least standard deviation of colour, 0..1, by light and noise.
@@ -50,6 +52,7 @@ Map = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 Colors = Float32[np.ndarray, "h w 3"]
 Pixels = slice | Int64[np.ndarray, "k w"]  # flat indices
+Window = tuple[slice, slice]  # rows and columns
 Jumps = tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]
 
 
@@ -355,31 +358,51 @@ def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], cam
     the pixel, so strips are filled linearly from their near to their far side.
     """
     valid = depth.valid & (depth.depth_m > 0)
-    result = np.zeros_like(depth.depth_m)
-    unknown = (~valid).view(np.uint8)
-    thick = cv2.morphologyEx(unknown, cv2.MORPH_OPEN, np.ones((MIN_STRIP_WIDTH_PX,) * 2, np.uint8))
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
-    to_known: Map | None = None
-    for label in range(1, count):
-        if boxes[label, cv2.CC_STAT_AREA] < MIN_STRIP_AREA_PX:
-            continue
-        part = _strip_window(boxes[label])
-        strip = labels[part] == label
+    result = np.zeros(valid.shape, np.float32)
+    for part, strip in _strips(~valid):
         beside = valid[part] & _dilated(strip, BORDER_RADIUS_PX)
-        around = np.divide(1, depth.depth_m[part], out=np.zeros_like(result[part]), where=beside)
-        if not _steps_at_all(around, depth, camera):
-            continue
-        if to_known is None:  # takes as long as all else
-            to_known = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_5)
-        if _may_be_grazing(strip, around, to_known[part], depth, camera):
+        around = np.divide(1, depth.depth_m[part], out=np.zeros(strip.shape, np.float32), where=beside)
+        if _may_be_grazing(strip, around, ~valid[part], depth, camera):
             grazing, bridged = _bridge(strip, around, color[part], depth, camera)
             result[part][grazing] = bridged[grazing]
-    return np.asarray(result)
+    return result
 
 
-def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
+def _strips(unknown: Mask) -> Iterator[tuple[Window, Mask]]:
+    """Yields the strips without depth that are large enough, each in a window of the picture."""
+    square = np.ones((MIN_STRIP_WIDTH_PX,) * 2, np.uint8)
+    thick = cv2.morphologyEx(unknown.view(np.uint8), cv2.MORPH_OPEN, square)
+    for tile in _tiles(thick.view(bool)):
+        count, labels, boxes, _ = cv2.connectedComponentsWithStats(thick[tile], connectivity=4)
+        for label in range(1, count):
+            if boxes[label, cv2.CC_STAT_AREA] >= MIN_STRIP_AREA_PX:
+                part = _strip_window(boxes[label])
+                strip = labels[part] == label
+                down, right = (whole.start + own.start for whole, own in zip(tile, part, strict=True))
+                yield (slice(down, down + strip.shape[0]), slice(right, right + strip.shape[1])), strip
+
+
+def _tiles(mask: Mask) -> Iterator[Window]:
+    """Yields parts of the picture that hold enough of a mask, and whole windows around all strips of it.
+
+    Of most pictures they are few: to label strips everywhere would take longer than all else.
+    """
+    for rows in _runs(np.asarray(mask.any(axis=1))):
+        for columns in _runs(np.asarray(mask[rows].any(axis=0))):
+            if np.count_nonzero(mask[rows, columns]) >= MIN_STRIP_AREA_PX:
+                yield rows, columns
+
+
+def _runs(is_set: Bool[np.ndarray, " n"]) -> list[slice]:
+    """Returns the runs of elements that lie within WINDOW_MARGIN_PX of set ones."""
+    near = _dilated(is_set[:, None], WINDOW_MARGIN_PX)[:, 0]
+    ends = np.flatnonzero(np.diff(near, prepend=False, append=False)).tolist()
+    return [slice(*run) for run in zip(ends[::2], ends[1::2], strict=True)]
+
+
+def _strip_window(box: Int32[np.ndarray, "5"]) -> Window:
     """Returns rows and columns of a strip (box: left, top, width, height, area) and the surfaces beside it."""
-    margin = 2 * BORDER_RADIUS_PX
+    margin = WINDOW_MARGIN_PX
     left, top, width, height = (int(value) for value in box[:4])
     return (
         slice(max(top - margin, 0), top + height + margin),
@@ -396,13 +419,16 @@ def _steps_at_all(around: Map, depth: DepthImage, camera: CameraModel) -> bool:
     return bool(known.max() - least > jump_threshold(depth, camera, least, 2.0))
 
 
-def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, camera: CameraModel) -> bool:
+def _may_be_grazing(strip: Mask, around: Map, unknown: Mask, depth: DepthImage, camera: CameraModel) -> bool:
     """Rules out most strips cheaply: no depth step beside them could make most of their pixels grazing.
 
-    `around` is the inverse depth beside the strip, 0 elsewhere, `to_known` the distance of pixels from known ones: a
-    strip is at least twice as wide there.
+    `around` is the inverse depth beside the strip, 0 elsewhere. A strip is at least twice as wide as a pixel of it is
+    from the nearest known one, which is no farther beyond the strip than the window reaches.
     """
+    if not _steps_at_all(around, depth, camera):
+        return False
     known = around[around > 0]
+    to_known = cv2.distanceTransform(unknown.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     least = np.full(int(strip.sum()), known.min())
     bearable = jump_threshold(depth, camera, least, 2 * to_known[strip])
     return bool((known.max() - known.min() > bearable).mean() > MIN_GRAZING_FRACTION)

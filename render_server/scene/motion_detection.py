@@ -1,5 +1,6 @@
 """Detects when the real scene or the camera has moved, and when a kept real scene no longer explains a frame."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -39,16 +40,19 @@ class MotionThresholds:
 
 @dataclass(frozen=True, eq=False)
 class FrameSamples:
-    """A frame on a grid of GRID_STEP_PX pixels: mean linear colour, and inverse depth (0 = unknown)."""
+    """A frame on a grid of GRID_STEP_PX pixels, sampled when asked: of a moving camera, poses alone tell enough."""
 
     frame: ViewFrame
-    color: Float32[np.ndarray, "gh gw 3"]
-    inverse_depth: Float32[np.ndarray, "gh gw"] | None
 
-    @staticmethod
-    def of(frame: ViewFrame) -> "FrameSamples":
-        """Samples a frame."""
-        return FrameSamples(frame, _downsampled_color(frame), _subsampled_inverse_depth(frame.depth))
+    @cached_property
+    def color(self) -> Float32[np.ndarray, "gh gw 3"]:
+        """Mean linear colour."""
+        return _downsampled_color(self.frame)
+
+    @cached_property
+    def inverse_depth(self) -> Float32[np.ndarray, "gh gw"] | None:
+        """Inverse depth (1/m, 0 = unknown); None if the frame has no depth."""
+        return _subsampled_inverse_depth(self.frame.depth)
 
     @cached_property
     def depth_range(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
@@ -92,7 +96,7 @@ def _has_changed(old: FrameSamples, new: FrameSamples, thresholds: MotionThresho
     return (
         before.camera != after.camera
         or (before.depth is None) != (after.depth is None)
-        or _image_motion(before, after, old.inverse_depth) > thresholds.image_motion_px
+        or _moves_more(old, new, thresholds.image_motion_px)
         or _moved_fraction(old, new, thresholds) > thresholds.depth_fraction
         or _recolored_fraction(old, new, thresholds) > thresholds.color_fraction
     )
@@ -140,7 +144,7 @@ class KeptWorld:
         old, thresholds = self.built_from, self._thresholds
         if old is None or old.frame.camera != new.frame.camera:
             return False
-        motion_px = _image_motion(old.frame, new.frame, old.inverse_depth)
+        motion_px = max(_image_motions(old, new))
         if motion_px <= thresholds.image_motion_px:
             return not _has_changed(old, new, thresholds)
         if old.inverse_depth is None or new.inverse_depth is None:
@@ -248,36 +252,47 @@ def _subsampled_inverse_depth(depth: DepthImage | None) -> Float32[np.ndarray, "
     return inverse
 
 
-def _image_motion(
-    before: ViewFrame, after: ViewFrame, inverse_depth: Float32[np.ndarray, "gh gw"] | None
-) -> float:
-    """Returns the greatest motion in pixels of points at the scene's distance between two poses.
+def _moves_more(old: FrameSamples, new: FrameSamples, limit_px: float) -> bool:
+    """Returns whether the change of pose moves the picture by more than `limit_px` pixels."""
+    return any(motion_px > limit_px for motion_px in _image_motions(old, new))
 
-    Points on a coarse grid of pixels are placed at the nearest and at the mean distance of the old frame.
+
+def _image_motions(old: FrameSamples, new: FrameSamples) -> Iterator[float]:
+    """Yields the greatest motion in pixels of points at each of the scene's distances between two poses.
+
+    Points on a coarse grid of pixels are placed at the mean and at the nearest distance of the old frame.
     """
+    before, after = old.frame, new.frame
     if before.pose is None or after.pose is None:
-        return 0.0 if before.pose is after.pose else np.inf
-    old, new = before.pose.world_from_camera, after.pose.world_from_camera
-    if np.array_equal(old, new):
-        return 0.0
-    camera = before.camera
+        yield 0.0 if before.pose is after.pose else np.inf
+        return
+    from_old, from_new = before.pose.world_from_camera, after.pose.world_from_camera
+    if np.array_equal(from_old, from_new):
+        yield 0.0
+        return
+    pixels, rays = _coarse_rays(before.camera)
+    new_from_old = np.linalg.inv(from_new) @ from_old
+    for distance in _distances(old.inverse_depth, from_old):
+        points = distance * rays @ new_from_old[:3, :3].T + new_from_old[:3, 3]
+        shift = np.linalg.norm(before.camera.project(points) - pixels, axis=1)
+        yield float(np.nan_to_num(shift, nan=np.inf).max())
+
+
+@lru_cache(maxsize=LENSES_KEPT)
+def _coarse_rays(camera: CameraModel) -> tuple[Float64[np.ndarray, "25 2"], Float64[np.ndarray, "25 3"]]:
+    """Returns pixels all over the picture and (x/z, y/z, 1) of their rays."""
     columns, rows = np.linspace(0, camera.width - 1, 5), np.linspace(0, camera.height - 1, 5)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    rays = np.column_stack([camera.unproject(pixels), np.ones(len(pixels))])
-    new_from_old = np.linalg.inv(new) @ old
-    motion = 0.0
-    for distance in _distances(inverse_depth, old):
-        points = distance * rays @ new_from_old[:3, :3].T + new_from_old[:3, 3]
-        shift = np.linalg.norm(camera.project(points) - pixels, axis=1)
-        motion = max(motion, float(np.nan_to_num(shift, nan=np.inf).max()))
-    return motion
+    return pixels, np.column_stack([camera.unproject(pixels), np.ones(len(pixels))])
 
 
 def _distances(
     inverse_depth: Float32[np.ndarray, "gh gw"] | None, world_from_camera: Float64[np.ndarray, "4 4"]
-) -> tuple[float, ...]:
-    """Returns the nearest (5 % are nearer) and the mean distance; without depth that of the world's origin."""
+) -> Iterator[float]:
+    """Yields the mean distance and the nearest (5 % are nearer); without depth that of the world's origin."""
     known = np.zeros(0) if inverse_depth is None else inverse_depth[inverse_depth > 0]
     if known.size == 0:
-        return (max(float(np.linalg.norm(world_from_camera[:3, 3])), 0.1),)
-    return float(1 / np.percentile(known, 95)), float(1 / known.mean(dtype=np.float64))
+        yield max(float(np.linalg.norm(world_from_camera[:3, 3])), 0.1)
+        return
+    yield float(1 / known.mean(dtype=np.float64))
+    yield float(1 / np.percentile(known, 95))

@@ -14,6 +14,7 @@ from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
 from deltalight.render_server.passes.caustics import TILE
 from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.cones import reuse_define
+from deltalight.render_server.passes.depth_fit import DepthFit
 from deltalight.render_server.passes.depth_mesh import DepthMesher
 from deltalight.render_server.passes.lpv import LpvPropagate
 from deltalight.render_server.passes.matting import Matting
@@ -185,6 +186,7 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     for fits in (False, True):
         RealSurface(gpu, (16, 16), fits_depth=fits).release()
     Kernel(gpu, "real_surface", FITS_DEPTH=1, DECLARED_SURFACES=1).release()
+    DepthFit(gpu, (16, 16)).release()
     DepthMesher(gpu).release()
     Kernel(gpu, "depth_nodes", GRAZING=1).release()
     Enlarge(gpu, (16, 16)).release()

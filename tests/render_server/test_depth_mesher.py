@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,13 +18,17 @@ from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.real_geometry import EMPTY_MESH, RealGeometry
 from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, bound_points, depth_mesh
 from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
-from tests.render_server.test_real_surface import room
+from tests.render_server.test_real_surface import room, shown_normals
 from tests.render_server.test_scene_depth_mesh import LENS, NORMAL, PINHOLE, image, plane_depth
 from tests.render_server.test_scene_threads import floor_from
 
 WORLD_FROM_CAMERA = np.array([[0, 0, 1.0, 0.3], [-1, 0, 0, 0.2], [0, -1, 0, 0.1], [0, 0, 0, 1]])
 SHAPE = PINHOLE.height, PINHOLE.width
 NO_GRAZING = np.zeros(SHAPE, np.float32)
+
+
+def no_grazing() -> Float32[np.ndarray, "h w"]:
+    return NO_GRAZING
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +80,7 @@ def test_the_gpu_makes_the_same_triangles(
     grazing = with_grazing(depth) if is_bridged else NO_GRAZING
     wanted = depth_mesh(depth, camera, WORLD_FROM_CAMERA, budget, grazing=lambda: grazing)
     assert wanted.uv is not None
-    mesher.take(depth, camera, grazing)
+    mesher.take(depth, camera, lambda: grazing)
     vertices, triangles = made_by_gpu(gpu, mesher, budget)
     theirs, ours = by_corners(wanted.uv, wanted.triangles), by_corners(vertices[:, 6:8], triangles)
     common = theirs.keys() & ours.keys()
@@ -93,7 +98,7 @@ def test_the_gpu_makes_the_same_triangles(
 def test_grazing_surfaces_close_a_hole(gpu: GpuContext, mesher: DepthMesher) -> None:
     depth = room(PINHOLE, 0.0005)
     counts = []
-    for grazing in (NO_GRAZING, with_grazing(depth), NO_GRAZING):
+    for grazing in (no_grazing, partial(with_grazing, depth), no_grazing):
         mesher.take(depth, PINHOLE, grazing)
         counts.append(len(made_by_gpu(gpu, mesher, 8_000)[1]))
     assert counts[1] > counts[0] + 30
@@ -102,17 +107,37 @@ def test_grazing_surfaces_close_a_hole(gpu: GpuContext, mesher: DepthMesher) -> 
 
 def test_another_camera_gets_its_own_grid(gpu: GpuContext, mesher: DepthMesher) -> None:
     small = CameraModel(80, 60, PINHOLE.matrix * np.array([[0.5], [0.5], [1]]))
-    mesher.take(room(PINHOLE, 0.002), PINHOLE, NO_GRAZING)
+    mesher.take(room(PINHOLE, 0.002), PINHOLE, no_grazing)
     made_by_gpu(gpu, mesher, 700)
-    mesher.take(image(plane_depth(small, NORMAL, 0.9), small), small, np.zeros((60, 80), np.float32))
+    mesher.take(image(plane_depth(small, NORMAL, 0.9), small), small, lambda: np.zeros((60, 80), np.float32))
     vertices, triangles = made_by_gpu(gpu, mesher, 700)
     assert len(triangles) > 500
     assert vertices[triangles, 6].max() < small.width
 
 
+def test_only_the_image_that_was_taken_last_is_fitted(mesher: DepthMesher) -> None:
+    first, second = room(PINHOLE, 0.002), room(PINHOLE, 0.002)
+    mesher.take(first, PINHOLE, no_grazing)
+    assert mesher.fitted(first) is not None
+    assert mesher.fitted(second) is None
+    mesher.take(second, PINHOLE, no_grazing)
+    assert mesher.fitted(first) is None
+    assert mesher.fitted(replace(second, camera=LENS)) is None
+
+
+def test_what_the_mesher_fitted_serves_the_visible_surface(gpu: GpuContext, mesher: DepthMesher) -> None:
+    depth = room(PINHOLE, 0.002)
+    mesher.take(depth, PINHOLE, no_grazing)
+    own, shared = (
+        shown_normals(gpu, depth, pytest.fail, fits_depth=True, on_gpu=found)
+        for found in (None, mesher.fitted(depth))
+    )
+    assert np.array_equal(own, shared)
+
+
 def test_an_image_of_another_size_is_refused(mesher: DepthMesher) -> None:
     with pytest.raises(DeltalightError, match="differ in size"):
-        mesher.take(room(PINHOLE, 0.002), CameraModel(80, 60, PINHOLE.matrix), NO_GRAZING)
+        mesher.take(room(PINHOLE, 0.002), CameraModel(80, 60, PINHOLE.matrix), no_grazing)
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])

@@ -77,6 +77,17 @@ def test_a_lid_seen_along_it_is_the_plane_between_its_edges() -> None:
     assert (np.diff(found[rows, CAMERA.width // 2]) > 0).all()  # nearer downwards
 
 
+def test_holes_elsewhere_change_nothing() -> None:
+    depth, shown = shelf(ALONG)
+    color, lid, holes = colored(shown), shown == LID, np.zeros(shown.shape, bool)
+    holes[[3, 200, 220], [5, 60, 300]] = True
+    holes[210:222, 20:40] = holes[-9:, -30:] = True
+    assert not (holes & lid).any()
+    alone = grazing_depth_fill(measured(depth, lid), color, CAMERA)
+    assert alone.any()
+    assert np.array_equal(grazing_depth_fill(measured(depth, lid | holes), color, CAMERA), alone)
+
+
 def test_the_mesh_closes_the_lid_with_triangles_that_face_up_and_join_nothing_else() -> None:
     depth, shown = shelf(ALONG)
     image, pose = measured(depth, shown == LID), ALONG.world_from_camera

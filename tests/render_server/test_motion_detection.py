@@ -29,8 +29,8 @@ def changed(**changes: object) -> ViewFrame:
 
 def test_noise_alone_is_no_change() -> None:
     tracker = MotionDetector()
-    assert tracker.update(FrameSamples.of(frame(0)))
-    assert not any(tracker.update(FrameSamples.of(frame(seed))) for seed in range(1, 20))
+    assert tracker.update(FrameSamples(frame(0)))
+    assert not any(tracker.update(FrameSamples(frame(seed))) for seed in range(1, 20))
 
 
 @pytest.mark.parametrize(
@@ -40,13 +40,30 @@ def test_motion_of_the_camera_counts_from_half_a_pixel_on(
     shift_m: float, turn_rad: float, expected: bool
 ) -> None:
     tracker = MotionDetector()
-    tracker.update(FrameSamples.of(frame(0)))
-    assert tracker.update(FrameSamples.of(frame(1, shift_m, turn_rad))) is expected
+    tracker.update(FrameSamples(frame(0)))
+    assert tracker.update(FrameSamples(frame(1, shift_m, turn_rad))) is expected
+
+
+def test_a_turned_camera_asks_for_no_colour() -> None:
+    tracker, samples = MotionDetector(), [FrameSamples(frame(0)), FrameSamples(frame(1, turn_rad=0.01))]
+    assert all(tracker.update(each) for each in samples)
+    assert not any("color" in vars(each) for each in samples)
+
+
+def test_the_nearest_things_move_the_picture_most() -> None:
+    """The wall moves by 0.3 pixels, the tenth of it that is five times nearer by 1.5."""
+    still, moved = frame(0), frame(1, shift_m=0.002)
+    for each in (still, moved):
+        assert each.depth is not None
+        each.depth.depth_m[:12] = 0.2
+    tracker = MotionDetector()
+    tracker.update(FrameSamples(still))
+    assert tracker.update(FrameSamples(moved))
 
 
 def test_slow_drift_adds_up() -> None:
     tracker = MotionDetector()
-    answers = [tracker.update(FrameSamples.of(frame(step, shift_m=0.001 * step))) for step in range(9)]
+    answers = [tracker.update(FrameSamples(frame(step, shift_m=0.001 * step))) for step in range(9)]
     assert answers[0]
     assert not answers[1]
     assert any(answers[2:])
@@ -54,35 +71,35 @@ def test_slow_drift_adds_up() -> None:
 
 def test_depth_that_moves_counts() -> None:
     tracker = MotionDetector()
-    tracker.update(FrameSamples.of(frame(0)))
+    tracker.update(FrameSamples(frame(0)))
     moved = frame(1).depth
     assert moved is not None
     moved.depth_m[20:60, 20:60] -= 0.03
-    assert tracker.update(FrameSamples.of(changed(depth=moved)))
-    assert not tracker.update(FrameSamples.of(changed(depth=moved)))
+    assert tracker.update(FrameSamples(changed(depth=moved)))
+    assert not tracker.update(FrameSamples(changed(depth=moved)))
 
 
 def test_light_that_changes_counts_and_exposure_that_is_known_does_not() -> None:
     tracker = MotionDetector()
-    tracker.update(FrameSamples.of(frame(0)))
+    tracker.update(FrameSamples(frame(0)))
     lit = frame(1).color.copy()
     lit[40:70, 40:70] = np.minimum(lit[40:70, 40:70].astype(int) + 25, 255)
-    assert tracker.update(FrameSamples.of(changed(color=lit)))
+    assert tracker.update(FrameSamples(changed(color=lit)))
     tracker = MotionDetector()
     bright = changed(color=np.full((120, 160, 3), 188, np.uint8))
     dark = changed(color=np.full((120, 160, 3), 137, np.uint8), exposure_scale=0.5)
-    tracker.update(FrameSamples.of(bright))
-    assert not tracker.update(FrameSamples.of(dark))
-    assert tracker.update(FrameSamples.of(changed(color=dark.color)))
+    tracker.update(FrameSamples(bright))
+    assert not tracker.update(FrameSamples(dark))
+    assert tracker.update(FrameSamples(changed(color=dark.color)))
 
 
 def test_losing_pose_or_depth_or_changing_the_camera_counts() -> None:
     other = CameraModel(160, 120, np.array([[151.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
     for changes in ({"pose": None}, {"depth": None}, {"camera": other}):
         tracker = MotionDetector()
-        tracker.update(FrameSamples.of(frame(0)))
-        assert tracker.update(FrameSamples.of(changed(**changes)))
-        assert not tracker.update(FrameSamples.of(changed(**changes)))
+        tracker.update(FrameSamples(frame(0)))
+        assert tracker.update(FrameSamples(changed(**changes)))
+        assert not tracker.update(FrameSamples(changed(**changes)))
 
 
 def test_without_depth_the_distance_to_the_board_serves() -> None:
@@ -90,6 +107,6 @@ def test_without_depth_the_distance_to_the_board_serves() -> None:
     near, far = np.eye(4), np.eye(4)
     near[2, 3], far[2, 3] = -1.0, -1.0
     far[0, 3] = 0.006
-    tracker.update(FrameSamples.of(changed(depth=None, pose=BoardPose(near))))
-    assert not tracker.update(FrameSamples.of(changed(depth=None, pose=BoardPose(near.copy()))))
-    assert tracker.update(FrameSamples.of(changed(depth=None, pose=BoardPose(far))))
+    tracker.update(FrameSamples(changed(depth=None, pose=BoardPose(near))))
+    assert not tracker.update(FrameSamples(changed(depth=None, pose=BoardPose(near.copy()))))
+    assert tracker.update(FrameSamples(changed(depth=None, pose=BoardPose(far))))

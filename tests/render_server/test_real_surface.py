@@ -34,7 +34,12 @@ def room(camera: CameraModel, sigma: float) -> DepthImage:
 
 
 def shown_normals(
-    gpu: GpuContext, depth: DepthImage, fitted: Callable[[], DepthSurface], *, fits_depth: bool
+    gpu: GpuContext,
+    depth: DepthImage,
+    fitted: Callable[[], DepthSurface],
+    *,
+    fits_depth: bool,
+    on_gpu: dict[str, Binding] | None = None,
 ) -> Float32[np.ndarray, "h w 3"]:
     """In the optical frame; those of pixels without a known one look along the ray."""
     view = CameraView(depth.camera, np.eye(4))
@@ -43,7 +48,7 @@ def shown_normals(
     rays.write(np.ascontiguousarray(depth.camera.rays(), np.float32).tobytes(), alignment=1)
     block = UniformBlock[CameraBlock](gpu, view.block())
     nothing: dict[str, Binding] = {"DECLARED_SURFACES": False, "Surfaces": None, "surface_count": 0}
-    surface.from_depth(depth, fitted, {"Camera": block, "picture_rays": rays, **nothing})
+    surface.from_depth(depth, fitted, {"Camera": block, "picture_rays": rays, **nothing}, on_gpu=on_gpu)
     found = read_texture(surface.normal)[..., :3]
     for each in (surface, rays, block):
         each.release()
