@@ -115,7 +115,7 @@ class ViewFrame:
     Linear camera colour is `decode_lut(response)[color] / exposure_scale`. `exposure_s` is None if it is unknown.
     `depth` is clean and registered to colour; None if the scene gives a model. `board` lets the renderer find the
     board's white paper. `sky_lights` are lights that the sensor node cut from its maps of radiance; the same object
-    while they do not change.
+    while they do not change. Renderers compare a frame with later ones, so nothing may overwrite its arrays.
     """
 
     frame_id: int
