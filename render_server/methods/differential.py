@@ -94,7 +94,7 @@ class SolutionVoxels(DirectionalVoxels):
         """Lights, resolves and filters mu, then rho."""
         self._light_both(mu, rho, gathered=False)
         self._occupy.run(self.mu, self.real.volume, self.real.store)
-        self._occupy.run(self.rho, self.real.volume, self.real.store, self.objects.store)
+        self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
         return self
 
     def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":

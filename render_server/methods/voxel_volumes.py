@@ -96,9 +96,8 @@ class VoxelSet:
         self.volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, size))
         self.groups = SurfelGroups(gpu, size)
         self.is_lit = False
-        self._mipmaps = mipmaps
         self._voxelize = Voxelize(gpu)
-        self._clear = ClearVoxels(gpu, mipmaps[0].directions)
+        self._clear = ClearVoxels(gpu, mipmaps)
 
     def fill(self, meshes: Meshes, placement: VolumePlacement) -> None:
         """Replaces the voxels by those of the triangles, and clears the old ones from the mipmaps."""
@@ -106,7 +105,7 @@ class VoxelSet:
 
     def fill_all(self, meshes: Sequence[Meshes], placements: Sequence[VolumePlacement]) -> None:
         """Fills several volumes, each with the triangles of its own."""
-        self._clear.run(self.store, self._mipmaps, self.volume)
+        self._clear.run(self.store, self.volume)
         self.volume.place(*placements)
         self._voxelize.run_all(self.store, meshes, self.volume)
         self.is_lit = False
@@ -341,7 +340,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_joint(self, _lit: LitVoxels) -> VoxelMipmap:
         """Filters the lit voxels of both sets into rho."""
-        self._occupy.run(self.rho, self.real.volume, self.real.store, self.objects.store)
+        self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
         self._filter_rho()
         return self.rho
 
