@@ -482,10 +482,6 @@ def common_kernel(gpu: GpuContext, name: str) -> Kernel:
     return kernel
 
 
-def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = None) -> None:
-    gpu.clear_buffer(buffer, size)
-
-
 def clear_volume(gpu: GpuContext, texture: moderngl.Texture3D) -> None:
     """Sets all texels to zero, without a copy of them on the CPU."""
     common_kernel(gpu, "clear_volume").run(texture.size, cleared=texture)

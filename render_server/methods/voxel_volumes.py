@@ -14,7 +14,7 @@ import numpy as np
 from deltalight.protocol.scene_method import DvctMethod, VoxelConeSettings
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
+from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 from deltalight.render_server.gpu_scene import GeometryState
@@ -96,9 +96,8 @@ class VoxelSet:
         self.volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, size))
         self.groups = SurfelGroups(gpu, size)
         self.is_lit = False
-        self._mipmaps = mipmaps
         self._voxelize = Voxelize(gpu)
-        self._clear = ClearVoxels(gpu, mipmaps[0].directions)
+        self._clear = ClearVoxels(gpu, mipmaps)
 
     def fill(self, meshes: Meshes, placement: VolumePlacement) -> None:
         """Replaces the voxels by those of the triangles, and clears the old ones from the mipmaps."""
@@ -106,7 +105,7 @@ class VoxelSet:
 
     def fill_all(self, meshes: Sequence[Meshes], placements: Sequence[VolumePlacement]) -> None:
         """Fills several volumes, each with the triangles of its own."""
-        self._clear.run(self.store, self._mipmaps, self.volume)
+        self._clear.run(self.store, self.volume)
         self.volume.place(*placements)
         self._voxelize.run_all(self.store, meshes, self.volume)
         self.is_lit = False
@@ -119,7 +118,7 @@ class VoxelSet:
     def forget_light(self) -> None:
         """Clears the sums if they hold light."""
         if self.is_lit:
-            clear_buffer(self._gpu, self.store.sums)
+            self._gpu.clear_buffer(self.store.sums)
         self.is_lit = True
 
     def release(self) -> None:
@@ -341,7 +340,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_joint(self, _lit: LitVoxels) -> VoxelMipmap:
         """Filters the lit voxels of both sets into rho."""
-        self._occupy.run(self.rho, self.real.volume, self.real.store, self.objects.store)
+        self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
         self._filter_rho()
         return self.rho
 

@@ -23,6 +23,7 @@ PAIRS_PER_TRIANGLE = 2  # to begin with
 # How many pairs are expected by those of earlier frames: so many times as many, and so many a voxel of a face.
 GROWTH, MORE_A_FACE = 1.5, 2.0
 MORE_TRIANGLES = 1.25  # beyond so many times as many, earlier frames tell nothing
+FINER = 1.1  # likewise with edges of voxels, whose number grows with the square: within GROWTH
 LONGEST_EDGE_VOXELS = 8.0  # longer triangles are cut: balances the threads, bounds each one's loops
 
 
@@ -83,13 +84,11 @@ class Filling:
     bindings: Bindings
 
     def is_like(self, other: "Filling") -> bool:
-        """Whether about as many pairs may be expected: of as many triangles, and voxels of one size."""
+        """Whether about as many pairs may be expected: of as many triangles, and as many voxels of about one size."""
         mine, its = self.placement, other.placement
         is_more = self.triangle_count > MORE_TRIANGLES * other.triangle_count
-        return not is_more and (mine.voxel_edge, mine.size) == (
-            its.voxel_edge,
-            its.size,
-        )
+        is_of_one_size = its.voxel_edge / FINER < mine.voxel_edge < its.voxel_edge * FINER
+        return not is_more and is_of_one_size and mine.size == its.size
 
 
 class EarlierCounts:
@@ -191,7 +190,7 @@ class VoxelPairs:
 
     def _list(self, filling: Filling) -> None:
         """Lists the pairs of short triangles, then those of long ones; what has no room is only counted."""
-        self._pairs.write(bytes(PAIRS_HEADER_BYTES))
+        self._gpu.clear_buffer(self._pairs, PAIRS_HEADER_BYTES)
         mesh, longest_m = filling.mesh, LONGEST_EDGE_VOXELS * filling.placement.voxel_edge
         shared: Bindings = {
             **filling.bindings,

@@ -11,7 +11,6 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import (
     Binding,
     Kernel,
-    clear_buffer,
     clear_volume,
     list_threads,
 )
@@ -30,6 +29,7 @@ LEAST_SURFELS = 1024
 LARGEST_ITEM_BYTES = (
     96  # of what is kept a surfel or slot: SUMS_PER_SLOT, SURFEL_LIGHT_BYTES (voxel_light.py)
 )
+FUSED_LEVELS = 4  # of filter_voxels: a tile of 8 cells an edge, then 4, 2 and 1
 LOWER_VOLUME, LOWER_SURFELS = "method.volume_size", "method.volume_size or method.triangle_budget"
 
 
@@ -126,7 +126,7 @@ class VoxelStore:
     def _allocate_grid(self, size: int, count: int) -> None:
         self.volume_size, self.volume_count = size, count
         self.grid = self._gpu.storage_buffer(count * size**3 * 4, LOWER_VOLUME)
-        clear_buffer(self._gpu, self.grid)
+        self._gpu.clear_buffer(self.grid)
 
     def resize(self, size: int, count: int) -> None:
         """Makes room for `count` volumes of `size` voxels an edge, and forgets all voxels."""
@@ -179,8 +179,8 @@ class VoxelStore:
             self._gpu.check_storage(surfel_bound * LARGEST_ITEM_BYTES, LOWER_SURFELS)
             self._release_growing()
             self._allocate(self._room_for(surfel_bound))
-        self.surfels.write(bytes(SURFELS_HEADER_BYTES))
-        self.touched.write(bytes(TOUCHED_HEADER_BYTES))
+        self._gpu.clear_buffer(self.surfels, SURFELS_HEADER_BYTES)
+        self._gpu.clear_buffer(self.touched, TOUCHED_HEADER_BYTES)
 
     def _room_for(self, surfels: int) -> int:
         """Room to grow, up to what a buffer can hold."""
@@ -201,21 +201,17 @@ class VoxelStore:
 class ClearVoxels:
     """Clears the voxels that a set touched, instead of whole volumes: its slots and its texels of level 0."""
 
-    def __init__(self, gpu: GpuContext, directions: int) -> None:
+    def __init__(self, gpu: GpuContext, mipmaps: Sequence[VoxelMipmap]) -> None:
+        """`mipmaps`: one or two, of as many directions, in which the set's voxels have texels."""
+        first, *second = self._mipmaps = mipmaps
         self._threads = list_threads(gpu)
-        self._kernel = Kernel(gpu, "clear_voxels", DIRECTIONS=directions)
+        defines = {"DIRECTIONS": first.directions, **({"TWO": 1} if second else {})}
+        self._kernel = Kernel(gpu, "clear_voxels", **defines)
 
-    def run(self, store: VoxelStore, mipmaps: Sequence[VoxelMipmap], volume: PlacedVolume) -> None:
-        """Clears `store`, and its voxels' texels in each of the mipmaps (at least one)."""
-        for index, mipmap in enumerate(mipmaps):
-            self._kernel.run(
-                (self._threads,),
-                store.bindings,
-                volume.bindings,
-                mipmap=mipmap.texture,
-                free_slots=index == len(mipmaps) - 1,
-            )
-        store.reset(0)
+    def run(self, store: VoxelStore, volume: PlacedVolume) -> None:
+        """Clears the voxels; the lists of `store` are left for the voxelisation that follows to `reset`."""
+        images = {name: each.texture for name, each in zip(("mipmap", "second"), self._mipmaps, strict=False)}
+        self._kernel.run((self._threads,), store.bindings, volume.bindings, **images)
 
     def release(self) -> None:
         """Frees the program."""
@@ -229,11 +225,18 @@ class OccupyVoxels:
         self._gpu, self._threads = gpu, list_threads(gpu)
         self._kernel = Kernel(gpu, "occupy_voxels")
 
-    def run(self, mipmap: VoxelMipmap, volume: PlacedVolume, *stores: VoxelStore) -> None:
-        """Replaces the mipmap's occupancy by that of the stores."""
-        clear_buffer(self._gpu, mipmap.occupied)
-        for store in stores:
-            self._kernel.run((self._threads,), store.bindings, volume.bindings, Occupied=mipmap.occupied)
+    def run(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore) -> None:
+        """Replaces the mipmap's occupancy by that of the store."""
+        self._gpu.clear_buffer(mipmap.occupied)
+        self._mark(mipmap, volume, store)
+
+    def add(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore, to: VoxelMipmap) -> None:
+        """Replaces the mipmap's occupancy by that of the store and of the mipmap `to`, which is of the same size."""
+        self._gpu.ctx.copy_buffer(mipmap.occupied, to.occupied)
+        self._mark(mipmap, volume, store)
+
+    def _mark(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore) -> None:
+        self._kernel.run((self._threads,), store.bindings, volume.bindings, Occupied=mipmap.occupied)
 
     def release(self) -> None:
         """Frees the program."""
@@ -246,8 +249,7 @@ class ResolveVoxels:
     def __init__(self, gpu: GpuContext) -> None:
         self._threads = list_threads(gpu)
         self._mu = Kernel(gpu, "resolve_voxels")
-        self._rho_real = Kernel(gpu, "resolve_voxels", RHO_REAL=1)
-        self._rho_virtual = Kernel(gpu, "resolve_voxels", RHO_VIRTUAL=1)
+        self._rho = Kernel(gpu, "resolve_voxels", RHO=1)
 
     def resolve_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
         """Writes (c_mu, a_real)."""
@@ -257,37 +259,49 @@ class ResolveVoxels:
         self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume
     ) -> None:
         """Writes (c_rho, a_real + a_virtual)."""
-        self._rho_real.run(
+        self._rho.run(
             (self._threads,),
             real.bindings,
             volume.bindings,
             mipmap=rho.texture,
             DeltaSums=real.delta_sums,
-            OtherGrid=virtual.grid,
-            OtherSums=virtual.sums,
-        )
-        self._rho_virtual.run(
-            (self._threads,), virtual.bindings, volume.bindings, mipmap=rho.texture, OtherGrid=real.grid
+            VirtualGrid=virtual.grid,
+            VirtualTouched=virtual.touched,
+            VirtualSums=virtual.sums,
         )
 
     def release(self) -> None:
         """Frees the programs."""
-        for kernel in (self._mu, self._rho_real, self._rho_virtual):
-            kernel.release()
+        release_all(self._mu, self._rho)
 
 
 class FilterVoxels:
-    """Filters the levels of an anisotropic mipmap, one dispatch per level (docs/method.md 4.4)."""
+    """Filters the levels of an anisotropic mipmap, several in a dispatch on a GPU (docs/method.md 4.4).
+
+    In software each is a dispatch: workgroups that wait for their own stores take 3.5 times as long there.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._kernel = Kernel(gpu, "filter_voxels")
+        self._at_once = 1 if gpu.is_software else FUSED_LEVELS
+        self._kernel = Kernel(gpu, "filter_voxels", **({} if gpu.is_software else {"FUSED": 1}))
 
     def run(self, mipmap: VoxelMipmap, volume: PlacedVolume) -> None:
         """Rebuilds all levels from level 0."""
-        for level in range(1, volume.placement.levels):
-            cells = volume.placement.size >> level
-            slabs = cells * DIRECTIONS * len(volume.placements)
-            self._kernel.run((cells, cells, slabs), volume.bindings, mipmap=mipmap.texture, level=level)
+        levels = volume.placement.levels
+        slabs = DIRECTIONS * len(volume.placements)
+        for first in range(1, levels, self._at_once):
+            cells, several = volume.placement.size >> first, {}
+            if self._at_once > 1:
+                tile = self._kernel.local_size[0]
+                cells = math.ceil(cells / tile) * tile  # whole tiles
+                several = {"level_count": min(self._at_once, levels - first)}
+            self._kernel.run(
+                (cells, cells, cells * slabs),
+                volume.bindings,
+                several,
+                mipmap=mipmap.texture,
+                first_level=first,
+            )
 
     def release(self) -> None:
         """Frees the program."""

@@ -11,15 +11,24 @@ from scipy import ndimage
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import clear_volume
+from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.gbuffer import MeshBuffers
-from deltalight.render_server.passes.volumes import PlacedVolume, place_volume
+from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
 from deltalight.render_server.passes.voxelize import (
     LONGEST_EDGE_VOXELS,
     EarlierCounts,
     Voxelize,
     VoxelizedMesh,
 )
-from deltalight.render_server.passes.voxels import SURFEL_BYTES, SURFELS_HEADER_BYTES, VoxelStore
+from deltalight.render_server.passes.voxels import (
+    DIRECTIONS,
+    SURFEL_BYTES,
+    SURFELS_HEADER_BYTES,
+    FilterVoxels,
+    VoxelMipmap,
+    VoxelStore,
+)
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import (
@@ -219,6 +228,49 @@ def test_a_gpu_counts_without_being_waited_for(gpu: GpuContext, monkeypatch: pyt
     assert [step for step, count in enumerate(missing) if count] == [4, 5]
     for each in (lab, exact):
         each.release()
+
+
+def test_a_volume_whose_voxels_change_a_little_is_not_waited_for(
+    gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coarse volume around everything in view is another one in each frame in which the camera moves."""
+    lab = VoxelLab(replace(gpu, is_software=False), SIZE)
+    edges = 1.0, 1.02, 1.05, 1.01, 0.8, 0.82  # m
+    mesh, waited = gpu_mesh(soup(np.random.default_rng(8), 400, (4.0,) * 3)), set()
+    wait = EarlierCounts.wait
+
+    def noted(earlier: EarlierCounts, *given: Any) -> Any:  # noqa: ANN401
+        waited.add(lab.placement.voxel_edge)
+        return wait(earlier, *given)
+
+    monkeypatch.setattr(EarlierCounts, "wait", noted)
+    for edge in edges:
+        lab.place(edge)
+        lab.surfels(mesh)
+    assert waited == {1.0, 0.8}
+    lab.release()
+
+
+@pytest.mark.parametrize(("size", "count"), [(24, 1), (40, 2), (64, 1)])
+def test_levels_filtered_together_are_those_of_one_after_the_other(
+    gpu: GpuContext, size: int, count: int
+) -> None:
+    volume = PlacedVolume(gpu, *[VolumePlacement((9.0 * i, 0.0, 0.0), 0.1, size) for i in range(count)])
+    mipmap = VoxelMipmap(gpu, size, DIRECTIONS)
+    mipmap.resize(size, count)
+    level_zero = np.random.default_rng(2).random((DIRECTIONS * size, size, count * size, 4))
+    found = []
+    for each in (gpu, replace(gpu, is_software=False)):
+        mipmap.texture.write(
+            level_zero.astype(np.float16).tobytes(), viewport=(0, 0, 0, *level_zero.shape[2::-1])
+        )
+        filtering = FilterVoxels(each)
+        filtering.run(mipmap, volume)
+        found.append(mipmap.texture.read())
+        clear_volume(gpu, mipmap.texture)
+        filtering.release()
+    assert found[0] == found[1]
+    release_all(mipmap, volume)
 
 
 def test_triangles_of_too_many_voxels_are_refused(lab: VoxelLab) -> None:

@@ -71,6 +71,11 @@ class VoxelLab:
         self._lights.set_environment(np.zeros((16, 16, 3), np.float32))
         self._cones = Kernel(gpu, Path(__file__).with_name("cones"))
 
+    def place(self, voxel_edge: float) -> None:
+        """Replace the cube by one of other voxels."""
+        self.placement = VolumePlacement((0.0, 0.0, 0.0), voxel_edge, self.placement.size)
+        self._volume.place(self.placement)
+
     def voxelize(
         self, store: VoxelStore, mesh: GpuMesh, behind_m: float = 0.0, chosen: np.ndarray | None = None
     ) -> None:

@@ -1,26 +1,27 @@
-// Filters one level of the six one-sided mipmaps (docs/method.md 4.4): two cells along k composited front to back,
-// mean of the four across. Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do
-// not occlude each other).
+// Filters levels of the six one-sided mipmaps (docs/method.md 4.4): two cells along k composited front to back, mean of
+// the four across. Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do not occlude
+// each other). With FUSED, a workgroup filters a tile of the first level, then the cells above it, which need no others.
 #include "common/volume.glsl"
 
+#ifdef FUSED
+layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
+layout(rgba16f) coherent uniform image3D mipmap;
+uniform int level_count;   // how many are written: until the tile is one cell, at most
+const int TILE = 8;
+#else
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
 layout(rgba16f) uniform image3D mipmap;
-uniform int level;          // the level to write; >= 1
+#endif
+uniform int first_level;   // to write; >= 1
 
-vec4 fetch(ivec3 cell, int k) { return imageLoad(mipmap, level_base(level - 1, k) + cell); }
+vec4 fetch(int level, ivec3 cell, int k) { return imageLoad(mipmap, level_base(level - 1, k) + cell); }
 
 vec4 front_to_back(vec4 front, vec4 back) {
     float room = 1.0 - front.a;
     return front + back * (back.a > room ? room / back.a : 1.0);
 }
 
-void main() {
-    int cells = volume_size >> level;
-    ivec3 id = ivec3(gl_GlobalInvocationID);
-    int slab = id.z / cells, k = slab % DIRECTIONS;
-    if (id.x >= cells || id.y >= cells || slab >= volume_count * DIRECTIONS) return;
-    work_in_volume(slab / DIRECTIONS);
-    ivec3 cell = ivec3(id.xy, id.z - slab * cells);
+void write_cell(int level, ivec3 cell, int k) {
     int along = k >> 1, u = (along + 1) % 3, v = (along + 2) % 3;
     ivec3 step_along = ivec3(0), step_u = ivec3(0), step_v = ivec3(0);
     step_along[along] = 1; step_u[u] = 1; step_v[v] = 1;
@@ -29,7 +30,34 @@ void main() {
     vec4 sum = vec4(0.0);
     for (int j = 0; j < 4; ++j) {
         ivec3 across = (j & 1) * step_u + (j >> 1) * step_v;
-        sum += front_to_back(fetch(front + across, k), fetch(back + across, k));
+        sum += front_to_back(fetch(level, front + across, k), fetch(level, back + across, k));
     }
     imageStore(mipmap, level_base(level, k) + cell, 0.25 * sum);
 }
+
+#ifdef FUSED
+void main() {
+    int cells = volume_size >> first_level, tiles = (cells + TILE - 1) / TILE;
+    int slab = int(gl_WorkGroupID.z) / tiles, k = slab % DIRECTIONS;
+    ivec3 tile = ivec3(gl_WorkGroupID.xy, int(gl_WorkGroupID.z) % tiles);
+    work_in_volume(slab / DIRECTIONS);
+    int thread = int(gl_LocalInvocationIndex);
+    for (int done = 0; done < level_count; ++done) {
+        int edge = TILE >> done;
+        ivec3 own = ivec3(thread % edge, thread / edge % edge, thread / (edge * edge));
+        ivec3 cell = tile * edge + own;
+        if (own.z < edge && all(lessThan(cell, ivec3(cells >> done)))) write_cell(first_level + done, cell, k);
+        memoryBarrierImage();
+        barrier();
+    }
+}
+#else
+void main() {
+    int cells = volume_size >> first_level;
+    ivec3 id = ivec3(gl_GlobalInvocationID);
+    int slab = id.z / cells;
+    if (id.x >= cells || id.y >= cells || slab >= volume_count * DIRECTIONS) return;
+    work_in_volume(slab / DIRECTIONS);
+    write_cell(first_level, ivec3(id.xy, id.z - slab * cells), slab % DIRECTIONS);
+}
+#endif
