@@ -130,7 +130,7 @@ DRAWS = ((moderngl.VertexArray, "render"), (moderngl.VertexArray, "render_indire
 BYTE_READS = tuple((owner, "read") for owner in (moderngl.Buffer, *TEXTURES))
 READS_INTO = tuple((owner, "read_into") for owner in (moderngl.Buffer, *TEXTURES))
 READS = (*BYTE_READS, *READS_INTO, (moderngl.Framebuffer, "read"))
-CLEARS = ((moderngl.Framebuffer, "clear"), (moderngl.Buffer, "clear"), (GpuContext, "clear_buffer"))
+CLEARS = ((moderngl.Framebuffer, "clear"), (moderngl.Buffer, "clear"), (GpuContext, "clear_start"))
 MIPMAPS = tuple((owner, "build_mipmaps") for owner in TEXTURES)
 
 

@@ -205,23 +205,14 @@ class GpuContext:
                 f"of one: lower {lower}."
             )
 
-    def clear_buffer(self, buffer: moderngl.Buffer, size: int | None = None) -> None:
-        """Sets the first `size` bytes of a buffer to zero (a multiple of 4; default: all), on the GPU.
+    def clear_start(self, buffer: moderngl.Buffer, size: int) -> None:
+        """Sets the first few bytes of a buffer to zero (a multiple of 4), on the GPU; more of it: `clear_buffer`.
 
-        `Buffer.clear` maps the buffer, so it waits for the GPU; `Buffer.write` lets drivers move the buffer to where
-        the CPU writes faster.
+        `Buffer.write` would let drivers move the buffer to where the CPU writes faster.
         """
         bind, clear = self._clearing
         bind(COPY_WRITE_BUFFER, buffer.glo)
-        clear(
-            COPY_WRITE_BUFFER,
-            R32UI,
-            0,
-            buffer.size if size is None else size,
-            RED_INTEGER,
-            UNSIGNED_INT,
-            None,
-        )
+        clear(COPY_WRITE_BUFFER, R32UI, 0, size, RED_INTEGER, UNSIGNED_INT, None)
 
     @cached_property
     def _clearing(self) -> tuple[Callable[..., None], Callable[..., None]]:

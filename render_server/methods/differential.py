@@ -15,7 +15,7 @@ import numpy as np
 from deltalight.protocol.scene_method import DifferentialMethod
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
@@ -116,7 +116,7 @@ class SolutionVoxels(DirectionalVoxels):
         self._resolve.resolve_mu(self.mu, real.store, real.volume)
         light.light_solution(real.store, rho, real.groups, with_objects=True, gathered=gathered)
         light.light_virtual(objects.store, rho, objects.groups, gathered=gathered)
-        self._gpu.clear_buffer(real.store.delta_sums)
+        clear_buffer(self._gpu, real.store.delta_sums)
         self._resolve.resolve_rho(self.rho, real.store, objects.store, real.volume)
         self._filter.run(self.mu, real.volume)
         self._filter.run(self.rho, real.volume)

@@ -9,7 +9,7 @@ import moderngl
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
@@ -108,7 +108,7 @@ class LpvCells:
 
     def _surfels(self, store: VoxelStore, meshes: Meshes) -> None:
         """Voxelises at half a cell; only the store's surfels are used."""
-        self._gpu.clear_buffer(store.grid)
+        clear_buffer(self._gpu, store.grid)
         self._voxelize.run(store, meshes, self._half_cells)
 
     def real_scene(
@@ -128,7 +128,7 @@ class LpvCells:
     def inject_real(self, real: VoxelStore, scene: Bindings, lights: LightBuffers) -> moderngl.Buffer:
         """Injects the real scene's light without objects."""
         self._albedo.run(lights, scene)
-        self._gpu.clear_buffer(self._real_light)
+        clear_buffer(self._gpu, self._real_light)
         self._maps.add_real(self._real_light, lights, self._albedo.atlas, scene)
         if self._blocks_environment:
             self._surfaces.add_real(self._real_light, real, scene)
@@ -158,7 +158,7 @@ class LpvCells:
         self, objects: VoxelStore, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer
     ) -> moderngl.Buffer:
         """Injects the change due to the objects."""
-        self._gpu.clear_buffer(self._change_light)
+        clear_buffer(self._gpu, self._change_light)
         self._maps.add_change(self._change_light, lights, self._albedo.atlas, scene)
         self._surfaces.add_virtual(self._change_light, objects, scene)
         return self._change_light
@@ -280,7 +280,7 @@ class DifferenceVolumes:
     ) -> LightVolume:
         """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
         for _ in range(self._settings.resolved_bounces):
-            self._gpu.clear_buffer(self._bounced_light)
+            clear_buffer(self._gpu, self._bounced_light)
             own = {**scene, **query_bindings(self._settings)}
             self._bounce.run(self._bounced_light, (self._cells.real, self._cells.objects), (mu, rho), own)
             self._rho.run(through, injected, change, self._bounced_light)
@@ -330,7 +330,7 @@ class PrintedVolumes:
     def inject_direct(self, scene: Bindings, lights: LightBuffers) -> moderngl.Buffer:
         """Injects the direct change ([P2] 4.3.2); nothing where shadow maps bring it."""
         if self._direct is not None:
-            self._gpu.clear_buffer(self._direct_light)
+            clear_buffer(self._gpu, self._direct_light)
             self._maps.add_direct(self._direct_light, lights, scene)
         return self._direct_light
 

@@ -14,7 +14,7 @@ import numpy as np
 from deltalight.protocol.scene_method import DvctMethod, VoxelConeSettings
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 from deltalight.render_server.gpu_scene import GeometryState
@@ -118,7 +118,7 @@ class VoxelSet:
     def forget_light(self) -> None:
         """Clears the sums if they hold light."""
         if self.is_lit:
-            self._gpu.clear_buffer(self.store.sums)
+            clear_buffer(self._gpu, self.store.sums)
         self.is_lit = True
 
     def release(self) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid, reuse_define
 from deltalight.render_server.passes.gbuffer import MaterialTable, ObjectBvh
@@ -81,7 +81,7 @@ class CausticBeams:
         needed = HEADER_BYTES + SENT_BEAM_BYTES * self.most
         if self._sent.size < needed:
             self._sent.orphan(needed)
-        self._gpu.clear_buffer(self._sent, HEADER_BYTES)
+        self._gpu.clear_start(self._sent, HEADER_BYTES)
 
     def _trace_beams(
         self,
@@ -136,7 +136,7 @@ class Caustics:
     def end_beams(self, sent: CausticBeams, scene: Bindings, reach_m: float) -> None:
         """Ends beams where they meet something within `reach_m`, of the real scene what the `scene`'s camera sees."""
         self._make_room(sent.most)
-        self._gpu.clear_buffer(self._count, 4)
+        self._gpu.clear_start(self._count, 4)
         self._end.run(
             (list_threads(self._gpu, sent.most),),
             sent.bindings,
@@ -157,7 +157,7 @@ class Caustics:
         """Fills the sums with the light of the beams where they end."""
         if self._last_sums is not None:
             self._sums, self._last_sums = self._last_sums, self._sums
-        self._gpu.clear_buffer(self._sums)
+        clear_buffer(self._gpu, self._sums)
         grid = self._grid
         if self._reuse is not None:
             self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)

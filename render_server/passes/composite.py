@@ -59,7 +59,7 @@ class ChangeRatio:
             change_ratio_out=self.ratio,
             Texels=None,
         )
-        self._gpu.clear_buffer(self.texels, LIST_HEADER_BYTES)
+        self._gpu.clear_start(self.texels, LIST_HEADER_BYTES)
         self._near.run(grid.size, sample_pixels=grid.pixels, change_ratio=self.ratio, Texels=self.texels)
 
     def release(self) -> None:

@@ -43,12 +43,12 @@ class LowResGrid:
         needed = 4 * (1 + self.texel_count)
         if texels.size < needed:
             texels.orphan(needed)
-        self._gpu.clear_buffer(texels, LIST_HEADER_BYTES)
+        self._gpu.clear_start(texels, LIST_HEADER_BYTES)
 
     def run(self, scene: Bindings) -> None:
         """Selects the pixels."""
         self.empty_list(self.virtual_texels)
-        self._gpu.clear_buffer(self.shown_pixels, LIST_HEADER_BYTES)
+        self._gpu.clear_start(self.shown_pixels, LIST_HEADER_BYTES)
         self._kernel.run(
             self.size,
             scene,

@@ -121,7 +121,7 @@ class ObjectCoverage:
         """
         self._target.use()
         self._target.clear()
-        self._gpu.clear_buffer(self.edges, LIST_HEADER_BYTES)
+        self._gpu.clear_start(self.edges, LIST_HEADER_BYTES)
         x, y, width, height = rectangle
         if width <= 0 or height <= 0:
             return

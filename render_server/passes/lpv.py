@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
 from deltalight.render_server.passes.gbuffer import NO_CUTOUTS
 from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.passes.voxels import LOWER_VOLUME, VoxelMipmap, VoxelStore
@@ -118,7 +118,7 @@ def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Buffer:
 
 def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
     buffer = gpu.storage_buffer(size, LOWER_VOLUME)
-    gpu.clear_buffer(buffer)
+    clear_buffer(gpu, buffer)
     return buffer
 
 
@@ -224,7 +224,7 @@ class LpvCoverFaces:
         `cells` is the placement of the cells; `store` was voxelised at half a cell per edge, from a mesh with these
         `cutouts`.
         """
-        self._gpu.clear_buffer(covered)
+        clear_buffer(self._gpu, covered)
         self._kernel.run(
             (self._threads,),
             store.bindings,

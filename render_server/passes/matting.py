@@ -44,7 +44,7 @@ class Matting:
 
         `reach_px` is rounded up to whole blocks; the other arguments are those of `ObjectCoverage.run`.
         """
-        self._gpu.clear_buffer(self._band, LIST_HEADER_BYTES)
+        self._gpu.clear_start(self._band, LIST_HEADER_BYTES)
         if rectangle[2] <= 0 or rectangle[3] <= 0:
             return
         own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}

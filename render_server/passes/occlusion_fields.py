@@ -9,7 +9,7 @@ from jaxtyping import Float16, Float32, Float64
 
 from deltalight.protocol.octahedral import octahedral_grid, texel_solid_angles
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer
 from deltalight.render_server.gpu.textures import texture_2d
 from deltalight.render_server.lights.octahedral import MAX_ORDER, harmonics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -146,7 +146,7 @@ class LightProbeCapture:
 
         `changes` is the factor by which objects change the light at each texel of the grid, applied to the sum.
         """
-        self._gpu.clear_buffer(self._sums)
+        clear_buffer(self._gpu, self._sums)
         kernel = self._gather if changes is None else self._gather_changed
         kernel.run(
             grid.size,
@@ -160,7 +160,7 @@ class LightProbeCapture:
 
     def forget(self) -> None:
         """Drops what was gathered, so that only the environment is left."""
-        self._gpu.clear_buffer(self._sums)
+        clear_buffer(self._gpu, self._sums)
 
     def resolve(self, probe: LightProbe, scene: Bindings, place: Bindings) -> None:
         """Computes radiance from the gathered sums and the environment, and its products."""

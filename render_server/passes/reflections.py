@@ -84,7 +84,7 @@ class MirrorRays:
 
     def _list_pixels(self, scene: Bindings) -> None:
         """Lists the pixels that need rays; the others reflect nothing."""
-        self._gpu.clear_buffer(self._pixels, LIST_HEADER_BYTES)
+        self._gpu.clear_start(self._pixels, LIST_HEADER_BYTES)
         self._select.run(
             self._grid.picture_size,
             scene,
@@ -101,7 +101,7 @@ class MirrorRays:
     def _gather_light(self, light: Bindings, scene: Bindings) -> None:
         """Computes the light at reflected points, at the resolution of the cones."""
         grid = self._grid
-        self._gpu.clear_buffer(self._texels, LIST_HEADER_BYTES)
+        self._gpu.clear_start(self._texels, LIST_HEADER_BYTES)
         self._hits.run(
             grid.size,
             self._objects.bindings,
@@ -198,7 +198,7 @@ class ScreenCones:
         `object_rays`: what rays saw of the objects (`MirrorRays.reflection`), so that cones leave them out.
         """
         if self._list_quads is not None:
-            self._gpu.clear_buffer(self._pixels, LIST_HEADER_BYTES)
+            self._gpu.clear_start(self._pixels, LIST_HEADER_BYTES)
             texels: Bindings = {"Texels": self._grid.virtual_texels, "scale": self._grid.scale}
             self._list_quads.run((self._threads,), texels, scene, ShownPixels=self._pixels)
         rays: Bindings = {"OBJECT_RAYS": object_rays is not None, "object_rays": object_rays}

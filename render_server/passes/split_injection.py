@@ -3,7 +3,7 @@
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_volume, list_threads
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, clear_volume, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
@@ -58,7 +58,7 @@ class SplitInjection:
     ) -> None:
         """Injects all lights; `scene` brings the objects' materials."""
         for store in (real, virtual):
-            self._gpu.clear_buffer(store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4)
+            clear_buffer(self._gpu, store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4)
         sums: Bindings = {
             **real.bindings,
             "RealLight": real.delta_sums,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.volumes import MOST_VOLUMES
@@ -71,8 +71,8 @@ class SurfelGroups:
         if store.surfel_capacity != self._room:
             self._release_growing()
             self._allocate(store.surfel_capacity)
-        self._gpu.clear_buffer(self._grid)
-        self._gpu.clear_buffer(self._entries, HEADER_BYTES)
+        clear_buffer(self._gpu, self._grid)
+        self._gpu.clear_start(self._entries, HEADER_BYTES)
 
     def _allocate(self, surfels: int) -> None:
         """Allocates the buffers that grow, with room for `surfels` surfels."""
@@ -132,7 +132,7 @@ class LightVoxels:
         self, store: VoxelStore, scene: Bindings, groups: SurfelGroups, *, gathered: bool = False
     ) -> None:
         """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support."""
-        self._gpu.clear_buffer(store.delta_sums)
+        clear_buffer(self._gpu, store.delta_sums)
         self._run("REAL_DELTA", store, groups, scene, gathered=gathered)
 
     def light_virtual(
@@ -159,7 +159,7 @@ class LightVoxels:
 
         Run it without objects first, so that `groups` hold E_mu for the other solution.
         """
-        self._gpu.clear_buffer(store.sums)
+        clear_buffer(self._gpu, store.sums)
         self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, scene, gathered=gathered)
 
     def _run(

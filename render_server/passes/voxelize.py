@@ -190,7 +190,7 @@ class VoxelPairs:
 
     def _list(self, filling: Filling) -> None:
         """Lists the pairs of short triangles, then those of long ones; what has no room is only counted."""
-        self._gpu.clear_buffer(self._pairs, PAIRS_HEADER_BYTES)
+        self._gpu.clear_start(self._pairs, PAIRS_HEADER_BYTES)
         mesh, longest_m = filling.mesh, LONGEST_EDGE_VOXELS * filling.placement.voxel_edge
         shared: Bindings = {
             **filling.bindings,

@@ -11,6 +11,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import (
     Binding,
     Kernel,
+    clear_buffer,
     clear_volume,
     list_threads,
 )
@@ -126,7 +127,7 @@ class VoxelStore:
     def _allocate_grid(self, size: int, count: int) -> None:
         self.volume_size, self.volume_count = size, count
         self.grid = self._gpu.storage_buffer(count * size**3 * 4, LOWER_VOLUME)
-        self._gpu.clear_buffer(self.grid)
+        clear_buffer(self._gpu, self.grid)
 
     def resize(self, size: int, count: int) -> None:
         """Makes room for `count` volumes of `size` voxels an edge, and forgets all voxels."""
@@ -179,8 +180,8 @@ class VoxelStore:
             self._gpu.check_storage(surfel_bound * LARGEST_ITEM_BYTES, LOWER_SURFELS)
             self._release_growing()
             self._allocate(self._room_for(surfel_bound))
-        self._gpu.clear_buffer(self.surfels, SURFELS_HEADER_BYTES)
-        self._gpu.clear_buffer(self.touched, TOUCHED_HEADER_BYTES)
+        self._gpu.clear_start(self.surfels, SURFELS_HEADER_BYTES)
+        self._gpu.clear_start(self.touched, TOUCHED_HEADER_BYTES)
 
     def _room_for(self, surfels: int) -> int:
         """Room to grow, up to what a buffer can hold."""
@@ -227,7 +228,7 @@ class OccupyVoxels:
 
     def run(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore) -> None:
         """Replaces the mipmap's occupancy by that of the store."""
-        self._gpu.clear_buffer(mipmap.occupied)
+        clear_buffer(self._gpu, mipmap.occupied)
         self._mark(mipmap, volume, store)
 
     def add(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore, to: VoxelMipmap) -> None:

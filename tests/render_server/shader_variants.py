@@ -178,6 +178,7 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     """Compiles what software and GPUs do differently, both ways wherever this runs, and what a budget brings."""
     for tiled in (False, True):
         LpvPropagate(gpu, tiled=tiled).release()
+    Kernel(gpu, "clear_buffer").release()
     for fused in ({}, {"FUSED": 1}):
         Kernel(gpu, "filter_voxels", **fused).release()
     for rows in (2, 8):

@@ -1,6 +1,7 @@
 """Buffers are cleared on the GPU, and lists are walked by as many workgroups as the GPU counted."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import moderngl
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import (
+    CLEARING_GROUPS,
     BindingError,
     Dispatch,
+    clear_buffer,
     watched,
 )
 from deltalight.render_server.gpu.list_groups import ListGroups
@@ -17,10 +20,16 @@ from tests.render_server.tiny_kernel import MakeKernel, floats
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 FULL = 0xFFFFFFFF
-WORDS = 2**20 + 77
+WORDS = 256 * CLEARING_GROUPS + 77  # more than the workgroups clear in one stride, and no multiple of four
 WALK = """
 #include "common/work_list.glsl"
 """
+
+
+@pytest.fixture(params=["software", "hardware"])
+def either(gpu: GpuContext, request: pytest.FixtureRequest) -> GpuContext:
+    """The context as it is, and as that of a GPU."""
+    return replace(gpu, is_software=request.param == "software")
 
 
 @pytest.fixture
@@ -41,41 +50,53 @@ def words(buffer: moderngl.Buffer) -> np.ndarray:
     return np.frombuffer(buffer.read(), np.uint32)
 
 
-def test_a_buffer_is_cleared_whole(gpu: GpuContext, full: moderngl.Buffer) -> None:
-    gpu.clear_buffer(full)
+def test_a_buffer_is_cleared_whole(either: GpuContext, full: moderngl.Buffer) -> None:
+    clear_buffer(either, full)
     assert not words(full).any()
 
 
 @pytest.mark.parametrize("count", [1, 300])
-def test_the_first_bytes_of_a_buffer_are_cleared(gpu: GpuContext, full: moderngl.Buffer, count: int) -> None:
-    gpu.clear_buffer(full, 4 * count)
+def test_the_first_bytes_of_a_buffer_are_cleared(
+    either: GpuContext, full: moderngl.Buffer, count: int
+) -> None:
+    clear_buffer(either, full, 4 * count)
     assert not words(full)[:count].any()
     assert (words(full)[count:] == FULL).all()
 
 
-def test_no_buffer_is_mapped_to_be_cleared(
+def test_on_a_gpu_no_buffer_is_mapped_to_be_cleared(
     gpu: GpuContext, full: moderngl.Buffer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def clear(*_args: object, **_more: object) -> None:
+        raise AssertionError("it is mapped")
+
+    monkeypatch.setattr(moderngl.Buffer, "clear", clear)
+    seen: list[Dispatch] = []
+    hardware = replace(gpu, is_software=False)
+    with watched(hardware, seen.append):
+        clear_buffer(hardware, full)
+        clear_buffer(hardware, full, 400)
+    assert [(one.kernel, one.size) for one in seen] == [
+        ("clear_buffer", (CLEARING_GROUPS, 1, 1)),
+        ("clear_buffer", (1, 1, 1)),
+    ]
+    assert seen[0].written == {"Cleared": full}
+
+
+def test_the_start_of_a_buffer_is_cleared_between_kernels_and_untouched_by_the_cpu(
+    gpu: GpuContext, full: moderngl.Buffer, make: MakeKernel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def touch(*_args: object, **_more: object) -> None:
         raise AssertionError("the CPU touches it")
 
     monkeypatch.setattr(moderngl.Buffer, "clear", touch)
     monkeypatch.setattr(moderngl.Buffer, "write", touch)
-    gpu.clear_buffer(full)
-    gpu.clear_buffer(full, 400)
-    assert not words(full).any()
-
-
-def test_kernels_write_to_a_buffer_after_it_was_cleared(
-    gpu: GpuContext, full: moderngl.Buffer, make: MakeKernel
-) -> None:
     kernel = make("", "values[gl_GlobalInvocationID.x] += 7.0;", "local_size_x = 4")
-    gpu.clear_buffer(full)
-    kernel.run((8,), Out=full)
-    gpu.clear_buffer(full)
-    kernel.run((8,), Out=full)
+    for _ in range(2):
+        gpu.clear_start(full, 32)
+        kernel.run((8,), Out=full)
     assert floats(full, 8) == [7.0] * 8
-    assert not words(full)[8:].any()
+    assert (words(full)[8:] == FULL).all()
 
 
 @pytest.mark.parametrize("length", [0, 1, 4, 5, 1023, 1024, 1025, 5000])

@@ -48,7 +48,7 @@ CHECKED = {  # kinds whose stages' writes are checked: the frames differ in the 
     "estimated": "depth",
 }
 REGENERATE = os.environ.get("DELTALIGHT_REGENERATE_GOLDENS") == "1"
-CLEARS = ("clear_volume",)
+CLEARS = ("clear_buffer", "clear_volume")
 CPU_FLAGS = ("avx", "avx2", "fma", "avx512f")  # that change the last bits of what llvmpipe and numpy compute
 
 

@@ -172,8 +172,9 @@ def of_corners(corners: np.ndarray) -> GpuMesh:
     return merge_for_gpu([TriangleMesh(positions, np.zeros_like(positions), triangles, None, Material())])
 
 
-def test_long_triangles_are_cut_into_the_pieces_of_the_mesh_code(lab: VoxelLab) -> None:
-    """To the bit, with more pieces than there is room for at first."""
+def test_long_triangles_are_cut_into_the_pieces_of_the_mesh_code(gpu: GpuContext) -> None:
+    """To the bit, with more pieces than there is room for at first, and no earlier filling to go by."""
+    lab = VoxelLab(gpu, SIZE)
     rng = np.random.default_rng(5)
     corners = np.concatenate(
         [
@@ -187,16 +188,20 @@ def test_long_triangles_are_cut_into_the_pieces_of_the_mesh_code(lab: VoxelLab) 
     found = sorted_surfels(lab, of_corners(corners))
     assert len(found) > 10_000
     assert np.array_equal(found, sorted_surfels(lab, of_corners(pieces)))
+    lab.release()
 
 
-def test_backs_are_those_of_the_mesh_code(lab: VoxelLab) -> None:
+def test_backs_are_those_of_the_mesh_code(gpu: GpuContext, lab: VoxelLab) -> None:
+    """To the bit in software; GPUs may round divisions and roots otherwise."""
     rng = np.random.default_rng(6)
     corners = rng.uniform(5, SIZE - 5, (300, 1, 3)) + rng.uniform(-4, 4, (300, 3, 3))
     mesh = of_corners(corners)
     backs = back_faces(mesh.corners, 1.0)
-    assert np.array_equal(
-        sorted_surfels(lab, mesh, BACK_OFFSET_VOXELS), sorted_surfels(lab, of_corners(backs))
-    )
+    found, wanted = sorted_surfels(lab, mesh, BACK_OFFSET_VOXELS), sorted_surfels(lab, of_corners(backs))
+    if gpu.is_software:
+        assert np.array_equal(found, wanted)
+    assert len(found) == pytest.approx(len(wanted), rel=1e-3)
+    np.testing.assert_allclose(found[:, :4].mean(axis=0), wanted[:, :4].mean(axis=0), rtol=1e-4)
 
 
 def test_chosen_triangles_alone_are_voxelised(lab: VoxelLab) -> None:
@@ -209,12 +214,12 @@ def test_chosen_triangles_alone_are_voxelised(lab: VoxelLab) -> None:
 def test_a_gpu_counts_without_being_waited_for(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) -> None:
     """But for the first filling, and for the second after one that had no room for all."""
     lab = VoxelLab(replace(gpu, is_software=False), SIZE)
-    exact = VoxelLab(gpu, SIZE)
     few, many = (gpu_mesh(soup(np.random.default_rng(8), 400, (edge,) * 3)) for edge in (1.5, 25.0))
     shown = [few] * 4 + [many] * 6
     waited: list[int] = []
     missing: list[int] = []
-    wanted = {id(mesh): len(exact.surfels(mesh)[1]) for mesh in (few, many)}
+    exact = {id(mesh): VoxelLab(gpu, SIZE) for mesh in (few, many)}  # what each has is waited for
+    wanted = {id(mesh): len(exact[id(mesh)].surfels(mesh)[1]) for mesh in (few, many)}
     wait = EarlierCounts.wait
 
     def noted(earlier: EarlierCounts, *given: Any) -> Any:  # noqa: ANN401
@@ -226,7 +231,7 @@ def test_a_gpu_counts_without_being_waited_for(gpu: GpuContext, monkeypatch: pyt
         missing.append(wanted[id(mesh)] - len(lab.surfels(mesh)[1]))
     assert set(waited) == {0, 6}
     assert [step for step, count in enumerate(missing) if count] == [4, 5]
-    for each in (lab, exact):
+    for each in (lab, *exact.values()):
         each.release()
 
 
@@ -273,10 +278,12 @@ def test_levels_filtered_together_are_those_of_one_after_the_other(
     release_all(mipmap, volume)
 
 
-def test_triangles_of_too_many_voxels_are_refused(lab: VoxelLab) -> None:
+def test_triangles_of_too_many_voxels_are_refused(gpu: GpuContext) -> None:
+    lab = VoxelLab(gpu, SIZE)  # a GPU would tell those of an earlier filling later
     mesh = of_corners(np.array([[[-1e6, -1e6, 20.5], [2e6, -1e6, 20.5], [-1e6, 2e6, 20.5]]]))
     with pytest.raises(DeltalightError, match="use fewer voxels"):
         lab.surfels(mesh)
+    lab.release()
 
 
 TILTED = {
