@@ -111,8 +111,13 @@ def _cone_coordinates(half_angle: float, size: int, source_size: int) -> Float32
 def _cone_sum(
     source: Float32[np.ndarray, "n n 3"], half_angle: float, size: int
 ) -> Float32[np.ndarray, "m m 3"]:
-    """Averages over wide cones by the plain sum over all texels of a source map."""
-    total = _cone_weights(half_angle, size, len(source)) @ source.reshape(-1, 3)
+    """Averages over wide cones by the plain sum over all texels of a source map.
+
+    BLAS multiplies by four columns in less time than by three.
+    """
+    columns = np.zeros((source.shape[0] * source.shape[1], 4), np.float32)
+    columns[:, :3] = source.reshape(-1, 3)
+    total = (_cone_weights(half_angle, size, len(source)) @ columns)[:, :3]
     return np.asarray(total.reshape(size, size, 3), np.float32)
 
 
