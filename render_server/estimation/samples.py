@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Float64, Int64, UInt8
 
 from deltalight.protocol.frames import ViewFrame, decode_lut
-from deltalight.render_server.frame import Observation
+from deltalight.render_server.frame import ObjectSurface, Observation
 from deltalight.render_server.frame_graph import FrameGraph
 from deltalight.render_server.gpu.textures import read_texels
 from deltalight.render_server.lights.lights import LightSet
@@ -177,15 +177,20 @@ def sample_light(graph: FrameGraph, lights: LightSet, bounce: Gathered | None) -
 
     Without `bounce`, all light that the cones gather is attributed to the lights.
     """
-    fields, shown, frame = graph.evaluate(lights), graph.shown(), graph.inputs.frame
+    fields, resources, frame = graph.evaluate(lights), graph.resources, graph.inputs.frame
+    shown = graph.kept(_shown, resources.observation, resources.object_surface)
     surface, scale = seen_surface(graph), fields.grid.scale
     cones, direct = read_texels(fields.cones.mu), read_texels(fields.direct.light.mu)
-    rows, columns = (np.arange(n) // scale for n in direct.shape[:2])
-    known = surface.position[:, 3].reshape(direct.shape[:2]) > 0
-    covered = read_texels(shown.object_coverage)[..., 0] > 0
+    rows, columns = (np.arange(n) // scale for n in shown.shape)
     traced = (cones[..., 3] > 0)[np.ix_(rows, columns)]
     picture = LitPicture(frame, surface, direct.reshape(-1, 4), cones, bounce, scale)
-    return LightSamples(picture, np.flatnonzero(known & ~covered & traced))
+    return LightSamples(picture, np.flatnonzero(shown & traced))
+
+
+def _shown(seen: Observation, objects: ObjectSurface) -> Bool[np.ndarray, "h w"]:
+    """Returns which pixels show real surfaces at known places, and nothing of an object."""
+    known = read_texels(seen.surface.position)[..., 3] > 0
+    return np.asarray(known & ~(read_texels(objects.coverage.texture)[..., 0] > 0))
 
 
 FIRST_WAIT_S = 1.0
