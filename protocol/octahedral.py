@@ -99,6 +99,18 @@ def texel_coordinates(directions: Float[np.ndarray, "a b 3"], size: int) -> Floa
     return (octahedral_uv(directions) * size + 0.5).astype(np.float32)
 
 
+def resize_octahedral(radiance: Float32[np.ndarray, "n n 3"], size: int) -> Float32[np.ndarray, "m m 3"]:
+    """Read a map bilinearly at the texel centres of one of another size."""
+    return sample_at(radiance, _grid_coordinates(size, len(radiance)))
+
+
+@cache
+def _grid_coordinates(size: int, source_size: int) -> Float32[np.ndarray, "n n 2"]:
+    coordinates = texel_coordinates(octahedral_grid(size), source_size)
+    coordinates.flags.writeable = False
+    return coordinates
+
+
 def sample_at(
     radiance: Float32[np.ndarray, "n n 3"], coordinates: Float32[np.ndarray, "a b 2"]
 ) -> Float32[np.ndarray, "a b 3"]:

@@ -1,9 +1,9 @@
 """The graph of one scene's frames: shared stages, the method's own stages, and composition."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from operator import eq, is_
-from typing import Any
+from typing import Any, TypeVar
 
 import moderngl
 import numpy as np
@@ -38,6 +38,8 @@ from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.precomputed import Precomputed
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.view import NOWHERE, CameraView, Rectangle
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -205,6 +207,7 @@ class FrameGraph:
         self._views: Composition | None = None  # made when somebody looks at another view
         self._composite = self._declare_composition(Composition(graph.gpu, size))
         self._inputs: FrameInputs | None = None
+        self._kept: dict[Callable[..., Any], tuple[object, Any]] = {}
 
     def _declare_composition(self, composition: Composition) -> Resource[Composite]:
         g, s, layers = self.graph, self.resources, self.layers
@@ -270,6 +273,15 @@ class FrameGraph:
         """Everything that the frame is rendered from."""
         assert self._inputs is not None
         return self._inputs
+
+    def kept(self, make: Callable[..., T], *of: Resource[Any], **constants: int) -> T:
+        """Returns what `make` makes of resources, brought up to date, and constants; kept until any changes."""
+        self._run(*of)
+        seen = *(item.version for item in of), constants
+        if make not in self._kept or self._kept[make][0] != seen:
+            self._kept[make] = seen, make(*(item.value for item in of), **constants)
+        found: T = self._kept[make][1]
+        return found
 
     @property
     def observation(self) -> Observation:

@@ -28,10 +28,8 @@ class AlbedoEstimator:
         if self._is_given or not self._schedule.is_due(graph.inputs.frame.timestamp_ns):
             return False
         samples = sample_light(graph, lights, None)
-        lit = samples.usable & samples.unshadowed
-        self._volume.observe(
-            graph.inputs.real.bounds, samples.position[lit], samples.measured[lit], samples.light[lit]
-        )
+        lit = samples.of(samples.usable & samples.unshadowed)
+        self._volume.observe(graph.inputs.real.bounds, lit.position, lit.measured, lit.light)
         self.texture.upload(self._volume)
         return True
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from deltalight.protocol.octahedral import octahedral_grid
 from deltalight.render_server.lights.lights import Light, incident_light
@@ -21,6 +21,7 @@ MIN_FRACTION = 0.02
 CANDIDATES = 200
 # Nearer to this plane than to one at a right angle: correlated noise of stereo turns normals by more than 15 degrees.
 NORMAL_COSINE = float(np.sqrt(0.5))
+PLANES_AT_ONCE = 16  # of hypotheses: their distances to all points stay in the processor's cache
 MIN_POINTS = 3
 REFINEMENTS = 3  # least-squares fits to the inliers; after that a plane hardly moves
 
@@ -37,6 +38,25 @@ class PointCloud:
         """Returns which points lie on the plane with this normal and distance from the origin, and face its way."""
         near = np.abs(self.position @ axis - offset) <= self.tolerance_m
         return np.asarray(near & (self.normal @ axis >= NORMAL_COSINE))
+
+    def count_inliers(
+        self, axes: Float64[np.ndarray, "m 3"], offsets: Float64[np.ndarray, " m"]
+    ) -> Int64[np.ndarray, " m"]:
+        """Returns how many points are inliers of each of several planes."""
+        position, normal = (np.ascontiguousarray(each.T) for each in (self.position, self.normal))
+        count = np.zeros(len(axes), np.int64)
+        for first in range(0, len(axes), PLANES_AT_ONCE):
+            some = slice(first, first + PLANES_AT_ONCE)
+            away = axes[some] @ position
+            away -= offsets[some, None]
+            lies = np.abs(away, out=away) <= self.tolerance_m
+            lies &= np.matmul(axes[some], normal, out=away) >= NORMAL_COSINE
+            count[some] = [np.count_nonzero(each) for each in lies]
+        return count
+
+    def only(self, chosen: Int64[np.ndarray, " n"]) -> "PointCloud":
+        """Returns the chosen points."""
+        return PointCloud(self.position[chosen], self.normal[chosen], self.tolerance_m[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +92,13 @@ def _largest_plane(cloud: PointCloud, free: Bool[np.ndarray, " k"]) -> DetectedP
     if len(remaining) < min_count:
         return None
     candidates = remaining[np.linspace(0, len(remaining) - 1, min(CANDIDATES, len(remaining))).astype(int)]
-    planes = [(cloud.normal[i], float(cloud.position[i] @ cloud.normal[i])) for i in candidates]
-    count = [int((free & cloud.inliers(*plane)).sum()) for plane in planes]
-    axis, offset = planes[int(np.argmax(count))]
+    axes, places = cloud.normal[candidates], cloud.position[candidates]
+    count = cloud.only(remaining).count_inliers(axes, np.einsum("mi,mi->m", axes, places))
+    best = int(np.argmax(count))
+    axis, offset = axes[best], float(places[best] @ axes[best])
     for _ in range(REFINEMENTS):
         inliers = free & cloud.inliers(axis, offset)
-        if inliers.sum() < min_count:
+        if np.count_nonzero(inliers) < min_count:
             return None
         axis, offset = _fit_plane(cloud.position[inliers], axis)
     return DetectedPlane(axis, offset, inliers)

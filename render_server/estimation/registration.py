@@ -194,15 +194,11 @@ def _registered_with(graph: FrameGraph, lights: LightSet, tried: Float32[np.ndar
     """
     trial = lights.registered(tried)
     samples = sample_light(graph, trial, bounced_light(graph, trial))
-    known = samples.usable & (samples.albedo > 0)
-    found = registration_from_patch(
-        samples.measured[known], samples.light[known], samples.bounce[known], samples.albedo[known]
-    )
+    known = samples.of(samples.usable & (samples.albedo > 0))
+    found = registration_from_patch(known.measured, known.light, known.bounce, known.albedo)
     if found is None:
-        lit = samples.usable & samples.unshadowed
-        found = registration_from_albedo_percentile(
-            samples.measured[lit], samples.light[lit], samples.bounce[lit]
-        )
+        lit = samples.of(samples.usable & samples.unshadowed)
+        found = registration_from_albedo_percentile(lit.measured, lit.light, lit.bounce)
     return replace(found, factor=found.factor * tried)
 
 

@@ -1,90 +1,196 @@
 """Samples of the light that falls on real surfaces, next to what the camera measured there; when to measure again."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float16, Float32, Float64, Int64, UInt8
 
-from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.render_server.frame import ObjectSurface, Observation
 from deltalight.render_server.frame_graph import FrameGraph
-from deltalight.render_server.gpu.textures import read_texture
+from deltalight.render_server.gpu.textures import read_texels
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.scene.albedo import known_albedo, unclipped
 
 UNSHADOWED = 0.95  # fraction of its direct light that a pixel gets, from which on it counts as unshadowed
 
-Gathered = Float64[np.ndarray, "h w 3"]
-"""Irradiance that cones gather at each texel of the reduced grid."""
+Gathered = Float16[np.ndarray, "h w 4"]
+"""Irradiance that cones gather at each texel of the reduced grid; a: 1 where they were traced."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSurface:
+    """What the camera sees of the real scene, by pixel: position (world, m; w = 0 where it is unknown) and normal."""
+
+    position: Float32[np.ndarray, "n 4"]
+    normal: Float16[np.ndarray, "n 4"]
+
+    @classmethod
+    def of(cls, seen: Observation) -> "SeenSurface":
+        """Reads it back."""
+        return cls(
+            *(read_texels(each).reshape(-1, 4) for each in (seen.surface.position, seen.surface.normal))
+        )
+
+
+def seen_surface(graph: FrameGraph) -> SeenSurface:
+    """Returns what the camera sees, read back once while nothing moves."""
+    return graph.kept(SeenSurface.of, graph.resources.observation)
+
+
+def decoded(frame: ViewFrame, codes: UInt8[np.ndarray, "n m 3"]) -> Float32[np.ndarray, "n m 3"]:
+    """Returns codes of a frame's camera in linear units, before division by the exposure."""
+    if not codes.size:
+        return np.zeros(codes.shape, np.float32)
+    return np.asarray(cv2.LUT(codes, decode_lut(frame.response)[None]))
+
+
+@dataclass(frozen=True, eq=False)
+class LitPicture:
+    """A picture and the light that falls on what it shows: `direct` by pixel, the rest by texel of the reduced grid.
+
+    `bounce`: the part of `cones` that comes from real surfaces.
+    """
+
+    frame: ViewFrame
+    surface: SeenSurface
+    direct: Float16[np.ndarray, "n 4"]
+    cones: Gathered
+    bounce: Gathered | None
+    scale: int
+
+    @cached_property
+    def usable(self) -> Bool[np.ndarray, " n"]:
+        """Which pixels carry their true radiance."""
+        color = self.frame.color
+        return unclipped(color, decoded(self.frame, color)).ravel()
+
+    @cached_property
+    def albedo(self) -> Float32[np.ndarray, " n"]:
+        """The albedo of each pixel where it is known, else 0."""
+        frame = self.frame
+        if frame.board is None or frame.pose is None:
+            return np.zeros(len(self.direct), np.float32)
+        return known_albedo(frame.board, frame.camera, frame.pose).ravel()
 
 
 @dataclass(frozen=True, eq=False)
 class LightSamples:
-    """Samples at pixels that show real surfaces; positions in world metres, the rest linear RGB."""
+    """Samples at pixels that show real surfaces: what falls on them is looked up when it is asked for.
 
-    position: Float64[np.ndarray, "k 3"]
-    measured: Float64[np.ndarray, "k 3"]
-    direct: Float64[np.ndarray, "k 3"]
-    light: Float64[np.ndarray, "k 3"]
-    bounce: Float64[np.ndarray, "k 3"]
-    usable: Bool[np.ndarray, " k"]
-    albedo: Float32[np.ndarray, " k"]  # where it is known, else 0
-    lit: Float64[np.ndarray, " k"]  # fraction of the unshadowed direct light
-    pixel: Int64[np.ndarray, "k 2"]  # column, row
+    `pixel` counts row by row. Positions are in world metres, the rest is linear RGB.
+    """
+
+    picture: LitPicture
+    pixel: Int64[np.ndarray, " k"]
+
+    def of(self, chosen: Bool[np.ndarray, " k"] | Int64[np.ndarray, " n"]) -> "LightSamples":
+        """Returns some of the samples."""
+        return LightSamples(self.picture, self.pixel[chosen])
+
+    @property
+    def usable(self) -> Bool[np.ndarray, " k"]:
+        """Which samples carry their true radiance."""
+        return np.asarray(self.picture.usable[self.pixel])
+
+    @property
+    def albedo(self) -> Float32[np.ndarray, " k"]:
+        """Where it is known, else 0."""
+        return np.asarray(self.picture.albedo[self.pixel])
+
+    @property
+    def position(self) -> Float64[np.ndarray, "k 3"]:
+        """Places of the surfaces."""
+        return self.picture.surface.position[self.pixel, :3].astype(np.float64)
+
+    @property
+    def normal(self) -> Float64[np.ndarray, "k 3"]:
+        """Normals of the surfaces."""
+        return self.picture.surface.normal[self.pixel, :3].astype(np.float64)
+
+    @property
+    def measured(self) -> Float32[np.ndarray, "k 3"]:
+        """Radiance that the camera measured."""
+        frame = self.picture.frame
+        coded = decoded(frame, frame.color.reshape(-1, 1, 3)[self.pixel])[:, 0]
+        return np.asarray(coded / frame.exposure_scale)
+
+    @property
+    def direct(self) -> Float64[np.ndarray, "k 3"]:
+        """Irradiance of the lights."""
+        return self.picture.direct[self.pixel, :3].astype(np.float64)
+
+    @property
+    def lit(self) -> Float64[np.ndarray, " k"]:
+        """Fraction of the unshadowed direct light."""
+        own = self.picture.direct[self.pixel].astype(np.float64)
+        whole = own[:, 3]
+        part = np.divide(own[:, :3].mean(axis=1), whole, out=np.ones(len(own)), where=whole > 0)
+        return np.asarray(part)
 
     @property
     def unshadowed(self) -> Bool[np.ndarray, " k"]:
         """Which samples receive nearly all of their direct light."""
         return np.asarray(self.lit >= UNSHADOWED)
 
-    def of(self, chosen: Bool[np.ndarray, " k"]) -> "LightSamples":
-        """Returns some of the samples."""
-        return LightSamples(**{name: values[chosen] for name, values in vars(self).items()})
+    @property
+    def bounce(self) -> Float64[np.ndarray, "k 3"]:
+        """Irradiance that comes from real surfaces; 0 where it is attributed to the lights."""
+        bounce = self.picture.bounce
+        return np.zeros((len(self.pixel), 3)) if bounce is None else self._of_texels(bounce)
+
+    @property
+    def light(self) -> Float64[np.ndarray, "k 3"]:
+        """Irradiance of lights and environment."""
+        return np.asarray(self.direct + self._of_texels(self.picture.cones) - self.bounce)
 
     def gather(self, graph: FrameGraph, lights: LightSet) -> Float64[np.ndarray, "k 3"]:
         """Returns the irradiance that cones gather at the samples under other lights."""
         scale = graph.layers.grid.value.scale
-        low, high = self.pixel.min(axis=0) - 2 * scale, self.pixel.max(axis=0) + 2 * scale  # a filter's reach
-        found = read_texture(graph.gather(lights, (*low.tolist(), *(high - low).tolist())).mu)
-        column, row = (self.pixel // scale).T
-        return found[row, column, :3]
+        pixel = np.stack(self._places, axis=1)
+        low, high = pixel.min(axis=0) - 2 * scale, pixel.max(axis=0) + 2 * scale  # a filter's reach
+        found = read_texels(graph.gather(lights, (*low.tolist(), *(high - low).tolist())).mu)
+        return self._of_texels(found)
+
+    @property
+    def _places(self) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
+        """Columns and rows."""
+        row, column = np.divmod(self.pixel, self.picture.frame.color.shape[1])
+        return column, row
+
+    def _of_texels(self, gathered: Gathered) -> Float64[np.ndarray, "k 3"]:
+        """Looks up what was gathered; a pixel's cones are those of its texel of the grid."""
+        column, row = (each // self.picture.scale for each in self._places)
+        return gathered[row, column, :3].astype(np.float64)
 
 
 def bounced_light(graph: FrameGraph, lights: LightSet) -> Gathered:
     """Returns the irradiance that cones gather from real surfaces alone, traced under a black environment."""
     black = replace(lights, environment=np.zeros_like(lights.environment))
-    return read_texture(graph.gather(black, (0, 0, *graph.inputs.view.size)).mu)[..., :3]
+    return read_texels(graph.gather(black, (0, 0, *graph.inputs.view.size)).mu)
 
 
 def sample_light(graph: FrameGraph, lights: LightSet, bounce: Gathered | None) -> LightSamples:
-    """Reads the fields back where the real scene is visible; a pixel's cones are those of its texel of the grid.
+    """Reads the fields back where the real scene is visible.
 
     Without `bounce`, all light that the cones gather is attributed to the lights.
     """
-    fields, shown, frame = graph.evaluate(lights), graph.shown(), graph.inputs.frame
-    cones, direct = read_texture(fields.cones.mu), read_texture(fields.direct.light.mu)
-    rows, columns = (np.arange(n) // fields.grid.scale for n in direct.shape[:2])
-    position = read_texture(shown.real_surface.position)
-    known = position[..., 3] > 0
-    covered = read_texture(shown.object_coverage)[..., 0] > 0
-    y, x = np.nonzero(known & ~covered & (cones[np.ix_(rows, columns)][..., 3] > 0))
-    coded = decode_lut(frame.response)[frame.color, np.arange(3)]
-    own = direct[y, x]
-    lit = np.divide(own[:, :3].mean(axis=1), own[:, 3], out=np.ones(len(own)), where=own[:, 3] > 0)
-    reflected = np.zeros((len(y), 3)) if bounce is None else bounce[rows[y], columns[x]]
-    albedo = np.zeros(known.shape, np.float32)
-    if frame.board is not None and frame.pose is not None:
-        albedo = known_albedo(frame.board, frame.camera, frame.pose)
-    return LightSamples(
-        position[y, x, :3],
-        (coded / frame.exposure_scale)[y, x],
-        own[:, :3],
-        own[:, :3] + cones[rows[y], columns[x]][:, :3] - reflected,
-        reflected,
-        unclipped(frame.color, coded)[y, x],
-        albedo[y, x],
-        lit,
-        np.stack([x, y], axis=1),
-    )
+    fields, resources, frame = graph.evaluate(lights), graph.resources, graph.inputs.frame
+    shown = graph.kept(_shown, resources.observation, resources.object_surface)
+    surface, scale = seen_surface(graph), fields.grid.scale
+    cones, direct = read_texels(fields.cones.mu), read_texels(fields.direct.light.mu)
+    rows, columns = (np.arange(n) // scale for n in shown.shape)
+    traced = (cones[..., 3] > 0)[np.ix_(rows, columns)]
+    picture = LitPicture(frame, surface, direct.reshape(-1, 4), cones, bounce, scale)
+    return LightSamples(picture, np.flatnonzero(shown & traced))
+
+
+def _shown(seen: Observation, objects: ObjectSurface) -> Bool[np.ndarray, "h w"]:
+    """Returns which pixels show real surfaces at known places, and nothing of an object."""
+    known = read_texels(seen.surface.position)[..., 3] > 0
+    return np.asarray(known & ~(read_texels(objects.coverage.texture)[..., 0] > 0))
 
 
 FIRST_WAIT_S = 1.0

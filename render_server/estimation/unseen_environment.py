@@ -1,11 +1,12 @@
 """Estimates of unobserved light: from the ground, from planes beyond the picture, and from everything else."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
-from deltalight.protocol.frames import LUMINANCE, decode_lut
+from deltalight.protocol import short_axis
+from deltalight.protocol.frames import LUMINANCE
 from deltalight.protocol.octahedral import octahedral_uv
 from deltalight.render_server.estimation.plane_extrapolation import (
     ExtrapolatedPlanes,
@@ -16,9 +17,10 @@ from deltalight.render_server.estimation.plane_extrapolation import (
     extrapolate_planes,
 )
 from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
-from deltalight.render_server.estimation.samples import LightSamples
+from deltalight.render_server.estimation.samples import LightSamples, SeenSurface, decoded
+from deltalight.render_server.frame import Observation
 from deltalight.render_server.frame_graph import FrameGraph
-from deltalight.render_server.gpu.textures import read_texture
+from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import irradiance_map
 
@@ -36,18 +38,16 @@ def find_extrapolated_planes(graph: FrameGraph, lights: LightSet, known: LightSa
     """
     inputs = graph.inputs
     usable = np.flatnonzero(known.usable)
-    chosen = usable[:: max(1, len(usable) // PLANE_SAMPLES)]
-    position, pixel = known.position[chosen], known.pixel[chosen]
-    normal = read_texture(graph.observation.surface.normal)[pixel[:, 1], pixel[:, 0], :3]
-    pose = inputs.view.world_from_camera
+    some = known.of(usable[:: max(1, len(usable) // PLANE_SAMPLES)])
+    position, pose = some.position, inputs.view.world_from_camera
     depth = (position - pose[:3, 3]) @ pose[:3, 2]
     tolerance = np.maximum(3 * inputs.scan.noise_sigma * depth**2, FLATNESS * depth)
-    indirect = (known.light + known.bounce - known.direct)[chosen]
-    seen = RealSamples(position, known.measured[chosen], known.lit[chosen], indirect, tolerance)
-    rays = inputs.frame.camera.rays().reshape(-1, 2).astype(np.float64)
-    sight = ViewFrustum(np.linalg.inv(pose), rays.min(axis=0), rays.max(axis=0))
+    indirect = some.light + some.bounce - some.direct
+    seen = RealSamples(position, some.measured, some.lit, indirect, tolerance)
+    first, last = short_axis.bounds(inputs.frame.camera.rays().reshape(-1, 2))
+    sight = ViewFrustum(np.linalg.inv(pose), first.astype(np.float64), last.astype(np.float64))
     low, high = inputs.objects.bounds
-    planes = detect_planes(PointCloud(position, normal, tolerance))
+    planes = detect_planes(PointCloud(position, some.normal, tolerance))
     size = len(lights.environment)
     return extrapolate_planes(planes, seen, lights.lights, sight, centre=(low + high) / 2, size=size)
 
@@ -61,8 +61,11 @@ def find_unseen_light(
     what the lights and the visible scene leave unexplained comes from those walls. None without such paper.
     `known` are samples under the same lamps as `lights`, whatever the environment.
     """
-    board, paper = graph.inputs.frame.board, known.of(known.usable & (known.albedo > 0))
-    if board is None or (board.white_albedo is None and not board.grey_cards) or not len(paper.albedo):
+    board = graph.inputs.frame.board
+    if board is None or (board.white_albedo is None and not board.grey_cards):
+        return None
+    paper = known.of(known.usable & (known.albedo > 0))
+    if not len(paper.pixel):
         return None
     black = replace(lights, environment=np.zeros_like(lights.environment))
     total = paper.direct + paper.gather(graph, lights)
@@ -72,16 +75,20 @@ def find_unseen_light(
 
 def ground_radiance(graph: FrameGraph) -> Float32[np.ndarray, "3"] | None:
     """Returns the mean radiance of upward-facing surfaces within two object sizes (docs/method.md 2)."""
-    surface, frame = graph.observation.surface, graph.inputs.frame
-    position, normal = read_texture(surface.position), read_texture(surface.normal)
-    low, high = graph.inputs.objects.bounds
-    away = np.linalg.norm(position[..., :3] - (low + high) / 2, axis=-1)
-    near = (position[..., 3] > 0) & (away <= GROUND_SIZES * float(np.max(high - low)))
-    ground = near & (normal[..., 2] > FACES_UP)
-    if not ground.any():
+    frame, resources = graph.inputs.frame, graph.resources
+    ground = graph.kept(_ground_pixels, resources.observation, resources.objects)
+    if not len(ground):
         return None
-    coded = decode_lut(frame.response)[frame.color[ground], np.arange(3)]
+    coded = decoded(frame, frame.color.reshape(-1, 1, 3)[ground])[:, 0]
     return np.asarray(coded.mean(axis=0) / frame.exposure_scale, np.float32)
+
+
+def _ground_pixels(seen: Observation, objects: GeometryState) -> Int64[np.ndarray, " k"]:
+    """Returns the pixels that show upward-facing surfaces within two object sizes."""
+    surface, (low, high) = SeenSurface.of(seen), objects.bounds
+    away = np.linalg.norm(surface.position[:, :3].astype(np.float64) - (low + high) / 2, axis=-1)
+    near = (surface.position[:, 3] > 0) & (away <= GROUND_SIZES * float(np.max(high - low)))
+    return np.flatnonzero(near & (surface.normal[:, 2].astype(np.float64) > FACES_UP))
 
 
 def unseen_light_shape(graph: FrameGraph, size: int) -> Float32[np.ndarray, "n n 1"]:
@@ -91,16 +98,33 @@ def unseen_light_shape(graph: FrameGraph, size: int) -> Float32[np.ndarray, "n n
     seen from the objects, would send to a surface facing each direction: as smooth as irradiance. It is uniform if no
     such surface is visible.
     """
-    frame = graph.inputs.frame
-    position = read_texture(graph.observation.surface.position)
-    low, high = graph.inputs.objects.bounds
-    direction = position[..., :3] - (low + high) / 2
-    seen = (position[..., 3] > 0) & (direction[..., 2] > 0)
-    luminance = decode_lut(frame.response)[frame.color[seen], np.arange(3)] @ LUMINANCE
-    texel = np.minimum((octahedral_uv(direction[seen]) * size).astype(int), size - 1)
-    flat = texel[:, 1] * size + texel[:, 0]
-    count = np.bincount(flat, minlength=size * size)
-    mean = np.bincount(flat, luminance, size * size) / np.maximum(count, 1)
+    frame, resources = graph.inputs.frame, graph.resources
+    seen = graph.kept(SkyPixels.of, resources.observation, resources.objects, size=size)
+    codes = frame.color.reshape(-1, 1, 3)[seen.pixel]
+    luminance = decoded(frame, codes)[:, 0] @ LUMINANCE
+    mean = np.bincount(seen.texel, luminance, size * size) / np.maximum(seen.count, 1)
     seen_radiance = np.repeat(mean.reshape(size, size, 1), 3, axis=2).astype(np.float32)
     shape = irradiance_map(seen_radiance)[..., :1]
     return shape / shape.max() if shape.max() > 0 else np.ones_like(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class SkyPixels:
+    """Pixels that show surfaces above the objects' horizon, and the texels of an octahedral map that they lie in.
+
+    `count`: how many lie in each texel.
+    """
+
+    pixel: Int64[np.ndarray, " k"]
+    texel: Int64[np.ndarray, " k"]
+    count: Int64[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, seen: Observation, objects: GeometryState, *, size: int) -> "SkyPixels":
+        """Finds them; `size` is the map's edge in texels."""
+        surface, (low, high) = SeenSurface.of(seen), objects.bounds
+        direction = surface.position[:, :3].astype(np.float64) - (low + high) / 2
+        pixel = np.flatnonzero((surface.position[:, 3] > 0) & (direction[:, 2] > 0))
+        texel = np.minimum((octahedral_uv(direction[pixel]) * size).astype(int), size - 1)
+        flat = texel[:, 1] * size + texel[:, 0]
+        return cls(pixel, flat, np.bincount(flat, minlength=size * size))

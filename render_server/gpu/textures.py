@@ -7,7 +7,7 @@ from typing import Any, Final, Protocol
 
 import moderngl
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 
 from deltalight.render_server.gpu.context import GpuContext
 
@@ -69,9 +69,14 @@ def read_texel(texture: moderngl.Texture, place: tuple[int, int]) -> Float32[np.
 
 def read_texture(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
     """Returns the contents of a half-float or float texture; waits until the GPU has written it."""
+    return read_texels(texture).astype(np.float64)
+
+
+def read_texels(texture: moderngl.Texture) -> Float[np.ndarray, "h w c"]:
+    """Returns the contents of a half-float or float texture in its own type; waits until the GPU has written it."""
     width, height = texture.size
     dtype = np.float16 if texture.dtype == "f2" else np.float32
-    return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)
+    return np.frombuffer(texture.read(), dtype).reshape(height, width, -1)
 
 
 def release_target(target: moderngl.Framebuffer) -> None:

@@ -14,7 +14,7 @@ from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.lights.lights import Light, LightSet
 from deltalight.render_server.lights.mirror_lights import mirror_lights
 from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.passes.lights import LightBuffers, MirrorVisibility
@@ -26,6 +26,8 @@ SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around th
 LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
 
 Points = Float64[np.ndarray, "n 3"]
+Fitted = tuple[tuple[Light, ...], GeometryState, ObjectExtent, SurfaceTable, bool]
+"""Lights, room, objects, mirrors, and whether only the shadows of the objects count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +67,7 @@ class LightStages:
     ) -> None:
         self._keeps_views = keeps_views
         self._receivers: tuple[GeometryState, Points, Points] | None = None
+        self._fitted: Fitted | None = None  # what the views are fitted to
         self.buffers = LightBuffers(gpu, tile_size, shadow_samples)
         self._mirrors = mirrors
         self._maps = ShadowMaps(gpu)
@@ -87,11 +90,26 @@ class LightStages:
         If an `area` of the picture is to be lit too, real shadows are those of the whole scene. Returns the records
         of both, which tell whether their maps are still those of the views.
         """
-        receivers = self._receivers_of(real, extent) if area == NOWHERE else real.points
-        shining = list(lights.lights)
+        fitted = lights.lights, real, extent, surfaces, area == NOWHERE
+        if self._fitted is None or any(
+            one is not other for one, other in zip(fitted, self._fitted, strict=True)
+        ):
+            self._place(*fitted)
+            self._fitted = fitted
+        return self.buffers.real_records, self.buffers.virtual_records
+
+    def _place(
+        self,
+        lights: tuple[Light, ...],
+        real: GeometryState,
+        extent: ObjectExtent,
+        surfaces: SurfaceTable,
+        is_around_objects: bool,
+    ) -> None:
+        receivers = self._receivers_of(real, extent) if is_around_objects else real.points
+        shining = list(lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent.points, axis=0)) if self._mirrors else []
         self.buffers.place(shining, real.points, receivers, extent.points, mirrors)
-        return self.buffers.real_records, self.buffers.virtual_records
 
     def _receivers_of(self, real: GeometryState, extent: ObjectExtent) -> Points:
         """Returns the real points on which shadows of the objects fall; the same while neither changes its place."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
-from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
+from deltalight.protocol.octahedral import resize_octahedral
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
@@ -264,8 +264,7 @@ def environment_texture(
     """
     prefiltered = prefilter(radiance)
     size, count = len(radiance), len(prefiltered.levels)
-    directions = octahedral_grid(size)
-    layers = [radiance, *(sample_octahedral(level, directions) for level in prefiltered.levels[1:])]
+    layers = [radiance, *(resize_octahedral(level, size) for level in prefiltered.levels[1:])]
     irradiance = np.pi * float(prefiltered.levels[-1].max())
     if irradiance > GREATEST_IRRADIANCE:
         layers = [layer * (GREATEST_IRRADIANCE / irradiance) for layer in layers]

@@ -21,6 +21,8 @@ MAX_COORDINATE_PX = 1e5  # fixed-point outlines overflow beyond this
 # left.
 INSETS_PX = (2, 1)
 EDGE_POINTS = 8
+# Of a patch's box: constant, and not what lies around the box in the whole picture.
+OUTSIDE_IS_OTHER = cv2.BORDER_CONSTANT | cv2.BORDER_ISOLATED
 # Limits of linear values and codes within which a pixel carries its true radiance.
 CLIPPED_LINEAR = 0.98
 CLIPPED_CODE = 255
@@ -80,7 +82,11 @@ def _inside(masks: list[UInt8[np.ndarray, "h w"]], camera: CameraModel) -> Bool[
     found = np.zeros((camera.height, camera.width), np.uint8)
     for inset in INSETS_PX:
         for mask in masks:
-            found |= cv2.erode(mask, _square(inset), borderValue=0)
+            x, y, width, height = cv2.boundingRect(mask)
+            if not width:
+                continue
+            box = slice(y, y + height), slice(x, x + width)
+            found[box] |= cv2.erode(mask[box], _square(inset), borderType=OUTSIDE_IS_OTHER, borderValue=0)
         if np.count_nonzero(found) >= SUFFICIENT_PIXELS:
             break
     return np.asarray(found.astype(bool))

@@ -106,6 +106,17 @@ def test_the_planes_of_a_noisy_corner_are_found_the_largest_first_and_always_the
         assert one.offset == other.offset
 
 
+def test_inliers_of_many_planes_are_counted_as_those_of_each() -> None:
+    rng = np.random.default_rng(5)
+    normal = rng.normal(size=(300, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    cloud = PointCloud(rng.uniform(0, 1, (300, 3)), normal, rng.uniform(0, 0.2, 300))
+    axes, offsets = normal[:45], rng.uniform(-1, 1, 45)
+    each = [np.count_nonzero(cloud.inliers(*plane)) for plane in zip(axes, offsets, strict=True)]
+    assert cloud.count_inliers(axes, offsets).tolist() == each
+    assert any(each)
+
+
 @pytest.mark.parametrize("count", [0, 2, 500])
 def test_where_no_plane_is_none_is_found(count: int) -> None:
     rng = np.random.default_rng(3)

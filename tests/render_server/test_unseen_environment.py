@@ -12,7 +12,7 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.scenes import COARSE, Stage, ambient, cube, directional, floor, frame, plain
+from tests.render_server.scenes import COARSE, Stage, ambient, cube, directional, floor, frame, look_at, plain
 
 ALBEDO = 0.7
 KNOWN, OUT_OF_SIGHT, SUN = 0.05, 0.12, 0.9
@@ -100,6 +100,32 @@ def test_while_lamps_change_live_pictures_assume_what_was_found(gpu: GpuContext,
     assert assumed == pytest.approx([found] * 2, rel=1e-6)
     assert rested == pytest.approx(wanted, rel=1e-3)
     assert rested > 1.2 * found
+
+
+@pytest.mark.usefixtures("clean_gl")
+@pytest.mark.parametrize("moves", ["nothing", "object", "camera"])
+def test_what_is_kept_while_lamps_change_follows_what_moves(
+    gpu: GpuContext, tmp_path: Path, moves: str
+) -> None:
+    """With another lamp, lights are those that a fresh renderer finds in the same frame."""
+    color = np.random.default_rng(1).integers(40, 200, plain().shape, np.uint8)
+    stage = Stage(tmp_path, COARSE)
+    made = document(stage)
+    before = made.replaced(real=made.real.replaced(unseen_albedo=0.5))
+    dim = before.lights.replaced(manual=[directional((0, 0, -1), SUN / 2), ambient(KNOWN)])
+    after, view = before.replaced(lights=dim), frame(color, board=BOARD)
+    if moves == "object":
+        after = after.replaced(objects=[stage.virtual(cube(0.08, (0.1, 0.0, 0)))])
+    if moves == "camera":
+        view = frame(color, board=BOARD, pose=look_at((0.1, -0.7, 0.5), (0.0, 0.1, 0.0)))
+    renderer, fresh = SceneRenderer(gpu, before), SceneRenderer(gpu, after)
+    renderer.render(frame(color, board=BOARD))
+    renderer.set_scene(after)
+    found, expected = (each.render(view).lights for each in (renderer, fresh))
+    assert found == expected
+    assert found[-1]["mean_radiance"] != [KNOWN] * 3
+    renderer.release()
+    fresh.release()
 
 
 def test_shadows_and_stains_on_the_paper_do_not_count() -> None:
