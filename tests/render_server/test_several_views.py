@@ -83,7 +83,7 @@ def off_voxel_borders(view: ViewFrame) -> ViewFrame:
     """
     assert view.pose is not None
     aside = view.pose.world_from_camera.copy()
-    aside[:3, 3] += 5e-4
+    aside[:3, 3] += 1e-4
     return replace(view, pose=replace(view.pose, world_from_camera=aside))
 
 
@@ -140,8 +140,13 @@ def test_what_another_camera_sees_lights_the_object(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_frame_that_comes_twice_counts_once(made: Callable[..., SceneRenderer], method: str) -> None:
-    """Two cameras at one place know what one knows: light and obstacles must not add up."""
+def test_a_frame_that_comes_twice_counts_once(
+    gpu: GpuContext, made: Callable[..., SceneRenderer], method: str
+) -> None:
+    """Two cameras at one place know what one knows: light and obstacles must not add up.
+
+    A GPU makes the triangles of one camera itself, with other last bits than numpy those of two.
+    """
     settings, geometry = METHODS[method], "fused" if method == "dlpv" else "depth"
     view = off_voxel_borders(seen_room(FACING))
     one = made(geometry, **settings, triangle_budget=EVERY_PIXEL).render(view)
@@ -151,8 +156,8 @@ def test_a_frame_that_comes_twice_counts_once(made: Callable[..., SceneRenderer]
     assert np.abs(one.color.astype(int) - view.color).max() > 40
     for each in pair:
         apart = np.abs(each.color.astype(int) - one.color).max(axis=2)
-        assert (apart > 1).mean() < 2e-4  # single pixels at edges, whose triangles one camera cuts otherwise
-        assert (each.color != one.color).mean() < 0.02
+        assert (apart > 1).mean() <= (0 if gpu.is_software else 2e-4)
+        assert (each.color != one.color).mean() < (0.01 if gpu.is_software else 0.02)
 
 
 def test_cameras_that_know_the_same_show_the_same_as_each_alone(made: Callable[..., SceneRenderer]) -> None:
