@@ -72,12 +72,16 @@ class CameraHistory:
             return True
         if self.moved:
             too_soon = abs(samples.frame.timestamp_ns - built.frame.timestamp_ns) < RENEWAL_NS
-            return not too_soon and not kept.explains(samples)
+            return not (too_soon or self._explains(kept, samples))
         if built is last:
             return self.voxel_m is not None  # whose average takes some more frames
         assert last is not None
         wait_ns = SETTLING_NS if kept.explains(last) else RENEWAL_NS
         return samples.frame.timestamp_ns - last.frame.timestamp_ns >= wait_ns
+
+    def _explains(self, kept: KeptWorld, samples: FrameSamples) -> bool:
+        """Returns whether a kept world explains what moves: on a GPU, of the frame before, so that none waits."""
+        return kept.explains(samples) if self._on_gpu is None else kept.explained_before(samples)
 
     def renew(self, taken: PosedFrame) -> PosedFrame:
         """Returns the frame to build the real scene from: `taken`, or the last that moved if it was not used yet."""

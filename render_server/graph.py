@@ -7,7 +7,7 @@ drawn.
 
 import time
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any, Generic, TypeVar
@@ -60,6 +60,9 @@ class Resource(Generic[T]):
         self._value = value
 
 
+_Polled = tuple[Resource[Any], Callable[[], Any], Same]
+
+
 @dataclass(eq=False)
 class Stage:
     """A function of resources.
@@ -103,7 +106,9 @@ class Graph:
         self._stages: list[Stage] = []
         self._named: dict[Stage, list[str]] = {}
         self._order: list[Stage] | None = None
-        self._polled: list[tuple[Resource[Any], Callable[[], Any], Same]] = []
+        self._polled: list[_Polled] = []
+        # By targets of a run: the stages that make them and the sources to ask, until more is declared.
+        self._needed: dict[tuple[Resource[Any], ...], tuple[list[Stage], list[_Polled]]] = {}
         self._owned: list[Any] = []
         self._plugin: Plugin | None = None
         self._view = 0
@@ -273,6 +278,7 @@ class Graph:
                 raise GraphError(f"Resource `{name}` is written by {by}; a resource has one writer.")
         made = tuple(Resource[Any](name, clocks, stage) for name in names)
         self._resources.update(zip(names, made, strict=True))
+        self._needed.clear()
         return made
 
     def own(self, item: object) -> None:
@@ -312,17 +318,17 @@ class Graph:
             GraphError: stages read each other in a circle, read what nobody writes, or write what they did not
                 declare.
         """
-        order, needed = self._sorted(), self._needed_for(targets or self._resources.values())
-        for stage in order:
+        for stage in self._sorted():
             stage.ran = False
-        for resource, ask, same in self._polled:
-            if resource in needed:
-                resource.write(ask(), same)
-        for stage in order:
-            if not needed.isdisjoint(stage.outputs):
-                if until_s is not None and time.monotonic() >= until_s:
-                    return False
-                self._update(stage)
+        if targets not in self._needed:
+            self._needed[targets] = self._needed_for(targets or self._resources.values())
+        stages, polled = self._needed[targets]
+        for resource, ask, same in polled:
+            resource.write(ask(), same)
+        for stage in stages:
+            if until_s is not None and time.monotonic() >= until_s:
+                return False
+            self._update(stage)
         return True
 
     def _sorted(self) -> list[Stage]:
@@ -362,8 +368,8 @@ class Graph:
             for output in stage.outputs:
                 output.clocks = clocks
 
-    def _needed_for(self, targets: Iterable[Resource[Any]]) -> set[Resource[Any]]:
-        """The targets and all that they are made from."""
+    def _needed_for(self, targets: Iterable[Resource[Any]]) -> tuple[list[Stage], list[_Polled]]:
+        """Returns the stages that the targets are made by, in order, and the polled sources."""
         needed: set[Resource[Any]] = set()
         open_ = list(targets)
         while open_:
@@ -371,7 +377,8 @@ class Graph:
             if item not in needed:
                 needed.add(item)
                 open_ += () if item.stage is None else item.stage.inputs
-        return needed
+        stages = [stage for stage in self._sorted() if not needed.isdisjoint(stage.outputs)]
+        return stages, [each for each in self._polled if each[0] in needed]
 
     def _update(self, stage: Stage) -> None:
         """Runs a stage if the version of any input differs from the one that it saw last."""
@@ -391,14 +398,8 @@ class Graph:
         """Runs a stage's function, timed; returns a value for each output."""
         dispatches: list[Dispatch] = []
         try:
-            with ExitStack() as around:
-                if stage.plugin is not None:
-                    around.enter_context(stage.plugin.blamed(f"stage `{stage.name}`"))
-                if self.timers is not None and stage.name not in self._values:
-                    around.enter_context(self.timers.measure(stage.name))
-                if self._checks:
-                    around.enter_context(watched(self.gpu, dispatches.append))
-                found = stage.function(*(item.value for item in stage.inputs))
+            with self._around(stage, dispatches):
+                found = stage.function(*[item.value for item in stage.inputs])
         except Exception as error:
             error.add_note(f"Stage `{stage.name}` raised it.")
             raise
@@ -409,6 +410,20 @@ class Graph:
             raise GraphError(f"Stage `{stage.name}` returned {count} values for {names}.")
         self._require_declared(stage, results, dispatches)
         return results
+
+    def _around(self, stage: Stage, dispatches: list[Dispatch]) -> AbstractContextManager[object]:
+        """Returns what times a stage, blames its plugin, and lists its `dispatches` if they are checked."""
+        timers = None if stage.name in self._values else self.timers
+        timed = nullcontext() if timers is None else timers.measure(stage.name)
+        if stage.plugin is None and not self._checks:
+            return timed
+        around = ExitStack()
+        if stage.plugin is not None:
+            around.enter_context(stage.plugin.blamed(f"stage `{stage.name}`"))
+        around.enter_context(timed)
+        if self._checks:
+            around.enter_context(watched(self.gpu, dispatches.append))
+        return around
 
     def _require_declared(self, stage: Stage, results: Sequence[Any], dispatches: Sequence[Dispatch]) -> None:
         """Refuses that a kernel wrote what another stage made and this one does not hand on."""

@@ -123,14 +123,14 @@ class _Program:
         for name in program:
             self._adopt(name, program[name])
         self._assign()
-        self._binders: Sequence[tuple[list[_Slot], Callable[[_Slot, Binding], None]]] = (
+        binders: Sequence[tuple[list[_Slot], Callable[[_Slot, Binding], None]]] = (
             (self._samplers, self._bind_sampler),
             (self._images, self._bind_image),
             (self._storage, self._bind_storage),
             (self._blocks, self._bind_block),
             (self._uniforms, self._write),
         )
-        self._needed = frozenset(slot.name for slots, _ in self._binders for slot in slots)
+        self._binders = [(slot.name, slot, bind) for slots, bind in binders for slot in slots]
         self._switches = frozenset(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:
@@ -166,10 +166,12 @@ class _Program:
         if not own.keys() <= self._declared.names:
             name = next(name for name in own if name not in self._declared.names)
             raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
-        self._require(self._needed, known)
-        for slots, bind in self._binders:
-            for slot in slots:
-                bind(slot, known[slot.name])
+        try:
+            for name, slot, bind in self._binders:
+                bind(slot, known[name])
+        except KeyError:
+            self._require({name for name, _, _ in self._binders}, known)
+            raise
 
     def _require(self, names: Set[str], known: Bindings) -> None:
         if not names <= known.keys():
@@ -391,7 +393,8 @@ class Kernel(_Shader):
         groups = tuple([max(1, -(-count // size)) for count, size in counts])
         program.compute.run(*groups)
         self._gpu.ctx.memory_barrier()
-        program.report(groups, partial(program.written, known))
+        if self._gpu.watchers:
+            program.report(groups, partial(program.written, known))
 
     def run_counted(self, groups: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
         """Runs as many workgroups (x, y, z; three uint32) as `groups` holds on the GPU, perhaps none; else as `run`.

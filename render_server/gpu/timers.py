@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from types import TracebackType
 
 import moderngl
 
@@ -35,28 +36,33 @@ class PassTimers:
         self.submit_ms: dict[str, float] = {}
         self.last_ms: dict[str, float] = {}  # of each pass when it last ran
 
-    @contextmanager
-    def measure(self, name: str) -> Iterator[None]:
+    def measure(self, name: str) -> AbstractContextManager[None]:
         """Times the GL work issued inside."""
+        return _Queried(self, name) if self._queries else self._clocked(name)
+
+    @contextmanager
+    def _clocked(self, name: str) -> Iterator[None]:
         start_s = time.perf_counter()
-        if not self._queries:
-            yield
-            _add_since(start_s, self._submitted, name)
-            self._gpu.ctx.finish()
-            _add_since(start_s, self._clock, name)
-            return
+        yield
+        _add_since(start_s, self._submitted, name)
+        self._gpu.ctx.finish()
+        _add_since(start_s, self._clock, name)
+
+    def take_query(self) -> moderngl.Query:
+        """Returns a query that is not in use."""
         spare = self._gpu.spare_queries
-        query = spare.pop() if spare else self._gpu.ctx.query(time=True)
-        try:
-            with query:
-                yield
-        except BaseException:
-            spare.append(query)
-            raise
+        return spare.pop() if spare else self._gpu.ctx.query(time=True)
+
+    def add_query(self, name: str, query: moderngl.Query, start_s: float) -> None:
+        """Takes the query of a pass that began at `start_s` and has ended."""
         self._current.append((name, query))
         # Otherwise the query's end is kept back with whatever comes next, and counts the CPU's work until then.
         self._gpu.flush()
         _add_since(start_s, self._submitted, name)
+
+    def drop_query(self, query: moderngl.Query) -> None:
+        """Takes back the query of a pass that failed."""
+        self._gpu.spare_queries.append(query)
 
     def end_frame(self) -> dict[str, float]:
         """Ends the frame and returns the newest known times."""
@@ -90,6 +96,29 @@ class PassTimers:
         for frame in (*self._pending, self._current):
             self._gpu.spare_queries.extend(query for _, query in frame)
         self._pending, self._current = [], []
+
+
+class _Queried:
+    """A pass that a query times; a class, for a frame has fifty, and generators take three times as long."""
+
+    __slots__ = ("_name", "_query", "_start_s", "_timers")
+
+    def __init__(self, timers: PassTimers, name: str) -> None:
+        self._timers, self._name = timers, name
+
+    def __enter__(self) -> None:
+        self._start_s = time.perf_counter()
+        self._query = self._timers.take_query()
+        self._query.__enter__()  # type: ignore[no-untyped-call]
+
+    def __exit__(
+        self, fault: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self._query.__exit__()
+        if fault is None:
+            self._timers.add_query(self._name, self._query, self._start_s)
+        else:
+            self._timers.drop_query(self._query)
 
 
 def _add_since(start_s: float, times_ms: dict[str, float], name: str) -> None:

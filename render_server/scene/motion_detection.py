@@ -1,8 +1,9 @@
 """Detects when the real scene or the camera has moved, and when a kept real scene no longer explains a frame."""
 
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
-from deltalight.render_server.scene.threads import by_bands
+from deltalight.render_server.scene.threads import begun, by_bands
 from deltalight.render_server.view import LENSES_KEPT
 
 GRID_STEP_PX = 4
@@ -138,19 +139,48 @@ class KeptWorld:
     def __init__(self, thresholds: MotionThresholds | None = None) -> None:
         self._thresholds = thresholds or MotionThresholds()
         self.built_from: FrameSamples | None = None
+        self._newest: _Comparison | None = None
 
     def explains(self, new: FrameSamples) -> bool:
         """Returns whether the scene need not be rebuilt; without depth, while the picture has moved little."""
-        old, thresholds = self.built_from, self._thresholds
-        if old is None or old.frame.camera != new.frame.camera:
-            return False
-        motion_px = max(_image_motions(old, new))
-        if motion_px <= thresholds.image_motion_px:
-            return not _has_changed(old, new, thresholds)
-        if old.inverse_depth is None or new.inverse_depth is None:
-            return motion_px <= thresholds.unseen_fraction * new.frame.camera.width
-        appeared, unseen = _compared(old, new, thresholds)
-        return appeared <= thresholds.depth_fraction and unseen <= thresholds.unseen_fraction
+        return self._compare(new).explains.result()
+
+    def explained_before(self, new: FrameSamples) -> bool:
+        """Returns whether the scene explained the frame before; compares this one meanwhile, on another thread.
+
+        For who has a frame done in a fraction of the time that the camera takes for one.
+        """
+        before = self._newest
+        self._compare(new)
+        return before is None or before.old is not self.built_from or before.explains.result()
+
+    def _compare(self, new: FrameSamples) -> "_Comparison":
+        old, newest = self.built_from, self._newest
+        if newest is None or newest.old is not old or newest.new is not new:
+            newest = _Comparison(old, new, begun(partial(_explains, old, new, self._thresholds)))
+            self._newest = newest
+        return newest
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Whether the scene that was built from a frame, None: none was, explains another one."""
+
+    old: FrameSamples | None
+    new: FrameSamples
+    explains: Future[bool]
+
+
+def _explains(old: FrameSamples | None, new: FrameSamples, thresholds: MotionThresholds) -> bool:
+    if old is None or old.frame.camera != new.frame.camera:
+        return False
+    motion_px = max(_image_motions(old, new))
+    if motion_px <= thresholds.image_motion_px:
+        return not _has_changed(old, new, thresholds)
+    if old.inverse_depth is None or new.inverse_depth is None:
+        return motion_px <= thresholds.unseen_fraction * new.frame.camera.width
+    appeared, unseen = _compared(old, new, thresholds)
+    return appeared <= thresholds.depth_fraction and unseen <= thresholds.unseen_fraction
 
 
 def _compared(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> tuple[float, float]:

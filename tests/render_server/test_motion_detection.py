@@ -3,7 +3,7 @@ import pytest
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
-from deltalight.render_server.scene.motion_detection import FrameSamples, MotionDetector
+from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
 
 CAMERA = CameraModel(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
 SIGMA = 0.002
@@ -110,3 +110,16 @@ def test_without_depth_the_distance_to_the_board_serves() -> None:
     tracker.update(FrameSamples(changed(depth=None, pose=BoardPose(near))))
     assert not tracker.update(FrameSamples(changed(depth=None, pose=BoardPose(near.copy()))))
     assert tracker.update(FrameSamples(changed(depth=None, pose=BoardPose(far))))
+
+
+def test_a_kept_world_tells_at_once_or_a_frame_late_what_it_explains() -> None:
+    kept, built, turned = KeptWorld(), FrameSamples(frame()), FrameSamples(frame(seed=1, turn_rad=0.01))
+    away = [FrameSamples(frame(seed=seed, turn_rad=0.5)) for seed in (2, 3)]
+    kept.built_from = built
+    assert kept.explains(turned)
+    assert not kept.explains(away[0])
+    late = KeptWorld()
+    late.built_from = built
+    assert [late.explained_before(each) for each in (turned, away[0], away[1])] == [True, True, False]
+    late.built_from = away[1]
+    assert late.explained_before(away[0]), "what an earlier world did not explain says nothing of this one"
