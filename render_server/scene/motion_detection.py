@@ -1,5 +1,6 @@
 """Detects when the real scene or the camera has moved, and when a kept real scene no longer explains a frame."""
 
+import math
 from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -7,7 +8,7 @@ from functools import cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
@@ -192,16 +193,17 @@ def _compared(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds
     assert old.inverse_depth is not None
     assert new.inverse_depth is not None
     assert new.frame.depth is not None
-    cells, inverse, known = _reprojected(old, new)
-    tilt = np.tan(np.radians(MAX_SLOPE_DEG)) * GRID_STEP_PX / new.frame.camera.matrix[0, 0]
+    samples, cells, inverse = _reprojected(old, new)
+    tilt = float(np.tan(np.radians(MAX_SLOPE_DEG))) * GRID_STEP_PX / new.frame.camera.matrix[0, 0]
     limit = _depth_limit(new.frame.depth, thresholds) + tilt * inverse
-    farthest, nearest = (edge[cells] for edge in old.depth_range)
-    low, high = (edge[cells] for edge in old.color_range)
-    seen = old.inverse_depth[cells] > 0
-    same_place = seen & (inverse >= farthest - limit) & (inverse <= nearest + limit)
-    color, spare = new.color[known], _color_limit(old.color[cells], thresholds)
+    farthest, nearest = (edge.ravel()[cells] for edge in old.depth_range)
+    low, high = (edge.reshape(-1, 3).take(cells, axis=0) for edge in old.color_range)
+    seen, excess = old.inverse_depth.ravel()[cells] > 0, inverse - limit
+    same_place = seen & (inverse >= farthest - limit) & (excess <= nearest)
+    spare = _color_limit(old.color.reshape(-1, 3).take(cells, axis=0), thresholds)
+    color = new.color.reshape(-1, 3).take(samples, axis=0)
     recolored = short_axis.any_of((color < low - spare) | (color > high + spare))
-    appeared = (seen & (inverse > nearest + limit)) | (same_place & recolored)
+    appeared = (seen & (excess > nearest)) | (same_place & recolored)
     total = max(int(np.count_nonzero(new.inverse_depth)), 1)
     unseen = total - int(np.count_nonzero(same_place | appeared))
     return float(np.count_nonzero(appeared)) / total, unseen / total
@@ -211,45 +213,45 @@ def _color_limit(
     color: Float32[np.ndarray, "*n 3"], thresholds: MotionThresholds
 ) -> Float32[np.ndarray, "*n 3"]:
     """Returns the difference of block means that noise explains: of half the deviation of a pixel's."""
-    sigma = thresholds.color_noise * np.sqrt(np.maximum(color, 0.01)) / 2
-    return np.asarray(thresholds.color_sigmas * np.sqrt(2) * sigma)
+    sigmas = thresholds.color_sigmas * math.sqrt(2) * thresholds.color_noise / 2
+    return np.asarray(sigmas * np.sqrt(np.maximum(color, np.float32(0.01))))
 
 
 def _reprojected(
     old: FrameSamples, new: FrameSamples
-) -> tuple[tuple[np.ndarray, np.ndarray], Float64[np.ndarray, " n"], Bool[np.ndarray, "gh gw"]]:
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Places the samples of `new` with depth in the picture of `old`.
 
-    Returns the cells (row, column) and inverse depths of those that it shows, and which samples they are.
+    Returns those that it shows, the cells that show them (both counted row by row), and their inverse depths there.
     """
     assert new.inverse_depth is not None
     assert old.frame.pose is not None
     assert new.frame.pose is not None
-    camera, inverse = new.frame.camera, new.inverse_depth
-    known = inverse > 0
-    points = _sample_rays(camera, inverse.shape)[known] / inverse[known][:, None]
+    camera, (rows, columns) = new.frame.camera, new.inverse_depth.shape
+    inverse = new.inverse_depth.ravel().astype(np.float64)
     old_from_new = np.linalg.inv(old.frame.pose.world_from_camera) @ new.frame.pose.world_from_camera
-    moved = np.einsum("ni,ji->nj", points, old_from_new[:3, :3]) + old_from_new[:3, 3]
-    ahead = np.maximum(moved[:, 2], 1e-6)
+    # Scaled by inverse depth, so that nothing is divided by where there is none.
+    x, y, z = old_from_new[:3, :3] @ _sample_rays(camera, (rows, columns)) + old_from_new[:3, 3:] * inverse
     fx, fy, cx, cy = camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-    column = np.floor((moved[:, 0] / ahead * fx + cx) / GRID_STEP_PX).astype(int)
-    row = np.floor((moved[:, 1] / ahead * fy + cy) / GRID_STEP_PX).astype(int)
-    shown = (
-        (moved[:, 2] > 0) & (row >= 0) & (row < len(inverse)) & (column >= 0) & (column < inverse.shape[1])
+    scale = 1 / np.maximum(z, 1e-6)
+    column, row = (
+        np.floor((across * scale * focal + centre) / GRID_STEP_PX)
+        for across, focal, centre in ((x, fx, cx), (y, fy, cy))
     )
-    chosen = np.zeros_like(known)
-    chosen[known] = shown
-    return (row[shown], column[shown]), 1 / ahead[shown], chosen
+    shown = (inverse > 0) & (z > 0) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    samples = np.flatnonzero(shown)
+    cells = (row[samples] * columns + column[samples]).astype(np.int64)
+    return samples, cells, inverse[samples] * scale[samples]
 
 
 @lru_cache(maxsize=LENSES_KEPT)
-def _sample_rays(camera: CameraModel, shape: tuple[int, int]) -> Float64[np.ndarray, "gh gw 3"]:
-    """Returns (x/z, y/z, 1) of the grid's pixels, of which every fourth has its depth."""
+def _sample_rays(camera: CameraModel, shape: tuple[int, int]) -> Float64[np.ndarray, "3 n"]:
+    """Returns (x/z, y/z, 1) of the grid's pixels, row by row, of which every fourth has its depth."""
     first = GRID_STEP_PX // 2
     columns, rows = (first + GRID_STEP_PX * np.arange(count) for count in shape[::-1])
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(float)
     rays = camera.unproject(pixels)
-    return np.column_stack([rays, np.ones(len(rays))]).reshape(*shape, 3)
+    return np.ascontiguousarray(np.column_stack([rays, np.ones(len(rays))]).T)
 
 
 def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
