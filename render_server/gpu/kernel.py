@@ -29,8 +29,6 @@ SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
 MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
 GPU_WALKERS = 2**18  # 4096 workgroups: what the largest GPUs hold at a time; idle threads cost microseconds
-CLEARING_GROUPS = 4096  # of workgroups at most; they stride over larger buffers
-WORD_BYTES = 4
 GL_INT = 0x1404
 CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
@@ -485,28 +483,6 @@ def common_kernel(gpu: GpuContext, name: str) -> Kernel:
     kernel = gpu.common[name]
     assert isinstance(kernel, Kernel)
     return kernel
-
-
-def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = None) -> None:
-    """Sets the first `size` bytes (a multiple of 4; default: all) of a buffer to zero.
-
-    By a kernel: `Buffer.clear` maps the buffer, so it waits for the GPU; with glClearBufferSubData, an H200 took 9 ms
-    longer for a frame of 256^3 voxels. In software, clearing is no more than a memset, 15 to 50 times as fast as a
-    kernel (measured from 4 to 64 MB).
-    """
-    size = buffer.size if size is None else size
-    if gpu.is_software:
-        buffer.clear(size)
-        return
-    kernel = common_kernel(gpu, "clear_buffer")
-    words = size // WORD_BYTES
-    threads = min(words, CLEARING_GROUPS * kernel.local_size[0])
-    kernel.run((threads,), Cleared=buffer, word_count=words)
-
-
-def clear_volume(gpu: GpuContext, texture: moderngl.Texture3D) -> None:
-    """Sets all texels to zero, without a copy of them on the CPU."""
-    common_kernel(gpu, "clear_volume").run(texture.size, cleared=texture)
 
 
 @contextmanager

@@ -14,8 +14,9 @@ import numpy as np
 
 from deltalight.protocol.scene_method import DifferentialMethod
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
+from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet

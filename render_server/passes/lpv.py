@@ -10,8 +10,9 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
+from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
 from deltalight.render_server.passes.gbuffer import NO_CUTOUTS
 from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.passes.voxels import LOWER_VOLUME, VoxelMipmap, VoxelStore

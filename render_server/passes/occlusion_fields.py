@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float16, Float32, Float64
 
 from deltalight.protocol.octahedral import octahedral_grid, texel_solid_angles
+from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import texture_2d
 from deltalight.render_server.lights.octahedral import MAX_ORDER, harmonics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid

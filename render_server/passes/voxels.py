@@ -7,14 +7,9 @@ import moderngl
 import numpy as np
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import (
-    Binding,
-    Kernel,
-    clear_buffer,
-    clear_volume,
-    list_threads,
-)
+from deltalight.render_server.gpu.kernel import Binding, Kernel, list_threads
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.volumes import PlacedVolume
 

@@ -7,14 +7,9 @@ import moderngl
 import numpy as np
 import pytest
 
+from deltalight.render_server.gpu.clearing import CLEARING_GROUPS, clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import (
-    CLEARING_GROUPS,
-    BindingError,
-    Dispatch,
-    clear_buffer,
-    watched,
-)
+from deltalight.render_server.gpu.kernel import BindingError, Dispatch, watched
 from deltalight.render_server.gpu.list_groups import ListGroups
 from tests.render_server.tiny_kernel import MakeKernel, floats
 

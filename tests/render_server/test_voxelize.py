@@ -10,8 +10,8 @@ import trimesh
 from scipy import ndimage
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu.clearing import clear_volume
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import clear_volume
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
