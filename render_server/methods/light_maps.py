@@ -17,6 +17,7 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import Light, LightSet
 from deltalight.render_server.lights.mirror_lights import mirror_lights
 from deltalight.render_server.methods.method import ResolvedSettings
+from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers, MirrorVisibility
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
@@ -152,6 +153,22 @@ class LightStages:
             item.release()
 
 
+class TracedObjects:
+    """What rays of all views meet: the objects, in one hierarchy."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._bvh = ObjectBvh(gpu)
+
+    def set_objects(self, objects: GeometryState) -> ObjectBvh:
+        """Sets the objects' triangles; their hierarchy is made beside the frame, or when rays are first traced."""
+        self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
+        return self._bvh
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._bvh.release()
+
+
 def light_stages(
     g: Graph,
     s: FrameResources,
@@ -163,6 +180,7 @@ def light_stages(
 ) -> LitScene:
     """Declares environment, light views, depth maps of both geometries, and mirror images of the lights."""
     g.section("lights")
+    object_bvh(g, s)
     keeps_views = tier.refresh_tiles > 0
     stages = g.shared(
         "lights",
@@ -186,6 +204,14 @@ def light_stages(
 
 def _both_none(old: object, new: object) -> bool:
     return old is None and new is None
+
+
+def object_bvh(g: Graph, s: FrameResources) -> Resource[ObjectBvh]:
+    """Declares what rays meet; early in the frame, for the hierarchy is made while the GPU is given other work."""
+    if "object bvh" in g:
+        return g.resource("object bvh")
+    traced = g.shared("traced objects", lambda: TracedObjects(g.gpu))
+    return g.stage("object bvh", traced.set_objects, s.objects)
 
 
 def object_extent(g: Graph, s: FrameResources) -> Resource[ObjectExtent]:

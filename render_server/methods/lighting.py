@@ -16,7 +16,7 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.light_maps import LitScene, Points, object_extent
+from deltalight.render_server.methods.light_maps import LitScene, Points, object_bvh, object_extent
 from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeams, Caustics
 from deltalight.render_server.passes.composite import ChangeRatio
@@ -126,22 +126,6 @@ class Layers:
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
     error: Resource[Callable[[], moderngl.Texture]] | None = None
-
-
-class TracedObjects:
-    """What rays of all views meet: the objects, in one hierarchy."""
-
-    def __init__(self, gpu: GpuContext) -> None:
-        self._bvh = ObjectBvh(gpu)
-
-    def set_objects(self, objects: GeometryState) -> ObjectBvh:
-        """Sets the objects' triangles; their hierarchy is built when rays are traced."""
-        self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
-        return self._bvh
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        self._bvh.release()
 
 
 @dataclass(frozen=True, eq=False)
@@ -444,8 +428,7 @@ def shading_stages(
         *lit.all,
         s.lights,
     )
-    traced = g.shared("traced objects", lambda: TracedObjects(g.gpu))
-    bvh = g.stage("object bvh", traced.set_objects, s.objects)
+    bvh = object_bvh(g, s)
     trace_beams: Callable[..., SentBeams | None] = no_beams
     if shading.has_caustics:
         trace_beams = g.shared("caustic beams", lambda: CastBeams(g.gpu, lit.buffers, shading.tier)).trace

@@ -1,6 +1,7 @@
 """The camera's image, the meshes and their hierarchy, and the geometry buffers of the real and the virtual scene."""
 
 from collections.abc import Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ from deltalight.render_server.gpu.textures import release_all, release_target, t
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
 from deltalight.render_server.scene.materials import map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
+from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from deltalight.render_server.view import CameraView, Rectangle
 
@@ -230,7 +232,10 @@ def bvh_texture(gpu: GpuContext, data: bytes) -> moderngl.Texture:
 
 
 class ObjectBvh:
-    """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced."""
+    """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced.
+
+    Where rays were traced before, that begins on another thread as soon as the objects are set.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
@@ -239,6 +244,10 @@ class ObjectBvh:
         self._corners = self._built = np.zeros((0, 3, 3), np.float32)
         self._mesh: MeshBuffers | None = None
         self._bvh: Bvh | None = None
+        self._packed: Future[tuple[bytes, bytes]] | None = (
+            None  # of what was built last, until it is uploaded
+        )
+        self._is_traced = False  # since the triangles changed
         self._fresh_cost = 0.0
         self.centre = np.zeros(3)
         self.radius = 0.0
@@ -253,19 +262,36 @@ class ObjectBvh:
         low, high = bounds
         self.centre, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
         self._corners, self._mesh = corners, mesh
+        if self._is_traced and corners is not self._built:
+            self._begin()
 
     @property
     def bindings(self) -> dict[str, Binding]:
         """The bindings of shaders/common/ray_mesh.glsl; brings the hierarchy up to date first."""
         assert self._mesh is not None
         if self._corners is not self._built:
-            self._built = self._corners
-            positions = np.ascontiguousarray(self._corners)
-            bvh = self._renewed(positions)
+            self._begin()
+        if self._packed is not None:
+            nodes, faces = self._packed.result()
+            self._packed = None
             self.release()
-            self._nodes = bvh_texture(self._gpu, bvh.packed())
-            self._faces = bvh_texture(self._gpu, bvh.packed_triangles(positions, self._mesh.triangles))
+            self._nodes, self._faces = bvh_texture(self._gpu, nodes), bvh_texture(self._gpu, faces)
+        self._is_traced = True
         return {"bvh_nodes": self._nodes, "bvh_faces": self._faces, **self._mesh.storage}
+
+    def _begin(self) -> None:
+        """Begins to bring the hierarchy up to date, after what was begun before."""
+        assert self._mesh is not None
+        before, positions, triangles = self._packed, np.ascontiguousarray(self._corners), self._mesh.triangles
+        self._built, self._is_traced = self._corners, False
+
+        def packed() -> tuple[bytes, bytes]:
+            if before is not None:
+                before.result()
+            bvh = self._renewed(positions)
+            return bvh.packed(), bvh.packed_triangles(positions, triangles)
+
+        self._packed = begun(packed)
 
     def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
         """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
