@@ -93,9 +93,9 @@ class SolutionVoxels(DirectionalVoxels):
         self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
     ) -> "SolutionVoxels":
         """Lights, resolves and filters mu, then rho."""
-        self._light_both(mu, rho, gathered=False)
         self._occupy.run(self.mu, self.real.volume, self.real.store)
         self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
+        self._light_both(mu, rho, gathered=False)
         return self
 
     def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":

@@ -9,7 +9,7 @@ import numpy as np
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Kernel, list_threads
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.volumes import PlacedVolume
 
@@ -282,15 +282,16 @@ class FilterVoxels:
         self._kernel = Kernel(gpu, "filter_voxels", **({} if gpu.is_software else {"FUSED": 1}))
 
     def run(self, mipmap: VoxelMipmap, volume: PlacedVolume) -> None:
-        """Rebuilds all levels from level 0."""
+        """Rebuilds all levels from level 0, of cells that hold anything by the mipmap's occupancy."""
         levels = volume.placement.levels
         slabs = DIRECTIONS * len(volume.placements)
         for first in range(1, levels, self._at_once):
-            cells, several = volume.placement.size >> first, {}
+            cells = volume.placement.size >> first
+            several: Bindings = {}
             if self._at_once > 1:
                 tile = self._kernel.local_size[0]
                 cells = math.ceil(cells / tile) * tile  # whole tiles
-                several = {"level_count": min(self._at_once, levels - first)}
+                several = {"level_count": min(self._at_once, levels - first), "Occupied": mipmap.occupied}
             self._kernel.run(
                 (cells, cells, cells * slabs),
                 volume.bindings,

@@ -10,7 +10,7 @@ import trimesh
 from scipy import ndimage
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.render_server.gpu.clearing import clear_volume
+from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.gbuffer import MeshBuffers
@@ -263,6 +263,7 @@ def test_levels_filtered_together_are_those_of_one_after_the_other(
     volume = PlacedVolume(gpu, *[VolumePlacement((9.0 * i, 0.0, 0.0), 0.1, size) for i in range(count)])
     mipmap = VoxelMipmap(gpu, size, DIRECTIONS)
     mipmap.resize(size, count)
+    mipmap.occupied.write(b"\xff" * mipmap.occupied.size)
     level_zero = np.random.default_rng(2).random((DIRECTIONS * size, size, count * size, 4))
     found = []
     for each in (gpu, replace(gpu, is_software=False)):
@@ -276,6 +277,19 @@ def test_levels_filtered_together_are_those_of_one_after_the_other(
         filtering.release()
     assert found[0] == found[1]
     release_all(mipmap, volume)
+
+
+def test_on_a_gpu_levels_of_empty_cells_are_emptied_without_a_look_below(gpu: GpuContext) -> None:
+    size = 32
+    volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 0.1, size))
+    mipmap, filtering = VoxelMipmap(gpu, size, DIRECTIONS), FilterVoxels(replace(gpu, is_software=False))
+    mipmap.texture.write(np.ones((*mipmap.texture.size[::-1], 4), np.float16).tobytes())
+    clear_buffer(gpu, mipmap.occupied)
+    filtering.run(mipmap, volume)
+    slabs = np.frombuffer(mipmap.texture.read(), np.float16).reshape(-1, size, size, 4)
+    assert (slabs[: DIRECTIONS * size] == 1).all(), "level 0 stays"
+    assert not slabs[DIRECTIONS * size :, : size // 2, : size // 2].any()
+    release_all(mipmap, volume, filtering)
 
 
 def test_triangles_of_too_many_voxels_are_refused(gpu: GpuContext) -> None:

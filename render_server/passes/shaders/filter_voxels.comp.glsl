@@ -1,9 +1,12 @@
 // Filters levels of the six one-sided mipmaps (docs/method.md 4.4): two cells along k composited front to back, mean of
 // the four across. Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do not occlude
-// each other). With FUSED, a workgroup filters a tile of the first level, then the cells above it, which need no others.
+// each other). With FUSED, a workgroup filters a tile of the first level, then the cells above it, which need no others;
+// nothing is read below cells that hold nothing, which are most (in software, asking costs more than that saves).
 #include "common/volume.glsl"
 
 #ifdef FUSED
+#include "common/occupancy.glsl"
+
 layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
 layout(rgba16f) coherent uniform image3D mipmap;
 uniform int level_count;   // how many are written: until the tile is one cell, at most
@@ -21,7 +24,16 @@ vec4 front_to_back(vec4 front, vec4 back) {
     return front + back * (back.a > room ? room / back.a : 1.0);
 }
 
-void write_cell(int level, ivec3 cell, int k) {
+#ifdef FUSED
+// Whether a cell may hold anything: it does not unless all of its corners say so.
+bool may_hold(int level, ivec3 cell) {
+    return is_occupied(volume, volume_size, level, cell) && is_occupied(volume, volume_size, level, cell + 1);
+}
+#else
+bool may_hold(int level, ivec3 cell) { return true; }
+#endif
+
+vec4 filtered(int level, ivec3 cell, int k) {
     int along = k >> 1, u = (along + 1) % 3, v = (along + 2) % 3;
     ivec3 step_along = ivec3(0), step_u = ivec3(0), step_v = ivec3(0);
     step_along[along] = 1; step_u[u] = 1; step_v[v] = 1;
@@ -32,7 +44,12 @@ void write_cell(int level, ivec3 cell, int k) {
         ivec3 across = (j & 1) * step_u + (j >> 1) * step_v;
         sum += front_to_back(fetch(level, front + across, k), fetch(level, back + across, k));
     }
-    imageStore(mipmap, level_base(level, k) + cell, 0.25 * sum);
+    return 0.25 * sum;
+}
+
+void write_cell(int level, ivec3 cell, int k) {
+    vec4 sum = may_hold(level, cell) ? filtered(level, cell, k) : vec4(0.0);
+    imageStore(mipmap, level_base(level, k) + cell, sum);
 }
 
 #ifdef FUSED

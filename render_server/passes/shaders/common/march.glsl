@@ -131,11 +131,7 @@ vec4 sample_near(sampler3D mipmap, vec3 q, Walk w) {
 }
 
 // Whether a trilinear sample at q (voxels) may meet anything, of the volume around the objects and of the one beyond.
-bool may_be_near(vec3 q, int level) {
-    ivec3 corner = corner_of(q, level);
-    int word = volume * mipmap_words(volume_size) + corner_word(volume_size, level, corner);
-    return (occupied[word] >> (corner.x & 31) & 1u) != 0u;
-}
+bool may_be_near(vec3 q, int level) { return is_occupied(volume, volume_size, level, corner_of(q, level)); }
 bool may_be_far(vec3 q, int level) {
     ivec3 corner = corner_of(q, level);
     return (occupied_far[corner_word(far_size, level, corner)] >> (corner.x & 31) & 1u) != 0u;

@@ -21,5 +21,11 @@ int corner_word(int n, int level, ivec3 corner) {
 // Words of a whole mipmap: those of volumes follow one another.
 int mipmap_words(int n) { return level_words(n) + (findMSB(n) + 1) * level_words(n >> 1); }
 
+// Whether any of the cells around a corner is touched, in a volume of n voxels an edge that follows `number` others.
+bool is_occupied(int number, int n, int level, ivec3 corner) {
+    int word = number * mipmap_words(n) + corner_word(n, level, corner);
+    return (occupied[word] >> (corner.x & 31) & 1u) != 0u;
+}
+
 // The corner around which a trilinear sample at q (voxels of level 0) reads.
 ivec3 corner_of(vec3 q, int level) { return ivec3(floor(q * exp2(-float(level)) + 0.5)); }
