@@ -53,7 +53,7 @@ class HostCommands:
             options += ["--device", str(device)]
         if self.allow_software:
             options += ["--allow-software"]
-        return self.child(label, "server", *options)
+        return replace(self.child(label, "server", *options), rehearsed=True)
 
     def web(self, data: Path, page_port: int, *more: str) -> ChildSpec:
         """Return a web process."""
