@@ -9,6 +9,7 @@ import uuid
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import structlog
 
@@ -22,7 +23,6 @@ from deltalight.protocol.scene_method import AroofMethod
 from deltalight.render_server.freed_memory import give_back_freed_memory
 from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.gpu.device_memory import device_memory, free_host_memory, gl_integers
-from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.cameras import RoomCameras, Taken
 from deltalight.render_server.server.frames import FrameSource
@@ -31,7 +31,7 @@ from deltalight.render_server.server.process import RECEIVE_TIMEOUT_S, ServerSet
 from deltalight.render_server.server.session import needs_depth
 
 LOOK_INTERVAL_S = 2.0  # between looks at the document and at the other server's health
-CALM_S = 3.0  # how long a document must be unchanged
+CALM_NS = 3 * 10**9  # how long a document must be unchanged
 ANSWER_TIMEOUT_S = 2.0
 LISTEN_S = 3.0  # at most, to nodes, for a frame of each
 PICTURES = 2  # of each camera: light from out of sight comes with the second
@@ -39,9 +39,18 @@ ATTEMPTS = 2 * PICTURES  # to get them
 NEEDED_BYTES = 10**9  # of the host
 NEEDED_DEVICE_BYTES = 6 * 10**9  # of a GPU: the volumes' default budget, and the rest
 
-Stamp = tuple[tuple[str, int, int], ...]
-
 log = structlog.get_logger()
+
+
+class _File(NamedTuple):
+    """What tells whether a file was written since."""
+
+    path: str
+    written_ns: int
+    size: int
+
+
+Stamp = tuple[_File, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +73,6 @@ class Ahead:
         self._gpu: GpuContext | None = None
         self._built: _Built | None = None
         self._document: Stamp = ()  # as last seen
-        self._changed_s = time.monotonic()
         self._is_done = False  # with this document
 
     def keep(self) -> None:
@@ -94,7 +102,7 @@ class Ahead:
     def _fits(self, gpu: GpuContext, settings: ServerSettings) -> bool:
         try:
             gpu.check()
-        except (GpuResetError, DeltalightError):
+        except DeltalightError:  # the context is lost, or out of memory
             return False
         return settings.device == self._settings.device
 
@@ -109,8 +117,9 @@ class Ahead:
         paths = self._settings.session, self._settings.scene
         document = _stamp([path for path in paths if path is not None])
         if document != self._document:
-            self._document, self._changed_s, self._is_done = document, time.monotonic(), False
-        is_due = not self._is_done and time.monotonic() - self._changed_s >= CALM_S
+            self._document, self._is_done = document, False
+        written_ns = max((each.written_ns for each in document), default=0)
+        is_due = not self._is_done and time.time_ns() - written_ns >= CALM_NS
         if not is_due and self._built is None:
             return
         state = self._state_of_server()
@@ -227,6 +236,6 @@ def _assets(scene: SceneDocument) -> list[Path]:
 
 
 def _stamp(files: list[Path]) -> Stamp:
-    """Returns what tells whether files were written since; those that are missing are left out."""
+    """Returns what tells whether these were written since; those that are missing are left out."""
     known = [(path, path.stat()) for path in files if path.is_file()]
-    return tuple((str(path), found.st_mtime_ns, found.st_size) for path, found in known)
+    return tuple(_File(str(path), found.st_mtime_ns, found.st_size) for path, found in known)
