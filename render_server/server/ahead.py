@@ -96,7 +96,8 @@ class Ahead:
         if built is None or not self._is_current(built, settings, scene):
             self._release_renderer()
             return self._gpu, None
-        built.renderer.set_scene(scene)  # the next frame is no frame at rest, which would be refined at once
+        # As after any change, the next frame is not one at rest, which would be refined at once.
+        built.renderer.set_scene(scene)
         return self._gpu, built.renderer
 
     def _fits(self, gpu: GpuContext, settings: ServerSettings) -> bool:
