@@ -93,6 +93,11 @@ class Station:
         request = ControlRequest(node="test", id=f"r{time.time_ns()}", op=op, payload=payload)
         return self._client.request(request, PATIENCE_S)
 
+    def move_cup(self) -> None:
+        changed = self.document.model_dump(mode="json")
+        changed["objects"][0]["pose"]["translation_m"] = [0.1, 0, 0.5]
+        assert self.ask("set_scene", scene=changed).ok
+
     def shown(self) -> SceneDocument:
         return parse_scene(self.ask("get_scene").payload["scene"])
 
@@ -143,13 +148,22 @@ def test_a_scene_that_was_built_ahead_and_changed_since_is_not_shown(
 ) -> None:
     station = station_of(COMMAND_LINE)
     station.wait_for_spare_to_say("scene built ahead")
-    changed = station.document.model_dump(mode="json")
-    changed["objects"][0]["pose"]["translation_m"] = [0.1, 0, 0.5]
-    assert station.ask("set_scene", scene=changed).ok
+    station.move_cup()
     station.kill()
     station.wait_for(lambda: station.picture().scene_revision == 8)
     assert station.shown().objects[0].pose.translation_m == (0.1, 0, 0.5)
     assert not any(USES_IT in line for line in station.lines)
+
+
+def test_a_scene_that_changed_is_built_ahead_anew(station_of: Callable[[str], Station]) -> None:
+    station = station_of(COMMAND_LINE)
+    station.wait_for_spare_to_say("scene built ahead")
+    station.move_cup()
+    station.wait_for_spare_to_say("revision=8")
+    station.kill()
+    station.wait_for(lambda: station.picture().scene_revision == 8)
+    assert station.shown().objects[0].pose.translation_m == (0.1, 0, 0.5)
+    station.wait_for(lambda: any(USES_IT in line for line in station.lines))
 
 
 def test_a_spare_that_can_build_nothing_ahead_takes_over_all_the_same(
