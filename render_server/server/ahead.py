@@ -201,12 +201,12 @@ class Ahead:
         if self._gpu is not None:
             self._gpu.release()
         self._gpu = None
-        give_back_freed_memory()
 
     def _release_renderer(self) -> None:
         if self._built is not None:
             self._built.renderer.release()
-        self._built = None
+            self._built = None
+            give_back_freed_memory()
 
 
 def _require_memory(gpu: GpuContext) -> None:
