@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
-from deltalight.services.warm_spare import PREPARED, spare_environment, use_spare
+from deltalight.services.warm_spare import PREPARED, rehearse_spare, spare_environment, use_spare
 
 NODE, SERVER, WEB = "sensor node", "render server", "web process"  # names of a host's processes
 SPARE_AFTER_S = 4.0  # of a process's life: most have started by then
@@ -39,18 +39,25 @@ class ChildSpec:
     """One supervised process: a name for display and the arguments after the interpreter.
 
     `watch` is called with the id of each started process; what it returns tells whether that hangs. With `warm`, a
-    spare process that has prepared these (`warm_spare`) waits to take the place of one that dies.
+    spare process that has prepared these (`warm_spare`) waits to take the place of one that dies; with `rehearsed`,
+    it also gets ready for this command line.
     """
 
     name: str
     arguments: tuple[str, ...]
     watch: Callable[[int], Watch] | None = None
     warm: tuple[str, ...] = ()
+    rehearsed: bool = False
 
     @classmethod
     def deltalight(cls, name: str, *arguments: str) -> "ChildSpec":
         """Return a child that runs a command of this command line."""
         return cls(name, ("-P", "-m", "deltalight.services.cli", *arguments))
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What follows the name `deltalight` on the command line."""
+        return self.arguments[len(ChildSpec.deltalight("").arguments) :]
 
 
 @dataclass
@@ -84,6 +91,8 @@ class Child:
         due = self.spec.warm and self.process is not None and self.spare is None
         if due and time.monotonic() - self.started_s >= SPARE_AFTER_S:
             self.spare = open_spare(self.spec.arguments, self.spec.warm)
+            if self.spec.rehearsed:
+                rehearse_spare(self.spare, self.spec.words)
 
     def _take_spare(self) -> subprocess.Popen[str] | None:
         """Return the spare, which starts now, None if there is none."""
@@ -158,8 +167,7 @@ def early_spares(commands: Mapping[str, str]) -> Iterator[dict[str, subprocess.P
 
 def take_spare(spare: subprocess.Popen[str] | None, spec: ChildSpec) -> subprocess.Popen[str] | None:
     """Tell a spare to go on as a deltalight command; None where there is no spare, or it died."""
-    words = spec.arguments[len(ChildSpec.deltalight("").arguments) :]
-    return spare if spare is not None and use_spare(spare, words) else None
+    return spare if spare is not None and use_spare(spare, spec.words) else None
 
 
 def end_all(processes: Sequence[subprocess.Popen[str]]) -> None:

@@ -133,7 +133,7 @@ def main() -> None:
     end_with_supervisor()
     allow_many_connections()
     limit_blas_threads(sys.argv[1:])
-    wait_if_spare()
+    wait_if_spare(run)
     sys.exit(run(sys.argv[1:]))
 
 

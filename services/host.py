@@ -19,7 +19,8 @@ class HostCommands:
     """Command lines of processes of this host, which talk over loopback.
 
     `config` is the configuration file of all; None = the one they find, which overrides the defaults here. With
-    `spares`, a process that dies is replaced by one that has imported what it needs (some 100 MB each).
+    `spares`, a process that dies is replaced by one that has imported what it needs (some 100 MB each);
+    a render server's has also built the scene, with as much memory as that takes.
     """
 
     config: Path | None = Path(os.devnull)
@@ -53,7 +54,7 @@ class HostCommands:
             options += ["--device", str(device)]
         if self.allow_software:
             options += ["--allow-software"]
-        return self.child(label, "server", *options)
+        return replace(self.child(label, "server", *options), rehearsed=True)
 
     def web(self, data: Path, page_port: int, *more: str) -> ChildSpec:
         """Return a web process."""
@@ -78,7 +79,8 @@ class HostPlan:
     `source` is what the node of this host captures; None = there is no node, and the server looks for the one called
     `remote_node` on the network. `config` is the configuration file of all processes; None = the one they find, which
     overrides the defaults here. `data` is the folder of scenes of the web process, which runs only if it is given.
-    With `spares`, a process that dies is replaced by one that has imported what it needs (some 100 MB each).
+    With `spares`, a process that dies is replaced by one that has imported what it needs (some 100 MB each);
+    a render server's has also built the scene, with as much memory as that takes.
     With `playback_port` the source is a recording that waits at its first frame, to be played and moved along there.
     """
 

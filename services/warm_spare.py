@@ -3,20 +3,75 @@
 import json
 import os
 import pkgutil
+import select
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any
 
 from deltalight.services.uncollected import uncollected
 
 SPARE_VARIABLE = "DELTALIGHT_SPARE_PREPARES"
-GO = b"1"
+GO, REHEARSE = "1", "2"  # what spares are told, a line each, arguments following; GO is the last one
 PREPARED = {  # by spares of a command
     "node": ("deltalight.services.node_process", "pydantic_settings", "blosc2"),
     "replay": ("deltalight.services.node_process", "pydantic_settings", "blosc2"),
     "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings", "blosc2"),
     "api": ("deltalight.services.api.serve", "pydantic_settings"),
 }
+ENDED_BY_SIGNAL = 128  # and the signal's number is the exit code
+
+
+class Spare:
+    """This process as a spare: what it is told on stdin.
+
+    `is_rehearsing`: the command that runs shall only get ready, `is_called` tells until when. What it keeps in
+    `prepared` is for the command that the process becomes.
+    """
+
+    def __init__(self, stdin: int) -> None:
+        self.is_rehearsing = False
+        self.prepared: Any = None
+        self._stdin = stdin
+        self._unread = b""
+        self._has_ended = False
+
+    def is_called(self, timeout_s: float = 0.0) -> bool:
+        """Wait so long to be told something; return whether there is anything, or stdin has ended."""
+        while not (b"\n" in self._unread or self._has_ended):
+            if not select.select([self._stdin], [], [], timeout_s)[0]:
+                return False
+            self._read()
+        return True
+
+    def next_line(self) -> str:
+        """Wait for the next line and return it; empty once stdin has ended."""
+        while not (b"\n" in self._unread or self._has_ended):
+            self._read()
+        line, _, self._unread = self._unread.partition(b"\n")
+        return line.decode()
+
+    def rehearse(self, arguments: Sequence[str], run: Callable[[list[str]], int]) -> None:
+        """Run a command until it is ready; a signal ends the process, a fault leaves the spare as it was."""
+        self.is_rehearsing = True
+        code = run(list(arguments))
+        self.is_rehearsing = False
+        if code > ENDED_BY_SIGNAL:
+            sys.exit(code)
+
+    def _read(self) -> None:
+        piece = os.read(self._stdin, 65536)
+        self._unread += piece
+        self._has_ended = not piece
+
+
+_spare: Spare | None = None
+
+
+def this_spare() -> Spare | None:
+    """Return what this process is or was as a spare; None if it was started as what it is."""
+    return _spare
 
 
 def spare_environment(prepared: tuple[str, ...]) -> dict[str, str]:
@@ -27,6 +82,14 @@ def spare_environment(prepared: tuple[str, ...]) -> dict[str, str]:
     return {SPARE_VARIABLE: ",".join(prepared)}
 
 
+def rehearse_spare(spare: "subprocess.Popen[str]", arguments: Sequence[str]) -> None:
+    """Tell a spare to get ready for a command with these arguments, once it has prepared what it was started for."""
+    assert spare.stdin is not None
+    with suppress(OSError):  # it died meanwhile
+        spare.stdin.write(REHEARSE + json.dumps(arguments) + "\n")
+        spare.stdin.flush()
+
+
 def use_spare(spare: "subprocess.Popen[str]", arguments: Sequence[str] = ()) -> bool:
     """Tell a spare to go on, with other `arguments` than its own if there are any; return whether it does."""
     assert spare.stdin is not None
@@ -34,7 +97,7 @@ def use_spare(spare: "subprocess.Popen[str]", arguments: Sequence[str] = ()) -> 
         return False
     try:
         with spare.stdin as told:
-            told.write(GO.decode() + (json.dumps(arguments) if arguments else ""))
+            told.write(GO + (json.dumps(arguments) if arguments else ""))
     except OSError:  # it died meanwhile
         spare.kill()
         spare.wait()
@@ -42,18 +105,21 @@ def use_spare(spare: "subprocess.Popen[str]", arguments: Sequence[str] = ()) -> 
     return True
 
 
-def wait_if_spare() -> None:
+def wait_if_spare(run: Callable[[list[str]], int]) -> None:
     """Where this process was started as a spare: prepare, wait for GO on stdin, and have an empty stdin from then on.
 
-    Arguments that follow GO replace those of the command line. Ends the process if stdin ends without GO: its
-    supervisor is gone, or has no use for it.
+    Arguments that follow GO replace those of the command line; `run` runs a command that is to be rehearsed before.
+    Ends the process if stdin ends without GO: its supervisor is gone, or has no use for it.
     """
+    global _spare  # noqa: PLW0603 (of the process)
     prepared = os.environ.pop(SPARE_VARIABLE, None)
     if prepared is None:
         return
     with uncollected():
         _prepare([name for name in prepared.split(",") if name])
-    told = _read_all(sys.stdin.fileno())
+    _spare = Spare(sys.stdin.fileno())
+    while (told := _spare.next_line()).startswith(REHEARSE):
+        _spare.rehearse(json.loads(told[len(REHEARSE) :]), run)
     if not told.startswith(GO):
         sys.exit(0)
     if len(told) > len(GO):
@@ -68,8 +134,3 @@ def _prepare(names: Sequence[str]) -> None:
         found = pkgutil.resolve_name(name)
         if callable(found):
             found()
-
-
-def _read_all(stdin: int) -> bytes:
-    pieces = iter(lambda: os.read(stdin, 65536), b"")
-    return b"".join(pieces)

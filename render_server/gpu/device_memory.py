@@ -13,7 +13,8 @@ _DEDICATED_NVX, _AVAILABLE_NVX = 0x9047, 0x9049  # kB (NVX_gpu_memory_info)
 _TEXTURE_FREE_ATI = (
     0x87FC  # kB free, of all and of the largest block, the same of auxiliary memory (ATI_meminfo)
 )
-_CONTROL_GROUP = Path("/sys/fs/cgroup/memory.max")
+_CONTROL_GROUP, _USED_BY_IT = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
+_MEMORY = Path("/proc/meminfo")
 
 Integers = Callable[[int, int], list[int]]  # glGetIntegerv: the name of a value, and how many numbers it has
 
@@ -66,6 +67,19 @@ def host_memory() -> int:
         return min(memory, int(_CONTROL_GROUP.read_text()))
     except (OSError, ValueError):  # no control groups, or "max"
         return memory
+
+
+def free_host_memory() -> int:
+    """Return what is free of `host_memory`, bytes; 0 where that is unknown."""
+    try:
+        lines = dict(line.split(":") for line in _MEMORY.read_text().splitlines())
+        free = int(lines["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        return 0
+    try:
+        return min(free, int(_CONTROL_GROUP.read_text()) - int(_USED_BY_IT.read_text()))
+    except (OSError, ValueError):
+        return free
 
 
 def gl_integers() -> Integers:

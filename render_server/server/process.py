@@ -13,6 +13,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import structlog
@@ -31,7 +32,12 @@ from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument, load_scene
-from deltalight.render_server.gpu.context import CompileWatcher, count_gl_objects, create_context
+from deltalight.render_server.gpu.context import (
+    CompileWatcher,
+    GpuContext,
+    count_gl_objects,
+    create_context,
+)
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
@@ -195,6 +201,15 @@ class Sender:
         return encode(item.message.model_copy(update={"encoding": "jpeg"}), jpegs)
 
 
+class BuiltAhead(Protocol):
+    """What a process built while it was a spare (`ahead.Ahead`)."""
+
+    def take(
+        self, settings: ServerSettings, scene: SceneDocument
+    ) -> tuple[GpuContext | None, SceneRenderer | None]:
+        """Returns what serves these settings and this scene; None for what has to be made."""
+
+
 def _topic(item: Sendable) -> str:
     return item.message.topic if isinstance(item, RenderedFrame) else item.topic
 
@@ -204,10 +219,10 @@ def warm_up() -> None:
     prefilter(np.zeros((ENVIRONMENT_SIZE, ENVIRONMENT_SIZE, 3), np.float32))
 
 
-def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
+def run_server(settings: ServerSettings, keys: Keys | None = None, ahead: BuiltAhead | None = None) -> None:
     """Serves until a `shutdown` command or an exception (Ctrl-C, SIGTERM) ends it.
 
-    `keys` are required if an endpoint leaves the host.
+    `keys` are required if an endpoint leaves the host; `ahead` is what this process built while it was a spare.
 
     Raises:
         DeltalightError: the scene is wrong, no OpenGL device is suitable, or a port is in use.
@@ -217,11 +232,16 @@ def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
     for fault in PLUGINS.faults.values():
         log.warning(fault)
     with ExitStack() as stack:
-        gpu = create_context(settings.device, allow_software=settings.allow_software)
+        gpu, renderer = (None, None) if ahead is None else ahead.take(settings, scene)
+        if gpu is None:
+            gpu = create_context(settings.device, allow_software=settings.allow_software)
         stack.callback(gpu.release)
         if gpu.is_software:
             log.warning("no GPU found, rendering slowly in software", renderer=gpu.renderer_name)
-        renderer = SceneRenderer(gpu, scene, waits=False)  # commands are answered meanwhile
+        if renderer is None:
+            renderer = SceneRenderer(gpu, scene, waits=False)  # commands are answered meanwhile
+        else:
+            log.info("goes on with the scene that was built ahead", revision=scene.revision)
         stack.callback(renderer.release)
         serve(
             settings,

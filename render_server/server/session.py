@@ -148,7 +148,7 @@ class RenderSession:
         self._cameras = RoomCameras(
             pairing,
             lambda fault: self._count_fault("bad_frames", fault),
-            needs_depth=_needs_depth(scene),
+            needs_depth=needs_depth(scene),
             endpoints=endpoints,
         )
         self._told: Mapping[str, CameraStatus] = {}  # of the cameras, by name
@@ -460,7 +460,7 @@ class RenderSession:
 
     def _use_scene(self, scene: SceneDocument, scene_id: str | None) -> dict[str, object]:
         self._renderer.set_scene(scene)
-        self._cameras.need_depth(_needs_depth(scene))
+        self._cameras.need_depth(needs_depth(scene))
         self.scene, self.scene_id = scene, scene_id
         self._keep_scene(scene)
         return {"revision": scene.revision}
@@ -488,7 +488,8 @@ def _rows(matrix: Float64[np.ndarray, "4 4"] | None) -> Any:  # noqa: ANN401 - p
     return None if matrix is None else matrix.tolist()
 
 
-def _needs_depth(scene: SceneDocument) -> bool:
+def needs_depth(scene: SceneDocument) -> bool:
+    """Returns whether frames of a scene are complete only with depth."""
     return scene.real.geometry in ("depth", "fused")
 
 

@@ -7,6 +7,7 @@ import typer
 
 from deltalight.services.commands.options import ConfigFile, NodeName
 from deltalight.services.uncollected import uncollected
+from deltalight.services.warm_spare import this_spare
 
 if TYPE_CHECKING:
     from deltalight.protocol.keys import KeySettings
@@ -49,6 +50,7 @@ def server(
     """Render the frames of sensor nodes and publish the pictures, until Ctrl-C."""
     with uncollected():
         from deltalight.protocol.keys import KeySettings
+        from deltalight.render_server.server.ahead import Ahead
         from deltalight.render_server.server.process import ServerSettings, run_server
         from deltalight.services.settings import load_configuration
 
@@ -68,7 +70,12 @@ def server(
     given = {key: value for key, value in given.items() if value is not None}
     settings = configuration.section("server", ServerSettings, given)
     keys = key_settings.load([*settings.subscribe, settings.publish, settings.control])
-    run_server(settings, keys)
+    spare = this_spare()
+    if spare is not None and spare.is_rehearsing:
+        spare.prepared = Ahead(settings, keys, spare.is_called)
+        spare.prepared.keep()
+    else:
+        run_server(settings, keys, None if spare is None else spare.prepared)
 
 
 def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:

@@ -54,7 +54,8 @@ def up(
         bool,
         typer.Option(
             "--spares/--no-spares",
-            help="Keep a spare of each process, which replaces a dead one sooner (some 350 MB).",
+            help="Keep a spare of each process, which replaces a dead one sooner (some 350 MB, and "
+            "as much as the render server takes, whose scene is built ahead).",
         ),
     ] = True,
     rooms: Annotated[

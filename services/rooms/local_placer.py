@@ -11,6 +11,7 @@ from deltalight.services import ports
 from deltalight.services.child import SPARE_AFTER_S, ChildSpec, end_all, open_spare, take_spare
 from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
 from deltalight.services.rooms.render_process import RenderProcess
+from deltalight.services.warm_spare import rehearse_spare
 
 # The command line of a placement's render server on a device (None = the driver's first).
 Command = Callable[[RoomOrder, Placement, int | None], ChildSpec]
@@ -19,7 +20,8 @@ Command = Callable[[RoomOrder, Placement, int | None], ChildSpec]
 class LocalPlacer:
     """Places each render server as a child of this process, in a slot per entry of `devices` (a `Placer`).
 
-    With a `spare`, a command line that prepares and waits (`ChildSpec.warm`), a placement takes half of a start.
+    With a `spare`, a command line that prepares and waits (`ChildSpec.warm`), a placement takes half of a start, and
+    one of the room that it rehearses (the one that has been placed for longest) a fraction.
     """
 
     def __init__(
@@ -122,3 +124,4 @@ class LocalPlacer:
             self._spare_due_s = time.monotonic() + SPARE_AFTER_S
             with suppress(OSError):  # no more open files or processes: rooms do without one
                 self._spare = open_spare(self._spare_spec.arguments, self._spare_spec.warm)
+                rehearse_spare(self._spare, next(iter(self._placed.values())).words)

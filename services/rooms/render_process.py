@@ -34,6 +34,11 @@ class RenderProcess:
         self._child.start(spare)
 
     @property
+    def words(self) -> tuple[str, ...]:
+        """Its command line (`ChildSpec.words`)."""
+        return self._child.spec.words
+
+    @property
     def process(self) -> subprocess.Popen[str]:
         """Its process."""
         assert self._child.process is not None

@@ -8,7 +8,12 @@ from typing import Any
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.render_server.gpu.device_memory import FoundDevice, device_memory, host_memory
+from deltalight.render_server.gpu.device_memory import (
+    FoundDevice,
+    device_memory,
+    free_host_memory,
+    host_memory,
+)
 from deltalight.services.rooms.capacity import (
     FalseClaimError,
     RoomFigures,
@@ -150,6 +155,10 @@ def test_drivers_tell_memory_in_their_ways() -> None:
     assert device_memory(["GL_ATI_meminfo"], amd, is_software=False) == (4 * GIB, 4 * GIB)
     assert device_memory([], integers({}), is_software=False) == (None, None)
     assert device_memory(["GL_NVX_gpu_memory_info"], nvidia, is_software=True) == (host_memory(), None)
+
+
+def test_what_is_free_of_this_host_is_a_part_of_its_memory() -> None:
+    assert 0 < free_host_memory() < host_memory()
 
 
 @pytest.mark.slow

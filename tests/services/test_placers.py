@@ -1,6 +1,7 @@
 """What every placer promises, kept with real processes, by Ray's too: slots, losses, endpoints, no orphans."""
 
 import errno
+import json
 import os
 import signal
 import time
@@ -38,6 +39,14 @@ publisher = Publisher(sys.argv[1])
 while True:
     publisher.send(encode(StatsMessage(node="room", capture_ns=time.time_ns(), state="running", detail="fine")))
     time.sleep(0.05)
+"""
+# A spare that writes down what it is to rehearse.
+TOLD = """
+import sys
+from pathlib import Path
+line = sys.stdin.readline()
+Path(sys.argv[1]).with_suffix(".part").write_text(line[1:])
+Path(sys.argv[1]).with_suffix(".part").rename(sys.argv[1])
 """
 REFUSING = "import sys; print('deltalight: The scene is wrong; mend it.', file=sys.stderr); sys.exit(2)"
 PATIENCE_S = 90.0
@@ -176,6 +185,16 @@ def test_a_spare_that_cannot_be_started_is_missed_by_nobody(monkeypatch: pytest.
         placer.place(order("hall", 1))
         assert until(placer, lambda event: event.kind == "reported").shows
         assert placer.spare_id is None
+
+
+def test_the_spare_rehearses_a_room_that_is_placed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(local_placer, "SPARE_AFTER_S", 0.0)
+    told = tmp_path / "told"
+    spare = ChildSpec("spare", ("-P", "-c", TOLD, str(told)))
+    with closing(LocalPlacer((None,), reporting, spare=spare, forward=lambda _line: None)) as placer:
+        placement = placer.place(order("hall", 1))
+        until(placer, lambda _event: told.exists())
+    assert json.loads(told.read_text()) == [*ChildSpec("hall", ("-c", REPORTING, placement.publish)).words]
 
 
 def test_ports_never_run_out_and_late_ones_are_not_used_again(monkeypatch: pytest.MonkeyPatch) -> None:

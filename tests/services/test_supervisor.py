@@ -147,7 +147,7 @@ def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
 WARM_CHILD = """
 import os, sys, time
 from deltalight.services.warm_spare import wait_if_spare
-wait_if_spare()
+wait_if_spare(lambda words: 0)
 print("runs with", "colorsys" in sys.modules, repr(sys.stdin.read()), file=sys.stderr, flush=True)
 while True: time.sleep(60)
 """
@@ -167,6 +167,37 @@ def test_a_spare_takes_the_place_of_a_process_that_dies(monkeypatch: pytest.Monk
         another = supervisor.spare_ids()["a"]
         assert another not in {first, spare}
     assert not any(psutil.pid_exists(number) for number in (first, spare, another))
+
+
+REHEARSING_CHILD = """
+import sys
+from deltalight.services.warm_spare import this_spare, wait_if_spare
+
+def run(words):
+    spare = this_spare()
+    if spare.is_rehearsing:
+        spare.prepared = f"rehearsed {words}, called: {spare.is_called(60.0)};"
+    elif spare.prepared:
+        print(spare.prepared, "runs", words, file=sys.stderr, flush=True)
+    return 0
+
+wait_if_spare(run)
+if this_spare() is not None:
+    run(sys.argv[1:])
+import time
+while True: time.sleep(60)
+"""
+
+
+def test_a_spare_rehearses_its_command_until_it_is_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deltalight.services.child.SPARE_AFTER_S", 0.0)
+    lines: list[str] = []
+    spec = ChildSpec("a", ("-P", "-c", REHEARSING_CHILD, "sing"), warm=("colorsys",), rehearsed=True)
+    with Supervisor([spec], forward=lines.append) as supervisor:
+        poll_until(supervisor, lambda: "a" in supervisor.spare_ids())
+        psutil.Process(supervisor.process_ids()["a"]).kill()
+        poll_until(supervisor, lambda: any("runs ['sing']" in line for line in lines))
+    assert "a: rehearsed ['sing'], called: True; runs ['sing']" in lines
 
 
 def test_a_dead_spare_is_nobodys_replacement(monkeypatch: pytest.MonkeyPatch) -> None:

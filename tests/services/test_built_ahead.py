@@ -1,0 +1,178 @@
+"""A spare render server that has built the scene ahead, with real processes: who is killed comes back with it."""
+
+import os
+import select
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import psutil
+import pytest
+
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.messages import CompositeMessage, ControlReply, ControlRequest
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import RequestClient
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.services import ports
+from deltalight.services.child import ChildSpec
+from deltalight.services.supervisor import Supervisor
+from deltalight.services.warm_spare import PREPARED
+from tests.services.storage_samples import TETRAHEDRON
+from tests.services.test_render_server_sockets import Node
+
+pytestmark = pytest.mark.slow(seconds=20)
+PATIENCE_S = 90.0
+SERVER = "render server"
+USES_IT = "goes on with the scene that was built ahead"
+COMMAND_LINE = "from deltalight.services.cli import main\nmain()"
+WITHOUT_MEMORY = f"""
+from deltalight.render_server.server import ahead
+ahead.NEEDED_BYTES = 2**62
+{COMMAND_LINE}
+"""
+
+
+class Station:
+    """A render server of a scene with one object, its spare, a node and a receiver of its pictures."""
+
+    def __init__(self, folder: Path, code: str) -> None:
+        node_port, published, control = ports.private_ports(3)
+        self.lines: list[str] = []
+        self.document = scene(folder)
+        session = folder / "session.json"
+        session.write_text(self.document.model_dump_json())
+        options = ["--session", str(session), "--subscribe", ports.endpoint(node_port), "--allow-software"]
+        sockets = ["--publish", ports.endpoint(published), "--control", ports.endpoint(control)]
+        arguments = ("-P", "-c", code, "server", *options, *sockets)
+        spec = ChildSpec(SERVER, arguments, warm=PREPARED["server"], rehearsed=True)
+        self.supervisor = Supervisor([spec], forward=self.lines.append)
+        self._node = Node(ports.endpoint(node_port))
+        self._receiver = Receiver([ports.endpoint(published)], ["composite"])
+        self._client = RequestClient(ports.endpoint(control))
+        self._heard = ""
+
+    def close(self) -> None:
+        self.supervisor.stop()
+        self._node.close()
+        self._receiver.close()
+        self._client.close()
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
+        self.supervisor.run(until=lambda: condition() or time.monotonic() > deadline_s)
+        assert condition(), self.lines
+
+    def wait_for_spare_to_say(self, words: str) -> None:
+        """The spare's lines are read by nobody else before it takes over."""
+        (child,) = self.supervisor._children
+
+        def said() -> bool:
+            if child.spare is not None and child.spare.stderr is not None:
+                stderr = child.spare.stderr.fileno()
+                if select.select([stderr], [], [], 0)[0]:
+                    self._heard += os.read(stderr, 65536).decode()
+            return words in self._heard
+
+        self.wait_for(said)
+
+    def kill(self) -> None:
+        """Kill the server, and wait until its spare has taken over and shows a picture."""
+        spare, now_ns = self.supervisor.spare_ids()[SERVER], time.time_ns()
+        psutil.Process(self.supervisor.process_ids()[SERVER]).kill()
+        self.wait_for(lambda: self.supervisor.process_ids()[SERVER] == spare)
+        self.wait_for(lambda: self.picture().rendered_ns > now_ns)
+
+    def picture(self) -> CompositeMessage:
+        messages = [decode(each)[0] for each in (self._receiver.latest(1.0) or {}).values()]
+        found = [message for message in messages if isinstance(message, CompositeMessage)]
+        return found[0] if found else CompositeMessage.model_construct(rendered_ns=0, scene_revision=0)
+
+    def ask(self, op: str, **payload: object) -> ControlReply:
+        request = ControlRequest(node="test", id=f"r{time.time_ns()}", op=op, payload=payload)
+        return self._client.request(request, PATIENCE_S)
+
+    def move_cup(self) -> None:
+        changed = self.document.model_dump(mode="json")
+        changed["objects"][0]["pose"]["translation_m"] = [0.1, 0, 0.5]
+        assert self.ask("set_scene", scene=changed).ok
+
+    def shown(self) -> SceneDocument:
+        return parse_scene(self.ask("get_scene").payload["scene"])
+
+
+def scene(folder: Path) -> SceneDocument:
+    mesh = folder / "cup.obj"
+    mesh.write_bytes(TETRAHEDRON)
+    return parse_scene(
+        {
+            "revision": 7,
+            "objects": [
+                {"id": "cup", "asset": str(mesh), "pose": {"translation_m": [0, 0, 0.5], "scale": 0.2}}
+            ],
+            "method": {"name": "dvct", "volume_size": 32, "cone_count": 4, "bounces": 0, "far_volume": False},
+        }
+    )
+
+
+@pytest.fixture
+def station_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Station]]:
+    monkeypatch.setattr("deltalight.services.child.SPARE_AFTER_S", 0.0)
+    opened: list[Station] = []
+
+    def station(code: str) -> Station:
+        opened.append(Station(tmp_path, code))
+        opened[-1].supervisor.__enter__()
+        return opened[-1]
+
+    yield station
+    for each in opened:
+        with closing(each):
+            pass
+
+
+def test_a_killed_server_comes_back_with_what_its_spare_has_built(
+    station_of: Callable[[str], Station],
+) -> None:
+    station = station_of(COMMAND_LINE)
+    station.wait_for_spare_to_say("scene built ahead")
+    station.kill()
+    station.wait_for(lambda: station.picture().scene_revision == 7)
+    assert station.shown() == station.document
+    station.wait_for(lambda: any(USES_IT in line for line in station.lines))
+
+
+def test_a_scene_that_was_built_ahead_and_changed_since_is_not_shown(
+    station_of: Callable[[str], Station],
+) -> None:
+    station = station_of(COMMAND_LINE)
+    station.wait_for_spare_to_say("scene built ahead")
+    station.move_cup()
+    station.kill()
+    station.wait_for(lambda: station.picture().scene_revision == 8)
+    assert station.shown().objects[0].pose.translation_m == (0.1, 0, 0.5)
+    assert not any(USES_IT in line for line in station.lines)
+
+
+def test_a_scene_that_changed_is_built_ahead_anew(station_of: Callable[[str], Station]) -> None:
+    station = station_of(COMMAND_LINE)
+    station.wait_for_spare_to_say("scene built ahead")
+    station.move_cup()
+    station.wait_for_spare_to_say("revision=8")
+    station.kill()
+    station.wait_for(lambda: station.picture().scene_revision == 8)
+    assert station.shown().objects[0].pose.translation_m == (0.1, 0, 0.5)
+    station.wait_for(lambda: any(USES_IT in line for line in station.lines))
+
+
+def test_a_spare_that_can_build_nothing_ahead_takes_over_all_the_same(
+    station_of: Callable[[str], Station],
+) -> None:
+    station = station_of(WITHOUT_MEMORY)
+    station.wait_for_spare_to_say("nothing is built ahead")
+    assert "lacks the memory for a second renderer" in station._heard
+    station.kill()
+    station.wait_for(lambda: station.picture().scene_revision == 7)
+    assert station._heard.count("nothing is built ahead") == 1
+    assert not any("built ahead" in line for line in station.lines)
