@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -382,8 +383,12 @@ class LightSet:
             light["id"] = identity
         return [
             *lights,
-            {"type": "environment", "mean_radiance": solid_angle_mean(self.environment).tolist()},
+            {"type": "environment", "mean_radiance": self._mean_radiance.tolist()},
         ]
+
+    @cached_property
+    def _mean_radiance(self) -> Float64[np.ndarray, "3"]:
+        return solid_angle_mean(self.environment)
 
 
 def build_lights(lights: documents.Lights) -> LightSet:
