@@ -9,9 +9,8 @@ from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
-from deltalight.render_server.passes.voxelize import VoxelizedMesh
-from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
-from deltalight.render_server.scene.depth_views import DepthViews
+from deltalight.render_server.passes.voxelize import Chosen, VoxelizedMesh
+from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh
 
@@ -98,6 +97,10 @@ class DrawnMesh:
         return self.mesh.corners
 
 
+ChooseBacks = Callable[[DrawnMesh, float], Chosen]
+"""Returns which triangles of a mesh have backs in voxels of an edge (m)."""
+
+
 @dataclass(frozen=True, eq=False)
 class GeometryState:
     """One set of triangles in the world; another set is another object.
@@ -114,7 +117,7 @@ class GeometryState:
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
     extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
     is_open: bool = False  # what is solid as cameras see it: backs are not in it
-    seen_by: DepthViews | None = None  # several cameras, which tell where backs cannot be
+    choose_backs: ChooseBacks | None = None  # by several cameras, which tell where backs cannot be
 
     @property
     def is_measured(self) -> bool:
@@ -153,10 +156,8 @@ class GeometryState:
         """
         if not self.is_open:
             return self.parts
-        coarse, chosen = self.coarse_mesh, None
-        if self.seen_by is not None:
-            middles = back_faces(coarse.corners, voxel_edge).mean(axis=1, dtype=np.float64)
-            chosen = np.flatnonzero(~self.seen_by.in_free_space(middles)).astype(np.int32)
+        coarse = self.coarse_mesh
+        chosen = None if self.choose_backs is None else self.choose_backs(coarse, voxel_edge)
         return *self.parts, VoxelizedMesh(coarse.buffers, BACK_OFFSET_VOXELS * voxel_edge, chosen)
 
     @property

@@ -5,24 +5,21 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import ModelGeometry, RealScene
 from deltalight.render_server.camera_history import CameraHistory
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import DrawnMesh, GeometryState
-from deltalight.render_server.passes.depth_mesh import DepthMesher
+from deltalight.render_server.gpu_scene import ChooseBacks, DrawnMesh, GeometryState
+from deltalight.render_server.passes.depth_mesh import DepthFrame, DepthMesher
 from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
-from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, REAL_MATERIAL, bound_points, depth_mesh
-from deltalight.render_server.scene.depth_surface import (
-    DepthSurface,
-    depth_surface,
-    grazing_depth_fill,
-    noise_sigma,
-)
-from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
+from deltalight.render_server.passes.voxelize import Chosen
+from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, BOUND_POINTS, REAL_MATERIAL
+from deltalight.render_server.scene.depth_surface import noise_sigma
+from deltalight.render_server.scene.depth_views import PosedSurface
 from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.render_server.scene.seen_depth import Grazing, SeenDepth
 from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
 from deltalight.render_server.scene.tsdf_mesh import TsdfScene
@@ -45,8 +42,8 @@ class RealGeometry:
     """Holds the real scene of all cameras in a room, and rebuilds it when it moves (CameraHistory).
 
     `state` is a new object whenever the triangles change. `cameras` are in the order of the frames. `meshes_on_gpu`:
-    the GPU makes the triangles of one camera's depth; default: if it is one, because numpy is quicker than Mesa's
-    software renderer.
+    the GPU makes the triangles of depth; default: if it is one, because numpy is quicker than Mesa's software
+    renderer.
     """
 
     def __init__(
@@ -174,53 +171,44 @@ class RealGeometry:
 
         What several cameras see is kept of the one that shows it largest.
         """
-        if self._mesher is not None and len(self.cameras) == 1:
-            self._mesh_on_gpu(self._mesher, self.cameras[0].seen)
+        frames = [camera.seen for camera in self.cameras]
+        surfaces = [partial(_posed_surface, *each) for each in zip(self.cameras, frames, strict=True)]
+        seen = SeenDepth(frames, surfaces)
+        budget = self.budget // len(frames)  # of the room, however many cameras see it
+        if self._mesher is not None:
+            self._mesh_on_gpu(self._mesher, seen, (budget, budget // COARSE_DIVISOR))
             return
-        seen = [camera.seen for camera in self.cameras]
-        grazing = [begun(partial(_grazing_depth, each)) for each in seen]  # while surfaces are fitted
-        shown = DepthViews(tuple(map(_posed_surface, self.cameras, seen)))
-        known = [
-            (each, frame.surface, fill.result)
-            for each, frame, fill in zip(seen, shown.frames, grazing, strict=True)
-        ]
-
-        def meshes(budget: int) -> list[TriangleMesh]:
-            return shown.without_copies([_depth_mesh(*each, budget) for each in known], budget)
-
-        budget = self.budget // len(seen)  # of the room, however many cameras see it
-        coarse = self._begun_coarse(lambda: merge_for_gpu(meshes(budget // COARSE_DIVISOR)))
-        fine = meshes(budget)
+        coarse = self._begun_coarse(lambda: merge_for_gpu(seen.meshes(budget // COARSE_DIVISOR)))
+        fine = seen.meshes(budget)
         if not any(len(mesh.triangles) for mesh in fine):
             self.state = None
             return
-        self._build(fine, coarse, is_open=True, seen_by=shown if len(seen) > 1 else None)
 
-    def _mesh_on_gpu(self, mesher: DepthMesher, seen: PosedFrame) -> None:
-        """Lets the GPU mesh a depth image; the CPU makes the same triangles only when asked for them."""
-        depth, view = seen.frame.depth, seen.view
-        assert depth is not None
-        grazing = begun(partial(_grazing_depth, seen))  # while depth is uploaded
-        bounds = begun(partial(bound_points, depth, view.camera, view.world_from_camera))
-        mesher.take(depth, view.camera, grazing.result)
-        points = bounds.result()
+        def choose_backs(mesh: DrawnMesh, voxel_edge: float) -> Chosen:
+            return seen.without_backs_in_sight(mesh.corners, voxel_edge)
+
+        self._build(fine, coarse, is_open=True, choose_backs=choose_backs if len(frames) > 1 else None)
+
+    def _mesh_on_gpu(self, mesher: DepthMesher, seen: SeenDepth, budgets: tuple[int, int]) -> None:
+        """Lets the GPU mesh the depth images; the CPU makes the same triangles only when asked for them."""
+        bounds = seen.begun_bounds()
+        mesher.take(list(map(_depth_frame, seen.frames, seen.grazing)), budgets)
+        points = bounds()
         if not len(points):
             self.state = None
             return
         empty = merge_for_gpu([EMPTY_MESH])
 
-        def drawn(buffers: MeshBuffers, budget: int) -> DrawnMesh:
-            mesher.fill(buffers, view.world_from_camera, budget, empty)
+        def drawn(buffers: MeshBuffers, *, coarse: bool) -> DrawnMesh:
+            mesher.fill(buffers, empty, coarse=coarse)
+            return DrawnMesh(buffers, lambda: merge_for_gpu(seen.meshes(budgets[coarse])))
 
-            def made() -> GpuMesh:
-                surface = depth_surface(depth, view.camera)
-                return merge_for_gpu([_depth_mesh(seen, surface, grazing.result, budget)])
+        def choose_backs(mesh: DrawnMesh, voxel_edge: float) -> Chosen:
+            return mesher.backs_of(mesh.buffers, BACK_OFFSET_VOXELS * voxel_edge)
 
-            return DrawnMesh(buffers, made)
-
-        fine = drawn(self._buffers, self.budget)
-        coarse = drawn(self._coarse_buffers, self.budget // COARSE_DIVISOR)  # takes as good as no time
-        self._show(fine, points, empty, lambda: coarse, is_open=True)
+        fine = drawn(self._buffers, coarse=False)
+        coarse = drawn(self._coarse_buffers, coarse=True)  # takes as good as no time
+        self._show(fine, points, empty, lambda: coarse, is_open=True, choose_backs=choose_backs)
 
     def _begun_coarse(self, make: Callable[[], GpuMesh]) -> Callable[[], DrawnMesh]:
         """Returns what makes coarse triangles when asked; begun now if the last ones were asked for too."""
@@ -239,14 +227,14 @@ class RealGeometry:
         coarse: Callable[[], DrawnMesh] | None,
         *,
         is_open: bool = False,
-        seen_by: DepthViews | None = None,
+        choose_backs: ChooseBacks | None = None,
     ) -> None:
         """Merges the meshes and uploads them."""
         merged = merge_for_gpu(meshes)
         self._buffers.write(merged)
         points = _sample(merged.vertices[:, :3])
         drawn = DrawnMesh(self._buffers, merged)
-        self._show(drawn, points, merged, coarse, is_open=is_open, seen_by=seen_by)
+        self._show(drawn, points, merged, coarse, is_open=is_open, choose_backs=choose_backs)
 
     def _show(
         self,
@@ -256,12 +244,14 @@ class RealGeometry:
         coarse: Callable[[], DrawnMesh] | None,
         *,
         is_open: bool,
-        seen_by: DepthViews | None = None,
+        choose_backs: ChooseBacks | None = None,
     ) -> None:
         """Sets the state."""
         if self._materials is None:
             self._materials = MaterialTable(self._gpu, materials, draws_maps=False)
-        self.state = GeometryState(drawn, points, self._materials, coarse, is_open=is_open, seen_by=seen_by)
+        self.state = GeometryState(
+            drawn, points, self._materials, coarse, is_open=is_open, choose_backs=choose_backs
+        )
 
     def _uploaded(self, coarse: GpuMesh) -> DrawnMesh:
         """Uploads the mesh of what lies far."""
@@ -277,23 +267,9 @@ class RealGeometry:
                 each.release()
 
 
-def _grazing_depth(seen: PosedFrame) -> Float32[np.ndarray, "h w"]:
+def _depth_frame(seen: PosedFrame, grazing: Grazing) -> DepthFrame:
     assert seen.frame.depth is not None
-    return grazing_depth_fill(seen.frame.depth, seen.frame.color, seen.view.camera)
-
-
-def _depth_mesh(
-    seen: PosedFrame,
-    surface: DepthSurface,
-    grazing: Callable[[], Float32[np.ndarray, "h w"]],
-    triangle_budget: int,
-) -> TriangleMesh:
-    """Returns a mesh of what a camera saw."""
-    view = seen.view
-    assert seen.frame.depth is not None
-    return depth_mesh(
-        seen.frame.depth, view.camera, view.world_from_camera, triangle_budget, surface, grazing=grazing
-    )
+    return DepthFrame(seen.frame.depth, seen.view, grazing)
 
 
 def _posed_surface(camera: CameraHistory, taken: PosedFrame) -> PosedSurface:

@@ -7,7 +7,7 @@ needs.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ LIST_WALKERS = 16384
 MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
 GPU_WALKERS = 2**18  # 4096 workgroups: what the largest GPUs hold at a time; idle threads cost microseconds
 GL_INT = 0x1404
+FITTING_KEPT = 32  # textures of a name that need not be checked again: some for each camera of a room
 CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
 Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
@@ -90,7 +91,8 @@ def _nothing() -> None:
 class _Slot:
     """An active resource of a linked program with its unit or binding point.
 
-    `checked` returns the texture that was last found to fit, while it lives; `last` is what a uniform holds.
+    `checked` returns the texture that was bound last, `fitting` those that were found to fit, by their ids, while
+    they live; `last` is what a uniform holds.
     """
 
     name: str
@@ -98,7 +100,19 @@ class _Slot:
     kind: int = 0
     place: int = 0
     checked: Callable[[], object] = _nothing
+    fitting: dict[int, Callable[[], object]] = field(default_factory=dict)
     last: bytes | Value | None = None
+
+    def is_known(self, texture: object) -> bool:
+        """Returns whether this very texture was found to fit before: cameras of a room take turns in each frame."""
+        self.checked = self.fitting.get(id(texture), _nothing)
+        return self.checked() is texture
+
+    def note_fitting(self, texture: object) -> None:
+        """Notes that a texture fits."""
+        if len(self.fitting) >= FITTING_KEPT:
+            self.fitting.clear()
+        self.checked = self.fitting[id(texture)] = ref(texture)
 
 
 class _Program:
@@ -196,7 +210,7 @@ class _Program:
 
     def _bind_sampler(self, slot: _Slot, value: Binding) -> None:
         texture: Any = self._gpu.empty_texture(*SAMPLERS[slot.kind]) if value is None else value
-        if slot.checked() is not texture:
+        if slot.checked() is not texture and not slot.is_known(texture):
             self._check_sampled(slot, texture)
         texture.use(location=slot.place)
 
@@ -210,11 +224,11 @@ class _Program:
             raise BindingError(
                 f"Kernel {self.label}: `{slot.name}` samples texels of type {texels}, not {texture.dtype}."
             )
-        slot.checked = ref(texture)
+        slot.note_fitting(texture)
 
     def _bind_image(self, slot: _Slot, value: Binding) -> None:
         texture: Any = value
-        if value is None or slot.checked() is not value:
+        if value is None or (slot.checked() is not value and not slot.is_known(value)):
             self._check_image(slot, value)
         texture.bind_to_image(slot.place)
 
@@ -229,7 +243,7 @@ class _Program:
                 f"Kernel {self.label}: `{slot.name}` is declared {' or '.join(sorted(wanted))}, "
                 f"but the texture is {found}."
             )
-        slot.checked = ref(texture)
+        slot.note_fitting(texture)
 
     def _bind_storage(self, slot: _Slot, value: Binding) -> None:
         is_written = slot.name in self._declared.written

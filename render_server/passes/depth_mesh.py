@@ -1,49 +1,54 @@
-"""Triangles of a depth image: on the GPU what render_server/scene/depth_mesh.py does in numpy."""
+"""Triangles of depth images: on the GPU what render_server/scene/depth_mesh.py does in numpy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import moderngl
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Kernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.depth_fit import DepthFit
+from deltalight.render_server.passes.depth_views import DepthViewLayers, FittedDepth
 from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.scene.depth_mesh import node_rays, stride_for_budget
 from deltalight.render_server.scene.depth_surface import jump_terms
 from deltalight.render_server.scene.triangle_mesh import GpuMesh
+from deltalight.render_server.view import CameraView
 
 
-class _PixelGrid:
-    """Textures at the pixels of a camera: depth and what is fitted to it, grazing surfaces, rays."""
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """A clean depth image and the view that it was taken from, to which it is registered.
 
-    def __init__(self, gpu: GpuContext, camera: CameraModel) -> None:
-        size = camera.width, camera.height
-        self.camera = camera
-        self._grazing = texture_2d(gpu, size, 1, "f4")
-        self._rays = texture_2d(gpu, size, 2, "f4", data=camera.rays().astype(np.float32).tobytes())
-        self._fit = DepthFit(gpu, size)
+    `grazing` returns the inverse depth of its grazing surfaces (`grazing_depth_fill`).
 
-    def take(self, depth: DepthImage, grazing: Callable[[], Float32[np.ndarray, "h w"]]) -> "_Taken":
-        fitted, oblique = self._fit.take(depth, self.camera), grazing()
-        has_grazing = bool(oblique.any())
-        if has_grazing:
-            self._grazing.write(oblique, alignment=1)
-        read: dict[str, Binding] = {
-            **fitted,
-            "picture_rays": self._rays,
-            "grazing_depth": self._grazing,
-            "GRAZING": has_grazing,
-        }
-        return _Taken(depth, fitted, read, jump_terms(depth, self.camera))
+    Raises:
+        DeltalightError: depth and camera differ in size.
+    """
 
-    def release(self) -> None:
-        release_all(self._grazing, self._rays, self._fit)
+    depth: DepthImage
+    view: CameraView
+    grazing: Callable[[], Float32[np.ndarray, "h w"]]
+
+    def __post_init__(self) -> None:
+        if self.depth.depth_m.shape != (self.view.camera.height, self.view.camera.width):
+            raise DeltalightError("the depth image and its camera differ in size; correct the calibration.")
+
+    @cached_property
+    def jump_terms(self) -> tuple[float, float]:
+        """The terms of `jump_threshold`, by pixel."""
+        return jump_terms(self.depth, self.view.camera)
+
+    def stride(self, triangle_budget: int) -> int:
+        """Returns the pixels of a cell of its mesh within a budget."""
+        return stride_for_budget(*self.view.size, triangle_budget)
 
 
 class _NodeGrid:
@@ -56,98 +61,158 @@ class _NodeGrid:
         self.quads = columns - 1, rows - 1
         texels = np.ascontiguousarray(rays.transpose(1, 2, 0)).tobytes()
         self.rays = texture_2d(gpu, self.size, 2, "f4", data=texels)
-        self.nodes = texture_2d(gpu, self.size, 2, "f4")
+        self.nodes = texture_2d(gpu, self.size, 4, "f4")
+
+    @property
+    def node_count(self) -> int:
+        """How many vertices there are."""
+        return int(self.size[0] * self.size[1])
+
+    @property
+    def triangle_count(self) -> int:
+        """How many triangles there could be."""
+        return int(2 * self.quads[0] * self.quads[1])
 
     def release(self) -> None:
         release_all(self.rays, self.nodes)
 
 
-@dataclass(frozen=True, eq=False)
-class _Taken:
-    """A depth image that was taken: what is fitted to it, what depth_nodes reads, its jump threshold by pixel."""
+class _CameraTextures:
+    """Textures at the pixels of one camera, depth and what is fitted to it among them, and at its meshes' nodes."""
 
-    depth: DepthImage
-    fitted: dict[str, Binding]
-    bindings: dict[str, Binding]
-    jump_terms: tuple[float, float]
+    def __init__(self, gpu: GpuContext, camera: CameraModel) -> None:
+        self._gpu = gpu
+        size = camera.width, camera.height
+        self.camera = camera
+        self._grazing = texture_2d(gpu, size, 1, "f4")
+        self._rays = texture_2d(gpu, size, 2, "f4", data=camera.rays().astype(np.float32).tobytes())
+        self._fit = DepthFit(gpu, size)
+        self._grids: dict[int, _NodeGrid] = {}
+        self._taken: DepthImage | None = None
+        self.fitted: dict[str, Binding] = {}
+        self._is_grazing: bool | None = None
+
+    def take(self, depth: DepthImage) -> None:
+        self._taken, self._is_grazing = None, None
+        self.fitted = self._fit.take(depth, self.camera)
+        self._taken = depth
+
+    def holds(self, depth: DepthImage) -> bool:
+        return self._taken is depth and self.camera == depth.camera
+
+    def grid(self, stride: int) -> _NodeGrid:
+        if stride not in self._grids:
+            self._grids[stride] = _NodeGrid(self._gpu, self.camera, stride)
+        return self._grids[stride]
+
+    @property
+    def pixels(self) -> dict[str, Binding]:
+        """What is fitted, and the pixels' rays."""
+        return {**self.fitted, "picture_rays": self._rays}
+
+    def with_grazing(self, grazing: Callable[[], Float32[np.ndarray, "h w"]]) -> dict[str, Binding]:
+        """Returns what depth_nodes reads; uploads the grazing surfaces once they are asked for."""
+        if self._is_grazing is None:
+            oblique = grazing()
+            self._is_grazing = bool(oblique.any())
+            if self._is_grazing:
+                self._grazing.write(oblique, alignment=1)
+        return {**self.pixels, "grazing_depth": self._grazing, "GRAZING": self._is_grazing}
+
+    def release(self) -> None:
+        release_all(self._grazing, self._rays, self._fit, *self._grids.values())
 
 
 class DepthMesher:
-    """Makes triangles of one depth image at a time, as scene/depth_mesh.py does, without a wait for the GPU.
+    """Makes triangles of the depth images that a room's cameras took at one moment, without a wait for the GPU.
 
-    Buffers have room for every node and triangle that could be; triangles that are not there have no area.
+    Of each as scene/depth_mesh.py does; of several, those stay that scene/depth_views.py keeps. Buffers have room for
+    every node and triangle that could be, one camera's after the other's; triangles that are not there have no area.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._make_nodes, self._make_triangles = Kernel(gpu, "depth_nodes"), Kernel(gpu, "depth_triangles")
-        self._pixels: _PixelGrid | None = None
-        self._grids: dict[int, _NodeGrid] = {}
-        self._taken: _Taken | None = None
+        self._cameras: list[_CameraTextures] = []
+        self._views: DepthViewLayers | None = None
+        self._frames: tuple[DepthFrame, ...] = ()
+        self._budgets = 0, 0
 
-    def take(
-        self, depth: DepthImage, camera: CameraModel, grazing: Callable[[], Float32[np.ndarray, "h w"]]
-    ) -> None:
-        """Takes a clean depth image, registered to `camera`, and the inverse depth of its grazing surfaces.
+    def take(self, frames: Sequence[DepthFrame], budgets: tuple[int, int]) -> None:
+        """Takes the depth images of all cameras; `budgets`: how many triangles each may have, fine and coarse."""
+        lenses = [each.view.camera for each in frames]
+        if lenses != [each.camera for each in self._cameras]:
+            self._set_cameras(lenses)
+        self._frames, self._budgets = tuple(frames), budgets
+        for camera, frame in zip(self._cameras, frames, strict=True):
+            camera.take(frame.depth)
+        if self._views is not None:
+            self._views.write(
+                [self._fitted(camera, each) for camera, each in zip(self._cameras, frames, strict=True)]
+            )
 
-        `grazing` is asked for that once the GPU is at work.
+    def _fitted(self, camera: _CameraTextures, frame: DepthFrame) -> FittedDepth:
+        fine, coarse = (frame.stride(budget) for budget in self._budgets)
+        return FittedDepth(frame.view, camera.pixels, frame.jump_terms, (fine, coarse))
 
-        Raises:
-            DeltalightError: depth and camera differ in size.
-        """
-        if depth.depth_m.shape != (camera.height, camera.width):
-            raise DeltalightError("the depth image and its camera differ in size; correct the calibration.")
-        if self._pixels is None or self._pixels.camera != camera:
-            self._forget_camera()
-            self._pixels = _PixelGrid(self._gpu, camera)
-        self._taken = None
-        self._taken = self._pixels.take(depth, grazing)
+    def _set_cameras(self, lenses: Sequence[CameraModel]) -> None:
+        self._forget_cameras()
+        self._cameras = [_CameraTextures(self._gpu, each) for each in lenses]
+        self._views = DepthViewLayers(self._gpu, lenses) if len(lenses) > 1 else None
 
     def fitted(self, depth: DepthImage) -> dict[str, Binding] | None:
-        """Returns what DepthFit found in a depth image if it was the last to be taken, until the next one is."""
-        if self._pixels is None or self._taken is None or self._taken.depth is not depth:
-            return None
-        return self._taken.fitted if self._pixels.camera == depth.camera else None
+        """Returns what DepthFit found in a depth image if it is among those taken last, until the next are."""
+        return next((camera.fitted for camera in self._cameras if camera.holds(depth)), None)
 
-    def fill(
-        self,
-        buffers: MeshBuffers,
-        world_from_camera: Float64[np.ndarray, "4 4"],
-        triangle_budget: int,
-        materials: GpuMesh,
-    ) -> None:
-        """Writes the triangles of the depth image that was taken, within a budget; `materials`: their only one."""
-        assert self._pixels is not None
-        assert self._taken is not None
-        grid = self._grid(self._pixels.camera, triangle_budget)
-        quads = grid.quads[0] * grid.quads[1]
-        buffers.reserve(grid.size[0] * grid.size[1], 2 * quads, materials)
+    def fill(self, buffers: MeshBuffers, materials: GpuMesh, *, coarse: bool = False) -> None:
+        """Writes the triangles of the depth images that were taken; `materials`: their only one."""
+        strides = [each.stride(self._budgets[coarse]) for each in self._frames]
+        grids = [camera.grid(stride) for camera, stride in zip(self._cameras, strides, strict=True)]
+        nodes, triangles = (
+            [getattr(grid, name) for grid in grids] for name in ("node_count", "triangle_count")
+        )
+        buffers.reserve(sum(nodes), sum(triangles), materials)
+        for number, grid in enumerate(grids):
+            place: Bindings = {
+                "first_vertex": sum(nodes[:number]),
+                "first_triangle": sum(triangles[:number]),
+                "depth_view_number": number,
+                "coarseness": int(coarse),
+            }
+            self._write(buffers, number, grid, place)
+
+    def _write(self, buffers: MeshBuffers, number: int, grid: _NodeGrid, place: Bindings) -> None:
+        """Writes one camera's triangles."""
+        camera, frame = self._cameras[number], self._frames[number]
+        slope, least = frame.jump_terms
         self._make_nodes.run(
             grid.size,
-            self._taken.bindings,
+            camera.with_grazing(frame.grazing),
+            {"SEVERAL_DEPTHS": False} if self._views is None else self._views.bindings,
             buffers.solid,
+            place,
             node_rays=grid.rays,
             nodes_out=grid.nodes,
             stride=grid.stride,
-            world_from_camera=world_from_camera,
+            world_from_camera=frame.view.world_from_camera,
         )
-        slope, least = self._taken.jump_terms
         self._make_triangles.run(
-            grid.quads, buffers.solid, nodes=grid.nodes, node_threshold=(grid.stride * slope, least)
+            grid.quads,
+            buffers.solid,
+            place,
+            nodes=grid.nodes,
+            node_threshold=(grid.stride * slope, least),
         )
 
-    def _grid(self, camera: CameraModel, triangle_budget: int) -> _NodeGrid:
-        stride = stride_for_budget(camera.width, camera.height, triangle_budget)
-        if stride not in self._grids:
-            self._grids[stride] = _NodeGrid(self._gpu, camera, stride)
-        return self._grids[stride]
+    def backs_of(self, mesh: MeshBuffers, behind_m: float) -> Callable[[moderngl.Buffer], None] | None:
+        """Returns what lists the triangles that have backs (DepthViewLayers); None with one camera: all have."""
+        return None if self._views is None else self._views.backs_of(mesh, behind_m)
 
-    def _forget_camera(self) -> None:
-        release_all(self._pixels, *self._grids.values())
-        self._pixels, self._taken = None, None
-        self._grids.clear()
+    def _forget_cameras(self) -> None:
+        release_all(*self._cameras, self._views)
+        self._cameras, self._views, self._frames = [], None, ()
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self._forget_camera()
+        self._forget_cameras()
         release_all(self._make_nodes, self._make_triangles)

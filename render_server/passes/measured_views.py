@@ -44,7 +44,7 @@ class MeasuredViews:
 
     def write(self, views: Sequence[CameraView], scenes: Sequence[Bindings]) -> None:
         """Copies the pictures and depths that the `scenes` bind, one for each view."""
-        self._cameras.write(b"".join(_packed(view) for view in views), alignment=1)
+        self._cameras.write(b"".join(packed_view(view) for view in views), alignment=1)
         for layer, (view, scene) in enumerate(zip(views, scenes, strict=True)):
             self._copy.run(view.size, scene, radiance_out=self._radiance, depth_out=self._depth, layer=layer)
         self._radiance.build_mipmaps(max_level=int(SURFEL_PICTURE_LOD))
@@ -55,9 +55,9 @@ class MeasuredViews:
         release_all(self._radiance, self._depth, self._cameras, self._copy)
 
 
-def _packed(view: CameraView) -> bytes:
-    """Returns the texels of a MeasuredView: matrix by columns, pinhole, extent."""
+def packed_view(view: CameraView, more: Sequence[float] = (0.0, 0.0)) -> bytes:
+    """Returns the texels of a MeasuredView: matrix by columns, pinhole, extent and `more`, by fours."""
     matrix = view.camera.matrix
     pinhole = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    values = np.concatenate([view.camera_from_world.T.ravel(), pinhole, view.size, (0.0, 0.0)])
+    values = np.concatenate([view.camera_from_world.T.ravel(), pinhole, view.size, more])
     return values.astype(np.float32).tobytes()

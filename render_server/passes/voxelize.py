@@ -1,7 +1,7 @@
 """From triangles to surfels and touched voxels (docs/method.md 4.2)."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import moderngl
@@ -18,6 +18,7 @@ from deltalight.render_server.passes.voxels import LOWER_SURFELS, VoxelStore
 
 PAIR_BYTES, PAIRS_HEADER_BYTES, COUNTS_BYTES = 12, 16, 12  # shaders/common/voxel_pieces.glsl
 LONG_PIECE_BYTES = 8
+NUMBER_BYTES = 4  # of a chosen triangle
 LEAST_LONG_PIECES = 4096
 PAIRS_PER_TRIANGLE = 2  # to begin with
 # How many pairs are expected by those of earlier frames: so many times as many, and so many a voxel of a face.
@@ -27,21 +28,26 @@ FINER = 1.1  # likewise with edges of voxels, whose number grows with the square
 LONGEST_EDGE_VOXELS = 8.0  # longer triangles are cut: balances the threads, bounds each one's loops
 
 
+Chosen = Int32[np.ndarray, " k"] | Callable[[moderngl.Buffer], None] | None
+"""Numbers of triangles of a mesh, or what lets the GPU write them into a buffer: for each triangle its number or
+NOT_CHOSEN (shaders/common/solid_mesh.glsl). None: all."""
+
+
 @dataclass(frozen=True, eq=False)
 class VoxelizedMesh:
     """A mesh for the voxeliser: its triangles or, if `behind_m` is not 0, their backs, so far behind them (m).
 
-    `chosen`: numbers of the triangles; None: all.
+    `chosen`: which of them.
     """
 
     mesh: MeshBuffers
     behind_m: float = 0.0
-    chosen: Int32[np.ndarray, " k"] | None = None
+    chosen: Chosen = None
 
     @property
     def triangle_count(self) -> int:
-        """How many triangles there are."""
-        return self.mesh.triangle_count if self.chosen is None else len(self.chosen)
+        """How many triangles there are, at most if the GPU chooses them."""
+        return len(self.chosen) if isinstance(self.chosen, np.ndarray) else self.mesh.triangle_count
 
 
 Meshes = Sequence[VoxelizedMesh]
@@ -210,8 +216,13 @@ class VoxelPairs:
     def _write_chosen(self, mesh: VoxelizedMesh) -> moderngl.Buffer | None:
         if mesh.chosen is None:
             return None
-        self._chosen.orphan(mesh.chosen.nbytes)
-        self._chosen.write(mesh.chosen.tobytes())
+        size = NUMBER_BYTES * mesh.triangle_count
+        if self._chosen.size != size:
+            self._chosen.orphan(size)
+        if isinstance(mesh.chosen, np.ndarray):
+            self._chosen.write(mesh.chosen.tobytes())
+        else:
+            mesh.chosen(self._chosen)
         return self._chosen
 
     def release(self) -> None:

@@ -85,13 +85,16 @@ def depth_mesh(
 
 
 def bound_points(
-    depth: DepthImage, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]
+    depth: DepthImage,
+    camera: CameraModel,
+    world_from_camera: Float64[np.ndarray, "4 4"],
+    most: int = BOUND_POINTS,
 ) -> Float64[np.ndarray, "n 3"]:
-    """Returns at most BOUND_POINTS points of what a depth image shows (world, m), without its outliers; quickly.
+    """Returns at most so many points of what a depth image shows (world, m), without its outliers; quickly.
 
     They lie on a grid of pixels that begins and ends at the picture's border.
     """
-    rows, columns, rays = _bound_grid(camera)
+    rows, columns, rays = _bound_grid(camera, most)
     chosen = np.ix_(rows, columns)
     metres = np.where(depth.valid[chosen], depth.depth_m[chosen], 0).astype(np.float64)
     known = _are_among_neighbours(np.divide(1, metres, out=np.zeros_like(metres), where=metres > 0))
@@ -116,10 +119,10 @@ def _are_among_neighbours(inverse_depth: Float64[np.ndarray, "a b"]) -> Bool[np.
 
 @lru_cache(maxsize=LENSES_KEPT)
 def _bound_grid(
-    camera: CameraModel,
+    camera: CameraModel, most: int
 ) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"], Float64[np.ndarray, "a b 3"]]:
-    """Returns rows and columns of a grid of at most BOUND_POINTS pixels, and points at a depth of 1 on their rays."""
-    share = min(1.0, math.sqrt(BOUND_POINTS / (camera.width * camera.height)))
+    """Returns rows and columns of a grid of at most so many pixels, and points at a depth of 1 on their rays."""
+    share = min(1.0, math.sqrt(most / (camera.width * camera.height)))
     rows, columns = (
         np.linspace(0, length - 1, max(1, int(share * length))).round().astype(np.int64)
         for length in (camera.height, camera.width)

@@ -8,6 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
@@ -16,6 +19,7 @@ from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.cones import reuse_define
 from deltalight.render_server.passes.depth_fit import DepthFit
 from deltalight.render_server.passes.depth_mesh import DepthMesher
+from deltalight.render_server.passes.depth_views import DepthViewLayers
 from deltalight.render_server.passes.lpv import LpvPropagate
 from deltalight.render_server.passes.matting import Matting
 from deltalight.render_server.passes.real_surface import RealSurface
@@ -191,7 +195,9 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     Kernel(gpu, "real_surface", FITS_DEPTH=1, DECLARED_SURFACES=1).release()
     DepthFit(gpu, (16, 16)).release()
     DepthMesher(gpu).release()
-    Kernel(gpu, "depth_nodes", GRAZING=1).release()
+    for defines in ({"GRAZING": 1}, {"SEVERAL_DEPTHS": 1}, {"GRAZING": 1, "SEVERAL_DEPTHS": 1}):
+        Kernel(gpu, "depth_nodes", **defines).release()
+    DepthViewLayers(gpu, [CameraModel(16, 16, np.eye(3))]).release()
     Enlarge(gpu, (16, 16)).release()
     Crossfade(gpu, (16, 16)).release()
 

@@ -1,6 +1,6 @@
 """Triangles that the GPU makes of depth are those of `depth_mesh`, and the points that bound them do."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -13,11 +13,12 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
 from deltalight.protocol.scene_objects import RealScene
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.depth_mesh import DepthMesher
+from deltalight.render_server.passes.depth_mesh import DepthFrame, DepthMesher
 from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.real_geometry import EMPTY_MESH, RealGeometry
 from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, bound_points, depth_mesh
 from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
+from deltalight.render_server.view import CameraView
 from tests.render_server.test_real_surface import room, shown_normals
 from tests.render_server.test_scene_depth_mesh import LENS, NORMAL, PINHOLE, image, plane_depth
 from tests.render_server.test_scene_threads import floor_from
@@ -29,6 +30,16 @@ NO_GRAZING = np.zeros(SHAPE, np.float32)
 
 def no_grazing() -> Float32[np.ndarray, "h w"]:
     return NO_GRAZING
+
+
+def take(
+    mesher: DepthMesher,
+    depth: DepthImage,
+    budget: int = 8_000,
+    grazing: Callable[[], Float32[np.ndarray, "h w"]] = no_grazing,
+) -> None:
+    view = CameraView(depth.camera, WORLD_FROM_CAMERA)
+    mesher.take([DepthFrame(depth, view, grazing)], (budget, budget // 8))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +54,7 @@ def made_by_gpu(
 ) -> tuple[Float32[np.ndarray, "n 12"], np.ndarray]:
     """Vertices, and triangles that are there."""
     buffers = MeshBuffers(gpu)
-    mesher.fill(buffers, WORLD_FROM_CAMERA, budget, merge_for_gpu([EMPTY_MESH]))
+    mesher.fill(buffers, merge_for_gpu([EMPTY_MESH]))
     assert buffers.triangle_count <= budget
     vertices, indices = (buffers.solid[name].read() for name in ("Vertices", "Indices"))
     buffers.release()
@@ -80,7 +91,7 @@ def test_the_gpu_makes_the_same_triangles(
     grazing = with_grazing(depth) if is_bridged else NO_GRAZING
     wanted = depth_mesh(depth, camera, WORLD_FROM_CAMERA, budget, grazing=lambda: grazing)
     assert wanted.uv is not None
-    mesher.take(depth, camera, lambda: grazing)
+    take(mesher, depth, budget, lambda: grazing)
     vertices, triangles = made_by_gpu(gpu, mesher, budget)
     theirs, ours = by_corners(wanted.uv, wanted.triangles), by_corners(vertices[:, 6:8], triangles)
     common = theirs.keys() & ours.keys()
@@ -99,7 +110,7 @@ def test_grazing_surfaces_close_a_hole(gpu: GpuContext, mesher: DepthMesher) -> 
     depth = room(PINHOLE, 0.0005)
     counts = []
     for grazing in (no_grazing, partial(with_grazing, depth), no_grazing):
-        mesher.take(depth, PINHOLE, grazing)
+        take(mesher, depth, 8_000, grazing)
         counts.append(len(made_by_gpu(gpu, mesher, 8_000)[1]))
     assert counts[1] > counts[0] + 30
     assert counts[2] == counts[0]
@@ -107,9 +118,9 @@ def test_grazing_surfaces_close_a_hole(gpu: GpuContext, mesher: DepthMesher) -> 
 
 def test_another_camera_gets_its_own_grid(gpu: GpuContext, mesher: DepthMesher) -> None:
     small = CameraModel(80, 60, PINHOLE.matrix * np.array([[0.5], [0.5], [1]]))
-    mesher.take(room(PINHOLE, 0.002), PINHOLE, no_grazing)
+    take(mesher, room(PINHOLE, 0.002), 700)
     made_by_gpu(gpu, mesher, 700)
-    mesher.take(image(plane_depth(small, NORMAL, 0.9), small), small, lambda: np.zeros((60, 80), np.float32))
+    take(mesher, image(plane_depth(small, NORMAL, 0.9), small), 700, lambda: np.zeros((60, 80), np.float32))
     vertices, triangles = made_by_gpu(gpu, mesher, 700)
     assert len(triangles) > 500
     assert vertices[triangles, 6].max() < small.width
@@ -117,17 +128,17 @@ def test_another_camera_gets_its_own_grid(gpu: GpuContext, mesher: DepthMesher) 
 
 def test_only_the_image_that_was_taken_last_is_fitted(mesher: DepthMesher) -> None:
     first, second = room(PINHOLE, 0.002), room(PINHOLE, 0.002)
-    mesher.take(first, PINHOLE, no_grazing)
+    take(mesher, first)
     assert mesher.fitted(first) is not None
     assert mesher.fitted(second) is None
-    mesher.take(second, PINHOLE, no_grazing)
+    take(mesher, second)
     assert mesher.fitted(first) is None
     assert mesher.fitted(replace(second, camera=LENS)) is None
 
 
 def test_what_the_mesher_fitted_serves_the_visible_surface(gpu: GpuContext, mesher: DepthMesher) -> None:
     depth = room(PINHOLE, 0.002)
-    mesher.take(depth, PINHOLE, no_grazing)
+    take(mesher, depth)
     own, shared = (
         shown_normals(gpu, depth, pytest.fail, fits_depth=True, on_gpu=found)
         for found in (None, mesher.fitted(depth))
@@ -135,9 +146,10 @@ def test_what_the_mesher_fitted_serves_the_visible_surface(gpu: GpuContext, mesh
     assert np.array_equal(own, shared)
 
 
-def test_an_image_of_another_size_is_refused(mesher: DepthMesher) -> None:
+def test_an_image_of_another_size_is_refused() -> None:
+    view = CameraView(CameraModel(80, 60, PINHOLE.matrix), WORLD_FROM_CAMERA)
     with pytest.raises(DeltalightError, match="differ in size"):
-        mesher.take(room(PINHOLE, 0.002), CameraModel(80, 60, PINHOLE.matrix), no_grazing)
+        DepthFrame(room(PINHOLE, 0.002), view, no_grazing)
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])

@@ -4,6 +4,7 @@ import importlib
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -77,6 +78,37 @@ def test_own_bindings_come_before_shared_ones_and_shared_ones_in_their_order(
     kernel = make("uniform float a, b, c;", "values[0] = a; values[1] = b; values[2] = c;")
     kernel.run((1,), {"b": 2, "c": 2, "not mine": 0}, {"a": 3, "b": 3, "c": 3}, Out=out, c=1)
     assert floats(out, 3) == [3, 2, 1]
+
+
+def test_textures_that_take_turns_are_checked_once_each_and_others_still(
+    gpu: GpuContext,
+    make: MakeKernel,
+    out: moderngl.Buffer,
+    texture: moderngl.Texture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As those of a room's cameras do."""
+    checked: list[object] = []
+    check = kernel_module._Program._check_sampled
+
+    def noted(program: Any, slot: Any, item: object) -> None:  # noqa: ANN401 (not public)
+        checked.append(item)
+        check(program, slot, item)
+
+    monkeypatch.setattr(kernel_module._Program, "_check_sampled", noted)
+    kernel = make("uniform sampler2D seen;", "values[0] = texelFetch(seen, ivec2(0), 0).r;")
+    other = texture_2d(gpu, (1, 1), 1, "f4", data=np.array([7], np.float32).tobytes())
+    codes = texture_2d(gpu, (1, 1), 4, "u1")
+    found = []
+    for item in (texture, other, texture, other):
+        kernel.run((1,), Out=out, seen=item)
+        found += floats(out, 1)
+    assert found == [1, 7, 1, 7]
+    assert checked == [texture, other]
+    with pytest.raises(BindingError, match="samples texels of type f"):
+        kernel.run((1,), Out=out, seen=codes)
+    other.release()
+    codes.release()
 
 
 def test_what_a_variant_leaves_out_may_be_given(make: MakeKernel, out: moderngl.Buffer) -> None:

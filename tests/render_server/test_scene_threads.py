@@ -6,11 +6,10 @@ import pytest
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage
 from deltalight.protocol.scene_objects import RealScene
-from deltalight.render_server import real_geometry
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.methods.light_maps import shadow_receivers
 from deltalight.render_server.real_geometry import COARSE_DIVISOR, RealGeometry
-from deltalight.render_server.scene import threads
+from deltalight.render_server.scene import seen_depth, threads
 from deltalight.render_server.scene.depth_surface import depth_surface
 from deltalight.render_server.scene.threads import BAND_ROWS, by_bands
 from deltalight.render_server.scene.triangle_mesh import GpuMesh
@@ -94,13 +93,13 @@ def test_the_coarse_mesh_is_made_once_and_when_asked_for(
     gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     budgets: list[int] = []
-    mesh_depth = real_geometry.depth_mesh
+    mesh_depth = seen_depth.depth_mesh
 
     def counted(*given: object, **named: object) -> object:
         budgets.append(given[3])  # type: ignore[arg-type]
         return mesh_depth(*given, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(real_geometry, "depth_mesh", counted)
+    monkeypatch.setattr(seen_depth, "depth_mesh", counted)
     real = RealGeometry(gpu, RealScene(), BUDGET, meshes_on_gpu=False)
     assert real.update([floor_from(0.25)])
     assert real.state is not None

@@ -1,15 +1,23 @@
 // Nodes of the mesh of a depth image, one for each cell of stride x stride pixels, at its centre (scene/depth_mesh.py):
-// their vertices, inverse depth and the step to their neighbours that slopes explain.
+// their vertices, inverse depth, the step to their neighbours that slopes explain, and with several cameras whether another
+// one shows the surface there larger.
 #define FITS_DEPTH
 #include "common/fitted_normal.glsl"
 #pragma switch GRAZING
+#pragma switch SEVERAL_DEPTHS
+#ifdef SEVERAL_DEPTHS
+#include "common/depth_views.glsl"
+uniform int depth_view_number;   // of this camera
+uniform int coarseness;          // of this mesh: 0 fine, 1 coarse
+#endif
 
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform sampler2D node_rays;       // (x/z, y/z) of the cells' centres
 uniform sampler2D grazing_depth;   // 1/m, of surfaces too oblique to measure; 0 elsewhere
 uniform int stride;                // pixels
 uniform mat4 world_from_camera;
-layout(rg32f) writeonly uniform image2D nodes_out;   // 1/m, 0 for a hole; 1/m
+uniform int first_vertex;
+layout(rgba32f) writeonly uniform image2D nodes_out;   // 1/m, 0 for a hole; 1/m; 1 if another camera shows it larger
 layout(std430) writeonly buffer Vertices { float vertices[]; };   // VERTEX_FLOATS each (scene/triangle_mesh.py)
 
 const int CELL_SAMPLES = 6, MOST_SAMPLES = CELL_SAMPLES * CELL_SAMPLES;
@@ -99,9 +107,14 @@ void main() {
         slack = MAX_CELL_DISTANCE * float(stride) * length(slope);
     }
 #endif
-    imageStore(nodes_out, cell, vec4(w, slack, 0.0, 0.0));
     ivec2 first = cell * stride, last = min(first + stride, size) - 1;
     vec3 world = (world_from_camera * vec4(vec3(ray, 1.0) / w, 1.0)).xyz;
     if (w <= 0.0) world = vec3(0.0);   // of triangles without area
-    store_vertex(uint(cell.y * cells.x + cell.x), world, mat3(world_from_camera) * normal, 0.5 * vec2(first + last));
+    normal = mat3(world_from_camera) * normal;
+    bool is_copy = false;
+#ifdef SEVERAL_DEPTHS
+    is_copy = w > 0.0 && is_shown_larger(depth_view_number, world, normal, coarseness);
+#endif
+    imageStore(nodes_out, cell, vec4(w, slack, float(is_copy), 0.0));
+    store_vertex(uint(first_vertex + cell.y * cells.x + cell.x), world, normal, 0.5 * vec2(first + last));
 }

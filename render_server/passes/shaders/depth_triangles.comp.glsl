@@ -1,11 +1,13 @@
 // Joins neighbouring nodes of a depth image's mesh that lie on one surface: two triangles for each quad of nodes, of which
-// those that are not there have no area (scene/depth_mesh.py). Seen from the camera, they are counter-clockwise.
+// those that are not there have no area (scene/depth_mesh.py). Seen from the camera, they are counter-clockwise. A triangle
+// goes if others show all of its corners larger, so that meshes of several cameras overlap where they meet.
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform sampler2D nodes;         // as depth_nodes leaves them
 uniform vec2 node_threshold;     // of w, from node to node: per w, and at least
+uniform int first_vertex, first_triangle;
 layout(std430) writeonly buffer Indices { uint indices[]; };
 
-vec2 corner[4];   // 0 1 above 2 3: w and slack
+vec3 corner[4];   // 0 1 above 2 3: w, slack, whether another camera shows it larger
 
 // A grazing surface has no step but what its slope explains.
 bool joined(int one, int other) {
@@ -17,7 +19,8 @@ bool joined(int one, int other) {
 // Whether the triangle of these corners is there, if the quad is cut from `a` to `b`.
 bool on_one_surface(int a, int b, int c) {
     bool usable = min(corner[a].x, min(corner[b].x, corner[c].x)) > 0.0;
-    return usable && joined(a, b) && joined(a, c) && joined(b, c);
+    bool is_copy = min(corner[a].z, min(corner[b].z, corner[c].z)) > 0.5;
+    return usable && !is_copy && joined(a, b) && joined(a, c) && joined(b, c);
 }
 
 // Whether the quad is cut from 0 to 3: along the lesser step, and between the neighbours of a hole.
@@ -30,11 +33,12 @@ bool falls() {
 void main() {
     ivec2 quad = ivec2(gl_GlobalInvocationID.xy), size = textureSize(nodes, 0);
     if (any(greaterThanEqual(quad, size - 1))) return;
-    for (int i = 0; i < 4; ++i) corner[i] = texelFetch(nodes, quad + ivec2(i & 1, i >> 1), 0).xy;
+    for (int i = 0; i < 4; ++i) corner[i] = texelFetch(nodes, quad + ivec2(i & 1, i >> 1), 0).xyz;
     bool falling = falls();
     ivec3 first = falling ? ivec3(0, 2, 3) : ivec3(0, 2, 1), second = falling ? ivec3(0, 3, 1) : ivec3(1, 2, 3);
     bool has_first = on_one_surface(first.x, first.y, first.z), has_second = on_one_surface(second.x, second.y, second.z);
-    uint node = uint(quad.y * size.x + quad.x), row = uint(size.x), at = 6u * uint(quad.y * (size.x - 1) + quad.x);
+    uint node = uint(first_vertex + quad.y * size.x + quad.x), row = uint(size.x);
+    uint at = 3u * uint(first_triangle) + 6u * uint(quad.y * (size.x - 1) + quad.x);
     for (int i = 0; i < 3; ++i) {
         indices[at + uint(i)] = has_first ? node + uint(first[i] & 1) + row * uint(first[i] >> 1) : 0u;
         indices[at + 3u + uint(i)] = has_second ? node + uint(second[i] & 1) + row * uint(second[i] >> 1) : 0u;

@@ -21,7 +21,7 @@ layout(std430) readonly buffer LongPieces { uvec2 long_pieces[]; };
 layout(std430) buffer LongPieces { uvec2 long_pieces[]; };
 layout(std430) readonly buffer Chosen { uint chosen[]; };
 uniform int triangle_count;
-uniform bool is_chosen;       // whether only those are voxelised whose numbers are given
+uniform bool is_chosen;       // whether only those are voxelised whose numbers are given (or NOT_CHOSEN)
 #endif
 
 bool reaches_volume(Piece p) {
@@ -96,6 +96,7 @@ void main() {
     if (i >= uint(triangle_count)) return;
     work_in_volume(filled_volume);
     uint triangle = is_chosen ? chosen[i] : i;
+    if (triangle == NOT_CHOSEN) return;
     Piece p = triangle_at(triangle);
     if (!reaches_volume(p)) return;
     float length_ratio = longest_edge(p) / longest_kept;
