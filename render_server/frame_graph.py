@@ -351,7 +351,12 @@ class FrameGraph:
             return self._views.compose_layers(image, relit.scene, options, relit.layers).composite
 
     def _run(self, *targets: Resource[Any], until_s: float | None = None) -> bool:
-        """Runs the graph with the newest pictures in linear radiance; a scene at rest does without."""
+        """Runs the graph with the newest pictures in linear radiance; a scene at rest does without.
+
+        The GPU makes the real scene's triangles before, unless the targets do without them.
+        """
+        if not {self.resources.geometry, self.resources.observation}.issuperset(targets):
+            self.inputs.real.fill()
         others = *(version for each in self._all for version in each._versions()), self._options.version
         for each in self._all:
             each._linearize(others)

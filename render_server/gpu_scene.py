@@ -80,11 +80,17 @@ class PlacedObject:
 class DrawnMesh:
     """Triangles in buffers, until others are written there.
 
-    `made` is what was uploaded or, for triangles that the GPU made of depth, makes the same on the CPU.
+    `filled` are the buffers, or has the GPU fill them. `made` is what was uploaded or, for triangles that the GPU
+    made of depth, makes the same on the CPU.
     """
 
-    buffers: MeshBuffers
+    filled: MeshBuffers | Callable[[], MeshBuffers]
     made: GpuMesh | Callable[[], GpuMesh]
+
+    @cached_property
+    def buffers(self) -> MeshBuffers:
+        """Vertices and triangles on the GPU."""
+        return self.filled() if callable(self.filled) else self.filled
 
     @cached_property
     def mesh(self) -> GpuMesh:
@@ -128,6 +134,10 @@ class GeometryState:
     def buffers(self) -> MeshBuffers:
         """Vertices and triangles on the GPU."""
         return self.drawn.buffers
+
+    def fill(self) -> None:
+        """Has the GPU make the triangles, once, if it makes them."""
+        assert self.buffers is not None
 
     @property
     def corners(self) -> Corners:

@@ -33,10 +33,13 @@ class SeenDepth:
         return DepthViews(tuple(fit() for fit in self._surfaces))
 
     def begun_bounds(self) -> Callable[[], Float64[np.ndarray, "n 3"]]:
-        """Begins to find at most BOUND_POINTS points around everything (world, m); returns what waits for them."""
-        most = BOUND_POINTS // len(self.frames)
-        found = [begun(partial(_bound_points, each, most)) for each in self.frames]
-        return lambda: np.concatenate([each.result() for each in found])
+        """Begins to find at most BOUND_POINTS points around everything (world, m); returns what finishes that.
+
+        Those of the first camera are found then: to wait for another thread takes longer.
+        """
+        most, (first, *others) = BOUND_POINTS // len(self.frames), self.frames
+        found = [begun(partial(_bound_points, each, most)) for each in others]
+        return lambda: np.concatenate([_bound_points(first, most), *(each.result() for each in found)])
 
     def meshes(self, triangle_budget: int) -> list[TriangleMesh]:
         """Returns a mesh of each camera's depth, each within the budget; takes time.
