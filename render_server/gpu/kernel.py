@@ -22,13 +22,6 @@ from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, de
 from deltalight.render_server.gpu.textures import image_format
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 
-SOFTWARE_WALKERS = 1024
-# Mesa's software renderer silently ends all loops of a thread after 65535 iterations in total; tracing the
-# cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
-SOFTWARE_DIVISOR = 12
-LIST_WALKERS = 16384
-MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
-GPU_WALKERS = 2**18  # 4096 workgroups: what the largest GPUs hold at a time; idle threads cost microseconds
 GL_INT = 0x1404
 FITTING_KEPT = 32  # textures of a name that need not be checked again: some for each camera of a room
 CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
@@ -476,18 +469,6 @@ def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:
     """Returns the shader's name and defines, e.g. `trace_cones REAL`."""
     stem = name.name if isinstance(name, Path) else name
     return " ".join([stem, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])
-
-
-def list_threads(gpu: GpuContext, longest: int | None = None) -> int:
-    """Returns the number of threads for walking a list of at most `longest` items; the GPU alone knows how many.
-
-    Few in software, where an idle thread costs as much as a busy one, but enough that no thread's loops are
-    cut off.
-    """
-    if not gpu.is_software:
-        return min(longest or GPU_WALKERS, MOST_WALKERS)
-    longest = longest or LIST_WALKERS
-    return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
 
 
 def common_kernel(gpu: GpuContext, name: str) -> Kernel:

@@ -1,4 +1,4 @@
-"""Workgroups for lists whose length only the GPU knows."""
+"""Threads and workgroups for lists whose length only the GPU knows."""
 
 import moderngl
 
@@ -7,6 +7,25 @@ from deltalight.render_server.gpu.kernel import common_kernel
 
 LIST_HEADER_BYTES = 4  # of shaders/common/work_list.glsl: the number of items
 GROUPS_BYTES = 12
+SOFTWARE_WALKERS = 1024
+# Mesa's software renderer silently ends all loops of a thread after 65535 iterations in total; tracing the
+# cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
+SOFTWARE_DIVISOR = 12
+LIST_WALKERS = 16384
+MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
+GPU_WALKERS = 2**18  # 4096 workgroups: what the largest GPUs hold at a time; idle threads cost microseconds
+
+
+def list_threads(gpu: GpuContext, longest: int | None = None) -> int:
+    """Returns the number of threads for walking a list of at most `longest` items; the GPU alone knows how many.
+
+    Few in software, where an idle thread costs as much as a busy one, but enough that no thread's loops are
+    cut off.
+    """
+    if not gpu.is_software:
+        return min(longest or GPU_WALKERS, MOST_WALKERS)
+    longest = longest or LIST_WALKERS
+    return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
 
 
 class ListGroups:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.coverage import SURFACE_REACH

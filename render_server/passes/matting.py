@@ -3,8 +3,8 @@
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES
+from deltalight.render_server.gpu.kernel import Bindings, Kernel
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing, ObjectCoverage
 from deltalight.render_server.view import Rectangle

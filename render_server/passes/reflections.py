@@ -6,8 +6,8 @@ import moderngl
 
 from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGroups
+from deltalight.render_server.gpu.kernel import Bindings, Kernel
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGroups, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid

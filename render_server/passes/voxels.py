@@ -9,7 +9,8 @@ import numpy as np
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.list_groups import list_threads
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.volumes import PlacedVolume
 
