@@ -96,18 +96,18 @@ def bound_points(
     """
     rows, columns, rays = _bound_grid(camera, most)
     chosen = np.ix_(rows, columns)
-    metres = np.where(depth.valid[chosen], depth.depth_m[chosen], 0).astype(np.float64)
+    metres = np.where(depth.valid[chosen], depth.depth_m[chosen], np.float32(0))
     known = _are_among_neighbours(np.divide(1, metres, out=np.zeros_like(metres), where=metres > 0))
     local = rays[known] * metres[known][:, None]
     return np.asarray(local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
 
 
-def _are_among_neighbours(inverse_depth: Float64[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
+def _are_among_neighbours(inverse_depth: Float32[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
     """Returns which points (0: unknown) lie in the range of medians around them, or beyond it by no more than it.
 
     An end of a slanted plane is a step of it beyond; an outlier in front of a surface is far beyond.
     """
-    median = cv2.medianBlur(inverse_depth.astype(np.float32), 3)
+    median = cv2.medianBlur(inverse_depth, 3)
     beside = np.ones((3, 3), np.uint8)
     most = cv2.dilate(median, beside)
     least = -cv2.dilate(np.where(median > 0, -median, -np.inf), beside)

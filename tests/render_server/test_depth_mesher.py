@@ -164,6 +164,12 @@ def test_points_enclose_what_depth_shows_without_its_outliers(camera: CameraMode
         assert (beyond < 0.05).all()
 
 
+@pytest.mark.parametrize("metres", [1.0, 0.7, 1.5, 3.001])
+def test_all_of_a_wall_at_one_depth_is_shown(metres: float) -> None:
+    points = bound_points(image(np.full(SHAPE, metres, np.float32)), PINHOLE, WORLD_FROM_CAMERA)
+    assert len(points) > BOUND_POINTS // 2
+
+
 def test_nothing_known_has_no_points() -> None:
     assert not len(bound_points(image(np.zeros(SHAPE, np.float32)), PINHOLE, WORLD_FROM_CAMERA))
 
