@@ -93,14 +93,14 @@ def _resources(soaked: Soaked) -> list[Figure | None]:
         own = [process for _, process in of_process(span, name)]
         growths.append(100 * (own[-1].rss_bytes / own[0].rss_bytes - 1))
         handles.append(float(own[-1].handles - own[0].handles))
-    counts = [each for each in objects_of_server(soaked.samples) if len(each) > 2]
-    objects = [float(max(each[1:]) - each[1]) for each in counts]
+    objects = [float(max(each) - each[0]) for each in objects_of_server(soaked.samples, SETTLED_AFTER_S)]
     after = f"calm samples of one process, from {SETTLED_AFTER_S:.0f} s after its start to its last"
+    began = f"of one render server, from {SETTLED_AFTER_S:.0f} s after its start on"
     few = Bar(f"<= {LOOSE_HANDLES} more", lambda value: value <= LOOSE_HANDLES)
     return [
         worst("growth of memory (RSS)", after, growths, Bar(f"< {GROWTH:g} %", lambda v: v < GROWTH), "%"),
         worst("growth of open handles", after, handles, few, ""),
-        worst("growth of GL objects", "of one render server, from its second count on", objects, NONE, ""),
+        worst("growth of GL objects", began, objects, NONE, ""),
     ]
 
 

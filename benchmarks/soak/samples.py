@@ -165,10 +165,16 @@ def steady_spans(
     return [(name, span) for (name, _), span in spans.items()]
 
 
-def objects_of_server(samples: Sequence[Sample]) -> list[list[int]]:
-    """Return the numbers of GL objects that were counted, one list for each render server's id."""
+def objects_of_server(samples: Sequence[Sample], settle_s: float) -> list[list[int]]:
+    """Return the numbers of GL objects that were counted, one list for each render server's id, without its first
+    `settle_s`; those counted once are left out.
+    """
     found: dict[int, list[int]] = {}
+    began: dict[int, float] = {}
     for sample in samples:
-        if SERVER in sample.processes and sample.gl_objects is not None:
-            found.setdefault(sample.processes[SERVER].process_id, []).append(sample.gl_objects)
-    return list(found.values())
+        if SERVER not in sample.processes or sample.gl_objects is None:
+            continue
+        number = sample.processes[SERVER].process_id
+        if sample.at_s >= began.setdefault(number, sample.at_s) + settle_s:
+            found.setdefault(number, []).append(sample.gl_objects)
+    return [counts for counts in found.values() if len(counts) > 1]
