@@ -52,7 +52,7 @@ def count_frames(job: SpeedJob, progress: Progress) -> CountsReport:
     Raises:
         DeltalightError: no OpenGL, or missing demo files.
     """
-    scenes, take = job.scenes(), prepare_take(progress)
+    scenes, take = job.scenes(), prepare_take(progress).at(job.size)
     methods: dict[str, dict[str, FrameCounts]] = {}
     frames = WARM_UP_FRAMES + 2 * job.frames
     with opened(job.device) as gpu:

@@ -92,7 +92,7 @@ def measure_speed(
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a process that died for good.
     """
-    scenes, take = job.scenes(), take or prepare_take(progress)
+    scenes, take = job.scenes(), (take or prepare_take(progress)).at(job.size)
     with opened(job.device) as gpu:
         frame = take.standing[0].camera
         report = SpeedReport(

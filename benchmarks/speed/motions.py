@@ -16,6 +16,7 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_lights import ManualLight
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.source import open_source
+from deltalight.render_server.view import resized_frame
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
 from deltalight.services.demo import RECORDING
 
@@ -56,6 +57,18 @@ class Take:
 
     standing: Sequence[ViewFrame]
     swing: Sequence[ViewFrame]
+
+    def at(self, size: tuple[int, int] | None) -> "Take":
+        """Return the frames as a camera of that size (width, height) takes them; None: as they are.
+
+        So no frame is resized while it is timed.
+        """
+        if size is None or size == self.standing[0].color.shape[1::-1]:
+            return self
+        standing, swing = (
+            [resized_frame(each, *size) for each in part] for part in (self.standing, self.swing)
+        )
+        return Take(standing, swing)
 
 
 def prepare_take(progress: Progress) -> Take:

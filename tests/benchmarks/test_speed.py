@@ -32,10 +32,11 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import open_source
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
-from deltalight.render_server.view import resized_frame
+from deltalight.render_server.view import output_size, resized_frame
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
 from deltalight.services.cli import run
 from deltalight.services.demo import RECORDING, demo_scene
+from deltalight.services.offline import with_output
 
 pytestmark = pytest.mark.skipif(
     not RECORDING.is_file(), reason="the demo's recording is not in this checkout"
@@ -92,6 +93,18 @@ def test_the_camera_never_shows_two_equal_frames_after_another(take: Take, scene
         assert after.pose is not None
         moved = after.pose.world_from_camera[:3, 3] - before.pose.world_from_camera[:3, 3]
         assert np.linalg.norm(moved) > 0.005
+
+
+def test_a_larger_picture_is_taken_by_a_larger_camera(take: Take, scene: SceneDocument) -> None:
+    assert take.at(None) is take.at((take.standing[0].camera.width, take.standing[0].camera.height)) is take
+    larger = take.at((64, 36))
+    assert (len(larger.standing), len(larger.swing)) == (len(take.standing), len(take.swing))
+    for frame in (*larger.standing, *larger.swing):
+        assert (
+            output_size(frame, with_output(scene, (64, 36), None).output)
+            == frame.color.shape[1::-1]
+            == (64, 36)
+        )
 
 
 def test_an_arm_reaches_further_into_colour_and_depth_and_back(take: Take, scene: SceneDocument) -> None:
