@@ -16,7 +16,6 @@ SPARE_EDGE = (
     0.125  # of a volume that stays while its objects move: the light around them changes that far at least
 )
 SNAP_VOXELS = 0.01
-LATTICE_VOXELS = 0.5  # where the world's planes of 0, such as the board's, lie in a voxel: not on the border of two
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +99,7 @@ def place_volume(
     """
     edge = edge_m if edge_m is not None else 2.0 * float(np.max(high - low))
     voxel = edge / size
-    wanted = ((low + high) / 2 - edge / 2) / voxel - LATTICE_VOXELS
-    origin = (np.floor(wanted + SNAP_VOXELS) + LATTICE_VOXELS) * voxel
+    origin = np.floor(((low + high) / 2 - edge / 2) / voxel + SNAP_VOXELS) * voxel
     return VolumePlacement((float(origin[0]), float(origin[1]), float(origin[2])), voxel, size)
 
 
