@@ -6,7 +6,7 @@ In this order: vignetting, blur, compression, noise. Noise is last because it is
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.render_server.post_effects.camera_blur import (
@@ -24,6 +24,8 @@ from deltalight.render_server.post_effects.camera_compression import (
     Compression,
     compressed,
 )
+from deltalight.render_server.post_effects.camera_defocus import BoardDefocus, DistanceBlur
+from deltalight.render_server.post_effects.camera_edges import edge_steps
 from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
 from deltalight.render_server.post_effects.camera_vignetting import PaperVignetting, Vignetting, vignetted
 
@@ -42,13 +44,21 @@ class FrameArtifacts:
     kernels: Float64[np.ndarray, "3 k k"] | None
     vignetting: Vignetting | None = None
     compression: Compression | None = None
+    distance_blur: DistanceBlur | None = None
 
-    def applied(self, color: Color, coverage: Coverage) -> Color:
-        """Return a picture of the frame with all of it on its virtual part; as it is while none is known."""
+    def applied(
+        self, color: Color, coverage: Coverage, depth_m: Float32[np.ndarray, "h w"] | None = None
+    ) -> Color:
+        """Return a picture of the frame with all of it on its virtual part; as it is while none is known.
+
+        `depth_m` is that of the objects (0: none), and needed where `distance_blur` is known.
+        """
         frame = self.frame
         if self.vignetting is not None:
             color = vignetted(color, coverage, self.vignetting.factors(frame.camera), frame)
-        if self.kernels is not None:
+        if self.distance_blur is not None and depth_m is not None:
+            color, coverage = self.distance_blur.applied(color, coverage, depth_m, frame.response)
+        elif self.kernels is not None:
             color, coverage = blurred(color, coverage, self.kernels, frame.response)
         if self.compression is not None:
             color = compressed(color, coverage, self.compression)
@@ -64,6 +74,7 @@ class CameraArtifacts:
         self._noise = CameraNoise()
         self._vignetting = PaperVignetting()
         self._compression = CameraCompression()
+        self._defocus = BoardDefocus()
         self._lens: list[LensBlur] = []
         self._last: ViewFrame | None = None
         self._pose: Float64[np.ndarray, "4 4"] = np.eye(4)
@@ -90,9 +101,17 @@ class CameraArtifacts:
             self._compression.observe(frame)
             self._last, self._pose = frame, world_from_camera
         from_centre = np.nan_to_num(_pixel(frame, self._pose, place_m) - frame.camera.matrix[:2, 2])
-        kernels = blur_kernels(self._lens_blur(), self._motion_px, from_centre)
+        lens, defocus = self._lens_blur(), self._defocus.model
+        by_distance = None
+        if defocus is not None:
+            by_distance = DistanceBlur(defocus, lens or LensBlur(0.0), self._motion_px, from_centre)
         return FrameArtifacts(
-            frame, self._noise.model, kernels, self._vignetting.model, self._compression.model
+            frame,
+            self._noise.model,
+            blur_kernels(lens, self._motion_px, from_centre),
+            self._vignetting.model,
+            self._compression.model,
+            by_distance,
         )
 
     def _lens_blur(self) -> LensBlur | None:
@@ -115,9 +134,15 @@ class CameraArtifacts:
         known = frame.exposure_s is not None
         self._motion_px = moved * min((frame.exposure_s or 0.0) * 1e9 / max(step_ns, 1), 1.0)
         is_still = float(np.linalg.norm(self._motion_px if known else moved)) < LEAST_MOTION_PX
-        if is_still and len(self._lens) < MOST_MEASURED:
-            found = measure_blur(frame)
+        wants_lens, wants_defocus = len(self._lens) < MOST_MEASURED, self._defocus.wants(frame)
+        if not is_still or not (wants_lens or wants_defocus):
+            return
+        edges = edge_steps(frame)
+        if wants_lens:
+            found = measure_blur(edges)
             self._lens += [] if found is None else [found]
+        if wants_defocus:
+            self._defocus.observe(frame, edges)
 
 
 def _pixel(
