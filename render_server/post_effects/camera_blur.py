@@ -1,13 +1,13 @@
 """A camera's blur on the virtual part of a picture ([D] 6.2): its lens's, measured at the board's edges, and motion.
 
 The response to an edge is taken as Gaussian, a pixel's own area included, so the MTF is exp(-2 (pi sigma f)^2). One
-figure holds lens, focus at the board's distance, demosaicking and sharpening. By lateral chromatic aberration the
-picture in red and in blue is a little larger or smaller than in green. During an exposure the picture moves in a
-straight line.
+figure holds lens, focus at the board's distance, demosaicking and sharpening; camera_defocus.py and camera_mosaic.py
+tell some of it apart where they find it. By lateral chromatic aberration the picture in red and in blue is a little
+larger or smaller than in green. During an exposure the picture moves in a straight line.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -46,6 +46,10 @@ class LensBlur:
     def shifts_px(self, from_centre_px: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "3 2"]:
         """Return how far R, G and B lie from green at a place, from the principal point."""
         return np.outer([self.red, 0.0, self.blue], from_centre_px)
+
+    def without(self, variance: float) -> "LensBlur":
+        """Return what is left of the blur without a part of its variance, px^2."""
+        return replace(self, sigma_px=float(np.sqrt(max(self.sigma_px**2 - variance, 0.0))))
 
 
 def measure_blur(edges: Sequence[EdgeStep]) -> LensBlur | None:

@@ -50,6 +50,10 @@ class Defocus:
         """Return the variance of the whole blur at depths of 1 / `inverse_m`, px^2; a pixel's at least."""
         return np.maximum(self.sharpest + (self.growth * (inverse_m - self.focus)) ** 2, PIXEL_VARIANCE)
 
+    def without(self, variance: float) -> "Defocus":
+        """Return what is left of the blur without a part of its variance, px^2."""
+        return replace(self, sharpest=self.sharpest - variance)
+
 
 def fit_defocus(edges: Sequence[EdgeStep]) -> Defocus | None:
     """Return the defocus that edges at several depths show; None if it is within its error.
