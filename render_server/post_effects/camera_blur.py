@@ -28,6 +28,8 @@ SIGNIFICANT = 3.0
 
 Color = UInt8[np.ndarray, "h w 3"]
 Coverage = Float32[np.ndarray, "h w"]
+Layer = Float32[np.ndarray, "h w 3"]
+Part = tuple[Float64[np.ndarray, "3 k k"], Coverage]
 
 
 def mtf50(sigma_px: float) -> float:
@@ -77,39 +79,23 @@ def blur_kernels(
     `lens` None: unknown. `motion_px` is how far (columns, rows) the picture moves in an exposure, `from_centre_px`
     where the objects are from the principal point.
     """
-    kernels = kernels_of_blurs([lens or LensBlur(0.0)], motion_px, from_centre_px)
-    return None if kernels is None else kernels[0]
-
-
-def kernels_of_blurs(
-    lenses: Sequence[LensBlur],
-    motion_px: Float64[np.ndarray, " 2"],
-    from_centre_px: Float64[np.ndarray, " 2"],
-) -> Float64[np.ndarray, "n 3 k k"] | None:
-    """Return the kernels of several blurs, all of one size; None if objects lack nothing of any."""
-    lacks = np.array([lens.sigma_px**2 for lens in lenses]) - PIXEL_VARIANCE
-    shifts = np.array([lens.shifts_px(from_centre_px) for lens in lenses])
+    lacks = 0.0 if lens is None else lens.sigma_px**2 - PIXEL_VARIANCE
+    shifts = (lens or LensBlur(0.0)).shifts_px(from_centre_px)
     length, apart = float(np.linalg.norm(motion_px)), float(np.abs(shifts).max())
-    if lacks.max() <= PIXEL_VARIANCE / 4 and length < LEAST_MOTION_PX and apart < LEAST_SHIFT_PX:
+    if lacks <= PIXEL_VARIANCE / 4 and length < LEAST_MOTION_PX and apart < LEAST_SHIFT_PX:
         return None
     # The kernel's own texels, over which the Gaussian is integrated, have the variance of a pixel.
-    sigmas = np.sqrt(np.maximum(lacks - PIXEL_VARIANCE, 1e-4))
-    radius = int(np.ceil(3 * sigmas.max() + length / 2 + apart + 1))
+    sigma = np.sqrt(max(lacks - PIXEL_VARIANCE, 1e-4))
+    radius = int(np.ceil(3 * sigma + length / 2 + apart + 1))
     steps = 8 * int(np.ceil(length)) + 1
-    path = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None] * motion_px
-    return np.array(
-        [
-            [_kernel(path + shift, sigma, radius) for shift in of_colors]
-            for of_colors, sigma in zip(shifts, sigmas, strict=True)
-        ]
-    )
-
-
-def _kernel(path: Float64[np.ndarray, "t 2"], sigma: float, radius: int) -> Float64[np.ndarray, "k k"]:
-    """Return the mean of a Gaussian at places (column, row) that it passes, one for each moment of the exposure."""
-    columns, rows = (_integrals(places, sigma, radius) for places in path.T)
-    kernel = np.einsum("tr,tc->rc", rows, columns)
-    return np.asarray(kernel / kernel.sum())
+    share = (np.arange(steps) + 0.5) / steps - 0.5
+    kernels = []
+    for shift in shifts:
+        columns, rows = (
+            _integrals(share * moved + at, sigma, radius) for moved, at in zip(motion_px, shift, strict=True)
+        )  # a row for each moment of the exposure
+        kernels.append(np.einsum("tr,tc->rc", rows, columns))
+    return np.asarray([kernel / kernel.sum() for kernel in kernels])
 
 
 def _integrals(centres: Float64[np.ndarray, " t"], sigma: float, radius: int) -> Float64[np.ndarray, "t k"]:
@@ -132,42 +118,32 @@ def blurred(
     blur. Behind an object's edges it is as near them. Pixels that the blurred objects do not reach are the same to
     the bit.
     """
-    return blurred_in_parts(
-        color, coverage, kernels[None], np.ones((1, *coverage.shape), np.float32), response
-    )
+    return blurred_in_parts(color, coverage, [(kernels, np.ones_like(coverage))], response)
 
 
 def blurred_in_parts(
-    color: Color,
-    coverage: Coverage,
-    kernels: Float64[np.ndarray, "n 3 k k"],
-    weights: Float32[np.ndarray, "n h w"],
-    response: Float32[np.ndarray, "256 3"] | None,
+    color: Color, coverage: Coverage, parts: Sequence[Part], response: Float32[np.ndarray, "256 3"] | None
 ) -> tuple[Color, Coverage]:
-    """Return a picture as `blurred` does, with several blurs: of what covers a pixel each takes its weight's share.
+    """Return a picture as `blurred` does, with several blurs: kernels, and their weights in what covers a pixel.
 
     Weights of a pixel sum to 1.
     """
     rows, columns = np.nonzero(coverage > 0)
     if not len(rows):
         return color, coverage
-    width = kernels.shape[-1]
+    reach = max(kernels.shape[1] for kernels, _ in parts) // 2
     box = tuple(
-        slice(max(int(each.min()) - width // 2, 0), int(each.max()) + width // 2 + 1)
-        for each in (rows, columns)
+        slice(max(int(each.min()) - reach, 0), int(each.max()) + reach + 1) for each in (rows, columns)
     )
     codes, cover = color[box], np.clip(coverage[box], 0, 1)
-    parts = cover * weights[:, *box]
     lut = decode_lut(response)
     linear = lut[codes, np.arange(3)].astype(np.float32)
-    objects, behind = (_continued(linear, known, width) for known in (cover >= SOLID, cover <= 0))
-    shares, coded = [], []
-    for channel in range(3):
-        share, own = _mixed(cover, parts, objects[..., channel], kernels[:, channel])
-        shares.append(share)
-        mixed = own + (1 - share) * behind[..., channel]
-        coded.append(np.rint(np.interp(mixed, lut[:, channel], np.arange(256))))
-    share = np.stack(shares, axis=-1)
+    share, own, behind = _together(
+        [_blurred_part(linear, cover, kernels, weight[box]) for kernels, weight in parts],
+        [_by_channel(cover[..., None], kernels) for kernels, _ in parts if len(parts) > 1],
+    )
+    mixed = own + (1 - share) * behind
+    coded = [np.rint(np.interp(mixed[..., c], lut[:, c], np.arange(256))) for c in range(3)]
     touched = (share.max(axis=-1) > LEAST_SHARE) | (cover > 0)
     result, covered = color.copy(), coverage.copy()
     result[box] = np.where(touched[..., None], np.stack(coded, axis=-1), codes).astype(np.uint8)
@@ -175,26 +151,38 @@ def blurred_in_parts(
     return result, covered
 
 
-def _mixed(
+def _blurred_part(
+    linear: Float32[np.ndarray, "h w 3"],
     cover: Float32[np.ndarray, "h w"],
-    parts: Float32[np.ndarray, "n h w"],
-    objects: Float32[np.ndarray, "h w"],
-    kernels: Float64[np.ndarray, "n k k"],
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Return how much the blurred objects cover, and their light in one channel times that.
+    kernels: Float64[np.ndarray, "3 k k"],
+    weight: Float32[np.ndarray, "h w"],
+) -> tuple[Layer, Layer, Layer]:
+    """Return how much a part of the objects covers, blurred, its light times that, and the light behind it."""
+    objects, behind = (_continued(linear, known, kernels.shape[1]) for known in (cover >= SOLID, cover <= 0))
+    part = (cover * weight)[..., None]
+    return _by_channel(part, kernels), _by_channel(part * objects, kernels), behind
 
-    Where parts of different blur meet, their shares do not sum to 1, although nothing shows between them. So the
-    parts' light is mixed by their shares, and what is covered is the blurred whole, by the blurs of the parts there.
+
+def _together(
+    parts: Sequence[tuple[Layer, Layer, Layer]], wholes: Sequence[Layer]
+) -> tuple[Layer, Layer, Layer]:
+    """Return the same of all parts; `wholes`: how much all objects cover in the blur of each part, if there are more.
+
+    Where parts meet, their shares do not sum to 1, although nothing shows between them. So light is mixed by shares,
+    and what is covered is the blurred whole, by the blurs of the parts there.
     """
-    shares = [_filtered(part, kernel) for part, kernel in zip(parts, kernels, strict=True)]
-    own = sum(_filtered(part * objects, kernel) for part, kernel in zip(parts, kernels, strict=True))
     if len(parts) == 1:
-        return shares[0], np.asarray(own)
-    total = np.asarray(sum(shares))
-    whole = sum(
-        share * _filtered(cover, kernel) for share, kernel in zip(shares, kernels, strict=True)
-    ) / np.maximum(total, TINY_SHARE)
-    return whole, np.asarray(own * whole / np.maximum(total, TINY_SHARE))
+        return parts[0]
+    total = np.maximum(sum(share for share, _, _ in parts), TINY_SHARE)
+    whole = sum(share * each for (share, _, _), each in zip(parts, wholes, strict=True)) / total
+    own = sum(own for _, own, _ in parts) * whole / total
+    return whole, np.asarray(own), np.asarray(sum(share * behind for share, _, behind in parts) / total)
+
+
+def _by_channel(picture: Float32[np.ndarray, "h w c"], kernels: Float64[np.ndarray, "3 k k"]) -> Layer:
+    """Return R G B through their kernels; of a picture of one channel, that through each."""
+    channels = np.broadcast_to(picture, (*picture.shape[:2], 3))
+    return np.stack([_filtered(channels[..., c], kernel) for c, kernel in enumerate(kernels)], axis=-1)
 
 
 def _filtered(

@@ -21,8 +21,8 @@ from deltalight.render_server.post_effects.camera_blur import (
     Color,
     Coverage,
     LensBlur,
+    blur_kernels,
     blurred_in_parts,
-    kernels_of_blurs,
 )
 from deltalight.render_server.post_effects.camera_edges import SIGMAS_PX, EdgeStep
 
@@ -34,6 +34,7 @@ ROUNDS = 5
 OUTLIER_DEVIATIONS = 3.0
 GRID_ERROR = 2 * np.log(SIGMAS_PX[1] / SIGMAS_PX[0]) / np.sqrt(12)
 """Of a variance, as a fraction: blurs are measured in steps."""
+NO_BLUR = np.ones((3, 1, 1))
 LEVEL_PX, MOST_LEVELS = 0.5, 6
 """Steps between the blurs that pixels of several depths are mixed of."""
 
@@ -170,12 +171,15 @@ class DistanceBlur:
         low, high = sigma[coverage > 0].min(), sigma[coverage > 0].max()
         count = int(np.clip(np.ceil((high - low) / LEVEL_PX) + 1, 1, MOST_LEVELS))
         levels = np.linspace(low, high, count)
-        lenses = [replace(self.lens, sigma_px=float(each)) for each in levels]
-        kernels = kernels_of_blurs(lenses, self.motion_px, self.from_centre_px)
-        if kernels is None:
+        kernels = [self._kernels(each) for each in levels]
+        if all(each is None for each in kernels):
             return color, coverage
         hats = [np.interp(variance, levels**2, hat).astype(np.float32) for hat in np.eye(count)]
-        return blurred_in_parts(color, coverage, kernels, np.array(hats), response)
+        parts = [(NO_BLUR if each is None else each, hat) for each, hat in zip(kernels, hats, strict=True)]
+        return blurred_in_parts(color, coverage, parts, response)
+
+    def _kernels(self, sigma_px: float) -> Float64[np.ndarray, "3 k k"] | None:
+        return blur_kernels(replace(self.lens, sigma_px=sigma_px), self.motion_px, self.from_centre_px)
 
 
 def _continued(
