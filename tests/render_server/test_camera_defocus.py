@@ -90,7 +90,7 @@ def shot(
         FINE * WIDTH, FINE * HEIGHT
     ).astype(np.float32)
     diameter = np.hypot(diameter, 4 * FINE * corner_px * 2 * outwards)
-    levels = np.linspace(0, diameter.max() + 1e-3, 20)
+    levels = np.linspace(0, diameter.max() + 1e-3, 12)
     soft = np.zeros_like(picture)
     for level, hat in zip(levels, np.eye(len(levels)), strict=True):
         weight = np.interp(diameter, levels, hat)
@@ -116,7 +116,7 @@ def test_aperture_and_focus_are_those_of_the_lens(aperture_m: float, corner_px: 
 def test_a_camera_that_comes_nearer_shows_it_too() -> None:
     """From the third frame on; the same place again says nothing new, as its errors are the same."""
     learned, sure = BoardDefocus(), []
-    for distance_m in (0.22, 0.26, 0.3, 0.36, 0.42):
+    for distance_m in (0.22, 0.3, 0.42):
         seen = shot(oblique(0.0, distance_m))
         assert learned.wants(seen)
         learned.observe(seen, edge_steps(seen))
