@@ -118,9 +118,9 @@ class BoardDefocus:
         return all(np.linalg.norm(place - each) >= LEAST_STEP for each in self._places)
 
     def observe(self, frame: ViewFrame, edges: Sequence[EdgeStep]) -> None:
-        """Take the edges of a frame that is wanted."""
+        """Take the edges of a frame that is wanted; one that shows none well is not looked at again."""
         place = _board_place(frame)
-        if edges and place is not None:
+        if place is not None:
             self._places.append(place)
             self._edges += edges
             self.model = fit_defocus(self._edges)

@@ -114,7 +114,7 @@ def test_aperture_and_focus_are_those_of_the_lens(aperture_m: float, corner_px: 
 
 
 def test_a_camera_that_comes_nearer_shows_it_too() -> None:
-    """From the third frame on; the same place again says nothing new, as its errors are the same."""
+    """From the third place on; the same place again says nothing new, as its errors are the same."""
     learned, sure = BoardDefocus(), []
     for distance_m in (0.22, 0.3, 0.42):
         seen = shot(oblique(0.0, distance_m))
@@ -122,7 +122,7 @@ def test_a_camera_that_comes_nearer_shows_it_too() -> None:
         learned.observe(seen, edge_steps(seen))
         assert not learned.wants(seen)
         sure.append(learned.model is not None)
-    assert sure[0] is False
+    assert sure == [False, False, True]
     assert learned.model is not None
     assert 4 * learned.model.growth / FOCAL_PX == pytest.approx(APERTURE_M, rel=0.1)
     assert 1 / learned.model.focus == pytest.approx(FOCUS_M, rel=0.1)
