@@ -87,8 +87,8 @@ class Output(StrictModel):
     )
     camera_artifacts: bool = Field(
         default=False,
-        description="Add the camera's noise, blur, vignetting, JPEG artefacts and motion blur, measured from its "
-        "frames, to the virtual part of the picture.",
+        description="Add the camera's noise, blur, defocus, vignetting, colour mosaic, JPEG artefacts and motion "
+        "blur, measured from its frames, to the virtual part of the picture.",
     )
     bloom: float = Field(
         default=0.0,

@@ -431,16 +431,20 @@ class SceneRenderer:
             self._readback.push(linear, "f2")
         if artifacts is None and linear is None:
             return lambda: self._read(frame)
-        covered = relit.shown().object_coverage
-        self._readback.push(covered, covered.dtype)
+        shown, texels = relit.shown(), None
+        self._readback.push(shown.object_coverage, shown.object_coverage.dtype)
+        if artifacts is not None and artifacts.distance_blur is not None:
+            self._readback.push(shown.object_buffer.position, "f4")
+            texels = raster_texels(shown.view)[::-1]
 
         def take() -> UInt8[np.ndarray, "h w 3"]:
             color = self._read(frame)
             radiance = None if linear is None else self._readback.pop()[..., :3].astype(np.float32)
             coverage = self._readback.pop()[..., 0].astype(np.float32)
+            depth_m = None if texels is None else self._readback.pop()[..., 3][texels]
             if radiance is not None:
                 color = bloomed(color, radiance, coverage, frame, output.bloom)
-            return color if artifacts is None else artifacts.applied(color, coverage)
+            return color if artifacts is None else artifacts.applied(color, coverage, depth_m)
 
         return take
 

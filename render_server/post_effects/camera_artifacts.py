@@ -1,12 +1,13 @@
 """What a camera does to a picture, learned from its frames and put on the virtual part.
 
 In this order: vignetting, blur, compression, noise. Noise is last because it is measured behind the compression.
+Where the camera's mosaic is known, noise comes before it, as at the sensor, and the compression last.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.render_server.post_effects.camera_blur import (
@@ -23,6 +24,15 @@ from deltalight.render_server.post_effects.camera_compression import (
     CameraCompression,
     Compression,
     compressed,
+)
+from deltalight.render_server.post_effects.camera_defocus import BoardDefocus, Defocus, DistanceBlur
+from deltalight.render_server.post_effects.camera_edges import edge_steps
+from deltalight.render_server.post_effects.camera_mosaic import (
+    GREEN_VARIANCE,
+    NOISE_KEPT,
+    CameraMosaic,
+    Mosaic,
+    mosaicked,
 )
 from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
 from deltalight.render_server.post_effects.camera_vignetting import PaperVignetting, Vignetting, vignetted
@@ -42,28 +52,47 @@ class FrameArtifacts:
     kernels: Float64[np.ndarray, "3 k k"] | None
     vignetting: Vignetting | None = None
     compression: Compression | None = None
+    distance_blur: DistanceBlur | None = None
+    mosaic: Mosaic | None = None
 
-    def applied(self, color: Color, coverage: Coverage) -> Color:
-        """Return a picture of the frame with all of it on its virtual part; as it is while none is known."""
+    def applied(
+        self, color: Color, coverage: Coverage, depth_m: Float32[np.ndarray, "h w"] | None = None
+    ) -> Color:
+        """Return a picture of the frame with all of it on its virtual part; as it is while none is known.
+
+        `depth_m` is that of the objects (0: none), and needed where `distance_blur` is known.
+        """
         frame = self.frame
         if self.vignetting is not None:
             color = vignetted(color, coverage, self.vignetting.factors(frame.camera), frame)
-        if self.kernels is not None:
+        if self.distance_blur is not None and depth_m is not None:
+            color, coverage = self.distance_blur.applied(color, coverage, depth_m, frame.response)
+        elif self.kernels is not None:
             color, coverage = blurred(color, coverage, self.kernels, frame.response)
-        if self.compression is not None:
-            color = compressed(color, coverage, self.compression)
-        if self.noise is None:
+        if self.mosaic is None:
+            return self._with_noise(self._compressed(color, coverage), coverage, self.noise)
+        at_sensor = None if self.noise is None else self.noise.before_filter(NOISE_KEPT)
+        color = self._with_noise(color, coverage, at_sensor)
+        return self._compressed(*mosaicked(color, coverage, self.mosaic, frame.response))
+
+    def _compressed(self, color: Color, coverage: Coverage) -> Color:
+        return color if self.compression is None else compressed(color, coverage, self.compression)
+
+    def _with_noise(self, color: Color, coverage: Coverage, noise: NoiseModel | None) -> Color:
+        if noise is None:
             return color
-        return add_noise(color, coverage, self.noise, frame.frame_id, frame.response)
+        return add_noise(color, coverage, noise, self.frame.frame_id, self.frame.response)
 
 
 class CameraArtifacts:
-    """Learns a camera's noise, the blur of its lens, its vignetting and compression, and follows its motion."""
+    """Learns a camera's noise, the blur of its lens, its vignetting, mosaic and compression; follows its motion."""
 
     def __init__(self) -> None:
         self._noise = CameraNoise()
         self._vignetting = PaperVignetting()
+        self._mosaic = CameraMosaic()
         self._compression = CameraCompression()
+        self._defocus = BoardDefocus()
         self._lens: list[LensBlur] = []
         self._last: ViewFrame | None = None
         self._pose: Float64[np.ndarray, "4 4"] = np.eye(4)
@@ -87,13 +116,31 @@ class CameraArtifacts:
         if frame is not self._last:
             self._follow(frame, world_from_camera, place_m)
             self._vignetting.observe(frame)
+            self._mosaic.observe(frame)
             self._compression.observe(frame)
             self._last, self._pose = frame, world_from_camera
         from_centre = np.nan_to_num(_pixel(frame, self._pose, place_m) - frame.camera.matrix[:2, 2])
-        kernels = blur_kernels(self._lens_blur(), self._motion_px, from_centre)
+        lens, by_distance = self._lens_blur(), self._defocus.model
+        if self._mosaic.model is not None:
+            # What was measured holds the blur of interpolation, which objects get by being interpolated.
+            lens = None if lens is None else lens.without(GREEN_VARIANCE)
+            by_distance = None if by_distance is None else by_distance.without(GREEN_VARIANCE)
         return FrameArtifacts(
-            frame, self._noise.model, kernels, self._vignetting.model, self._compression.model
+            frame,
+            self._noise.model,
+            blur_kernels(lens, self._motion_px, from_centre),
+            self._vignetting.model,
+            self._compression.model,
+            self._distance_blur(lens, by_distance, from_centre),
+            self._mosaic.model,
         )
+
+    def _distance_blur(
+        self, lens: LensBlur | None, defocus: Defocus | None, from_centre_px: Float64[np.ndarray, " 2"]
+    ) -> DistanceBlur | None:
+        if defocus is None:
+            return None
+        return DistanceBlur(defocus, lens or LensBlur(0.0), self._motion_px, from_centre_px)
 
     def _lens_blur(self) -> LensBlur | None:
         """Return the medians of what was measured."""
@@ -115,9 +162,15 @@ class CameraArtifacts:
         known = frame.exposure_s is not None
         self._motion_px = moved * min((frame.exposure_s or 0.0) * 1e9 / max(step_ns, 1), 1.0)
         is_still = float(np.linalg.norm(self._motion_px if known else moved)) < LEAST_MOTION_PX
-        if is_still and len(self._lens) < MOST_MEASURED:
-            found = measure_blur(frame)
+        wants_lens, wants_defocus = len(self._lens) < MOST_MEASURED, self._defocus.wants(frame)
+        if not is_still or not (wants_lens or wants_defocus):
+            return
+        edges = edge_steps(frame)
+        if wants_lens:
+            found = measure_blur(edges)
             self._lens += [] if found is None else [found]
+        if wants_defocus:
+            self._defocus.observe(frame, edges)
 
 
 def _pixel(

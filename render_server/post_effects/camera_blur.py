@@ -1,46 +1,35 @@
 """A camera's blur on the virtual part of a picture ([D] 6.2): its lens's, measured at the board's edges, and motion.
 
 The response to an edge is taken as Gaussian, a pixel's own area included, so the MTF is exp(-2 (pi sigma f)^2). One
-figure holds lens, focus at the board's distance, demosaicking and sharpening. By lateral chromatic aberration the
-picture in red and in blue is a little larger or smaller than in green. During an exposure the picture moves in a
-straight line.
+figure holds lens, focus at the board's distance, demosaicking and sharpening; camera_defocus.py and camera_mosaic.py
+tell some of it apart where they find it. By lateral chromatic aberration the picture in red and in blue is a little
+larger or smaller than in green. During an exposure the picture moves in a straight line.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from deltalight.protocol.board import BoardSpec
-from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.frames import decode_lut
+from deltalight.render_server.post_effects.camera_edges import EdgeStep
 
 PIXEL_VARIANCE = 1 / 12
 """Of a pixel's area; objects are rendered with it, so that much of the camera's blur is there already."""
-SIGMAS_PX = np.geomspace(0.3, 6.0, 76)
-SHIFTS_PX = np.linspace(-1.0, 1.0, 21)
-BIN_PX = 0.25
-"""Width of the bins of distance from an edge, in which pixels beside it are averaged."""
-INSET = 0.15
-"""Of an edge's length at either end, where the next edge begins."""
-REACH = 0.7
-"""Of the marker's border: how far beside an edge pixels are read."""
-LEAST_REACH_PX, LEAST_LENGTH_PX, LEAST_BINS = 1.5, 6.0, 8
-LEAST_CONTRAST = 0.1
-MOST_RESIDUAL = 0.1
-"""Of an edge's contrast, rms: what lies across it is something else."""
-CODES = (4, 251)
-"""An edge with pixels outside is clipped."""
 LEAST_EDGES = 8
 NO_MOTION = np.zeros(2)
 SOLID, LEAST_SHARE = 0.99, 1 / 512
+TINY_SHARE = 1e-6
 LEAST_MOTION_PX, LEAST_SHIFT_PX = 0.25, 0.05
 SIGNIFICANT = 3.0
 """Standard errors by which red or blue must differ in size from green."""
 
 Color = UInt8[np.ndarray, "h w 3"]
 Coverage = Float32[np.ndarray, "h w"]
+Layer = Float32[np.ndarray, "h w 3"]
+Part = tuple[Float64[np.ndarray, "3 k k"], Coverage]
 
 
 def mtf50(sigma_px: float) -> float:
@@ -60,16 +49,18 @@ class LensBlur:
         """Return how far R, G and B lie from green at a place, from the principal point."""
         return np.outer([self.red, 0.0, self.blue], from_centre_px)
 
+    def without(self, variance: float) -> "LensBlur":
+        """Return what is left of the blur without a part of its variance, px^2."""
+        return replace(self, sigma_px=float(np.sqrt(max(self.sigma_px**2 - variance, 0.0))))
 
-def measure_blur(frame: ViewFrame) -> LensBlur | None:
-    """Return the blur across the edges of the board's markers, and how colours differ in size; None if few show."""
-    if frame.board is None or frame.pose is None or frame.board.type == "charuco":
+
+def measure_blur(edges: Sequence[EdgeStep]) -> LensBlur | None:
+    """Return the blur across a frame's edges, and how colours differ in size; None if they are few."""
+    if len(edges) < LEAST_EDGES:
         return None
-    found = [step for edge in _edges(frame, frame.board) if (step := _edge_step(frame, edge)) is not None]
-    if len(found) < LEAST_EDGES:
-        return None
-    sigmas, radii, red, blue = np.array(found).T
-    return LensBlur(float(np.median(sigmas)), _magnification(radii, red), _magnification(radii, blue))
+    radii, red, blue = np.array([(each.across_px, each.red_px, each.blue_px) for each in edges]).T
+    sigma = float(np.median([each.sigma_px for each in edges]))
+    return LensBlur(sigma, _magnification(radii, red), _magnification(radii, blue))
 
 
 def _magnification(radius: Float64[np.ndarray, " n"], shift: Float64[np.ndarray, " n"]) -> float:
@@ -78,109 +69,6 @@ def _magnification(radius: Float64[np.ndarray, " n"], shift: Float64[np.ndarray,
     slope = float(radius @ shift) / power
     error = np.sqrt(np.mean((shift - slope * radius) ** 2) / power)
     return slope if abs(slope) > SIGNIFICANT * error else 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Edge:
-    """A straight edge in the picture: a point of it (px), its direction, its length and how far beside it to look."""
-
-    start: Float64[np.ndarray, " 2"]
-    along: Float64[np.ndarray, " 2"]
-    length: float
-    reach: float
-
-
-def _edges(frame: ViewFrame, board: BoardSpec) -> Iterator[_Edge]:
-    """Yield the outer edges of the markers in view that are long enough."""
-    assert frame.pose is not None
-    camera_from_world = np.linalg.inv(frame.pose.world_from_camera)
-    cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
-    border = board.border_bits / cells
-    size = np.array([frame.camera.width, frame.camera.height])
-    for quad in board.corner_points().values():
-        middle = quad.mean(axis=0)
-        for corner, other in zip(quad, np.roll(quad, -1, axis=0), strict=True):
-            inward = middle - (corner + other) / 2  # half of the marker
-            points = np.stack([corner, other, (corner + other) / 2 + 2 * border * inward])
-            seen = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-            if (seen[:, 2] <= 0).any():
-                continue
-            first, last, inside = frame.camera.project(seen)
-            length = float(np.linalg.norm(last - first))
-            if not (np.isfinite(length) and length > 0):
-                continue
-            along = (last - first) / length
-            reach = REACH * abs(float(_across(along) @ (inside - first)))
-            start = first + INSET * (last - first)
-            if min(first.min(), last.min(), *(size - first), *(size - last)) < reach + 1:
-                continue
-            if reach >= LEAST_REACH_PX and (1 - 2 * INSET) * length >= LEAST_LENGTH_PX:
-                yield _Edge(start, along, (1 - 2 * INSET) * length, reach)
-
-
-def _across(along: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
-    return np.array([-along[1], along[0]])
-
-
-def _edge_step(frame: ViewFrame, edge: _Edge) -> tuple[float, float, float, float] | None:
-    """Return the blur's standard deviation, and distances across the edge: from the principal point, of red and blue.
-
-    Those of red and blue are from green. None if the edge is clipped, faint or something else.
-    """
-    ends = np.stack([edge.start, edge.start + edge.length * edge.along])
-    low = np.floor(ends.min(axis=0) - edge.reach).astype(int)
-    high = np.ceil(ends.max(axis=0) + edge.reach).astype(int) + 1
-    codes = frame.color[low[1] : high[1], low[0] : high[0]]
-    rows, columns = np.mgrid[low[1] : high[1], low[0] : high[0]]
-    offset = np.stack([columns, rows], axis=-1) - edge.start
-    across = _across(edge.along)
-    distance, along = offset @ across, offset @ edge.along
-    used = (np.abs(distance) <= edge.reach) & (along >= 0) & (along <= edge.length)
-    if not used.any() or codes[used].min() < CODES[0] or codes[used].max() > CODES[1]:
-        return None
-    linear = decode_lut(frame.response)[codes[used], np.arange(3)].astype(np.float64)
-    steps = [_fitted_step(distance[used], linear[:, channel]) for channel in range(3)]
-    if steps[0] is None or steps[1] is None or steps[2] is None:
-        return None
-    (_, red), (sigma, green), (_, blue) = steps[0], steps[1], steps[2]
-    radius = float(across @ (ends.mean(axis=0) - frame.camera.matrix[:2, 2]))
-    return sigma, radius, red - green, blue - green
-
-
-def _fitted_step(
-    distance: Float64[np.ndarray, " n"], value: Float64[np.ndarray, " n"]
-) -> tuple[float, float] | None:
-    """Fit a step blurred by a Gaussian: the best of all SIGMAS_PX and SHIFTS_PX; returns both."""
-    from scipy.special import erf
-
-    bins = np.round(distance / BIN_PX).astype(int)
-    names, bins = np.unique(bins, return_inverse=True)
-    if len(names) < LEAST_BINS:
-        return None
-    count = np.bincount(bins).astype(np.float64)
-    value = np.bincount(bins, value) / count
-    distance = np.bincount(bins, distance) / count
-    weight = count / count.sum()
-    steps = erf((distance - SHIFTS_PX[:, None]) / (np.sqrt(2) * SIGMAS_PX[:, None, None]))
-    steps = steps - (steps @ weight)[..., None]
-    centred = value - weight @ value
-    power = (steps**2) @ weight
-    slope = (steps * centred) @ weight / power
-    residual = (centred**2) @ weight - slope**2 * power
-    best, shift = np.unravel_index(residual.argmin(), residual.shape)
-    contrast, rms = 2 * abs(float(slope[best, shift])), float(residual[best, shift].clip(min=0)) ** 0.5
-    if contrast < LEAST_CONTRAST or rms > MOST_RESIDUAL * contrast:
-        return None
-    sigma = float(np.sqrt(SIGMAS_PX[best] ** 2 - BIN_PX**2 / 12))
-    return sigma, float(SHIFTS_PX[shift]) + _vertex(residual[best], int(shift))
-
-
-def _vertex(values: Float64[np.ndarray, " n"], least: int) -> float:
-    """Return how far beside the least of the values at SHIFTS_PX a parabola through its neighbours is lowest."""
-    if not 0 < least < len(values) - 1:
-        return 0.0
-    before, here, after = values[least - 1 : least + 2]
-    return float((before - after) / (2 * (before - 2 * here + after)) * (SHIFTS_PX[1] - SHIFTS_PX[0]))
 
 
 def blur_kernels(
@@ -230,30 +118,71 @@ def blurred(
     blur. Behind an object's edges it is as near them. Pixels that the blurred objects do not reach are the same to
     the bit.
     """
+    return blurred_in_parts(color, coverage, [(kernels, np.ones_like(coverage))], response)
+
+
+def blurred_in_parts(
+    color: Color, coverage: Coverage, parts: Sequence[Part], response: Float32[np.ndarray, "256 3"] | None
+) -> tuple[Color, Coverage]:
+    """Return a picture as `blurred` does, with several blurs: kernels, and their weights in what covers a pixel.
+
+    Weights of a pixel sum to 1.
+    """
     rows, columns = np.nonzero(coverage > 0)
     if not len(rows):
         return color, coverage
-    width = kernels.shape[1]
+    reach = max(kernels.shape[1] for kernels, _ in parts) // 2
     box = tuple(
-        slice(max(int(each.min()) - width // 2, 0), int(each.max()) + width // 2 + 1)
-        for each in (rows, columns)
+        slice(max(int(each.min()) - reach, 0), int(each.max()) + reach + 1) for each in (rows, columns)
     )
     codes, cover = color[box], np.clip(coverage[box], 0, 1)
     lut = decode_lut(response)
     linear = lut[codes, np.arange(3)].astype(np.float32)
-    objects, behind = (_continued(linear, known, width) for known in (cover >= SOLID, cover <= 0))
-    shares, coded = [], []
-    for channel, kernel in enumerate(kernels):
-        shares.append(_filtered(cover, kernel))
-        own = _filtered(cover * objects[..., channel], kernel)
-        mixed = own + (1 - shares[channel]) * behind[..., channel]
-        coded.append(np.rint(np.interp(mixed, lut[:, channel], np.arange(256))))
-    share = np.stack(shares, axis=-1)
+    share, own, behind = _together(
+        [_blurred_part(linear, cover, kernels, weight[box]) for kernels, weight in parts],
+        [_by_channel(cover[..., None], kernels) for kernels, _ in parts if len(parts) > 1],
+    )
+    mixed = own + (1 - share) * behind
+    coded = [np.rint(np.interp(mixed[..., c], lut[:, c], np.arange(256))) for c in range(3)]
     touched = (share.max(axis=-1) > LEAST_SHARE) | (cover > 0)
     result, covered = color.copy(), coverage.copy()
     result[box] = np.where(touched[..., None], np.stack(coded, axis=-1), codes).astype(np.uint8)
     covered[box] = np.where(touched, share[..., 1], 0)
     return result, covered
+
+
+def _blurred_part(
+    linear: Float32[np.ndarray, "h w 3"],
+    cover: Float32[np.ndarray, "h w"],
+    kernels: Float64[np.ndarray, "3 k k"],
+    weight: Float32[np.ndarray, "h w"],
+) -> tuple[Layer, Layer, Layer]:
+    """Return how much a part of the objects covers, blurred, its light times that, and the light behind it."""
+    objects, behind = (_continued(linear, known, kernels.shape[1]) for known in (cover >= SOLID, cover <= 0))
+    part = (cover * weight)[..., None]
+    return _by_channel(part, kernels), _by_channel(part * objects, kernels), behind
+
+
+def _together(
+    parts: Sequence[tuple[Layer, Layer, Layer]], wholes: Sequence[Layer]
+) -> tuple[Layer, Layer, Layer]:
+    """Return the same of all parts; `wholes`: how much all objects cover in the blur of each part, if there are more.
+
+    Where parts meet, their shares do not sum to 1, although nothing shows between them. So light is mixed by shares,
+    and what is covered is the blurred whole, by the blurs of the parts there.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    total = np.maximum(sum(share for share, _, _ in parts), TINY_SHARE)
+    whole = sum(share * each for (share, _, _), each in zip(parts, wholes, strict=True)) / total
+    own = sum(own for _, own, _ in parts) * whole / total
+    return whole, np.asarray(own), np.asarray(sum(share * behind for share, _, behind in parts) / total)
+
+
+def _by_channel(picture: Float32[np.ndarray, "h w c"], kernels: Float64[np.ndarray, "3 k k"]) -> Layer:
+    """Return R G B through their kernels; of a picture of one channel, that through each."""
+    channels = np.broadcast_to(picture, (*picture.shape[:2], 3))
+    return np.stack([_filtered(channels[..., c], kernel) for c, kernel in enumerate(kernels)], axis=-1)
 
 
 def _filtered(

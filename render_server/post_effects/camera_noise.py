@@ -41,6 +41,10 @@ class NoiseModel:
         """Return the variance at linear intensities, R G B."""
         return np.asarray(np.maximum(self.read + self.shot * intensity, 0))
 
+    def before_filter(self, kept: Float64[np.ndarray, " 3"]) -> "NoiseModel":
+        """Return the independent noise that becomes this in a filter that keeps such shares of variance, R G B."""
+        return NoiseModel(self.read / kept, self.shot / kept, (0.0, 0.0))
+
 
 def estimate_noise(
     first: Color, second: Color, response: Float32[np.ndarray, "256 3"] | None

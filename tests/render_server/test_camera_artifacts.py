@@ -6,10 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from deltalight.benchmarks.ground_truth.sensors import ColorSensor
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor, srgb_bytes
 from deltalight.protocol.frames import decode_lut
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.post_effects.camera_mosaic import demosaicked
 from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server import test_camera_defocus as lens
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame, look_at, plain
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -90,6 +92,63 @@ def test_objects_are_compressed_as_the_picture_is(gpu: GpuContext, tmp_path: Pat
     without, with_it = pictures[False], pictures[True]
     assert np.array_equal(with_it[~covered], without[~covered])
     assert (with_it[covered] != without[covered]).any()
+
+
+def sharpness(picture: np.ndarray, where: np.ndarray) -> float:
+    """Sum of squared steps from pixel to pixel, in linear light, in and around an object."""
+    light = decode_lut(None)[picture[..., 1], 1].astype(float)
+    around = cv2.dilate(where.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return float(((np.diff(light, axis=1) ** 2)[around[:, 1:]]).sum())
+
+
+@pytest.mark.parametrize("antialiasing", [False, True])
+def test_objects_out_of_focus_are_soft(gpu: GpuContext, tmp_path: Path, antialiasing: bool) -> None:
+    """From the first frame that sees the board obliquely on: a near cube loses more than one in focus does."""
+    seen = lens.shot(lens.oblique(55.0))
+    stage = Stage(tmp_path, COARSE)
+    cubes = [
+        stage.virtual(cube(0.035, (x, y, 0.0)), (0.02,) * 3) for x, y in ((0.06, -0.26), (0.095, -0.145))
+    ]
+    document = stage.document(cubes, [ambient(0.5)], floor())
+    pictures = {}
+    for asked in (False, True):
+        output = document.output.replaced(camera_artifacts=asked, antialiasing=antialiasing)
+        renderer = SceneRenderer(gpu, document.replaced(output=output))
+        pictures[asked] = [renderer.render(seen).color for _ in range(2)]
+        covered = fields_of(renderer).matte > 0
+        renderer.release()
+    (without, _), (with_it, again) = pictures[False], pictures[True]
+    assert np.array_equal(with_it, again)
+    far_off = cv2.dilate(covered.astype(np.uint8), np.ones((41, 41), np.uint8)) == 0
+    assert far_off.any()
+    assert np.array_equal(with_it[far_off], without[far_off])
+    count, labels = cv2.connectedComponents(covered.astype(np.uint8))
+    assert count == 3
+    focused, near = (sharpness(with_it, labels == n) / sharpness(without, labels == n) for n in (1, 2))
+    assert near < 0.6 * focused
+
+
+def test_objects_are_seen_through_the_cameras_mosaic(gpu: GpuContext, tmp_path: Path) -> None:
+    """From the first frame on a grey object's edges have coloured fringes, and what is beside them stays."""
+    light = decode_lut(None)[plain(150), np.arange(3)] + np.random.default_rng(2).normal(
+        0, 0.01, (120, 160, 3)
+    )
+    seen = frame(srgb_bytes(demosaicked(light.astype(np.float32), "GRBG")))
+    stage = Stage(tmp_path, COARSE)
+    document = stage.document([stage.virtual(cube(0.3), (0.02,) * 3)], [ambient(0.5)], floor())
+    pictures = {}
+    for asked in (False, True):
+        renderer = SceneRenderer(
+            gpu, document.replaced(output=document.output.replaced(camera_artifacts=asked))
+        )
+        pictures[asked] = renderer.render(seen).color.astype(int)
+        covered = fields_of(renderer).matte > 0
+        renderer.release()
+    beside = cv2.dilate(covered.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert np.array_equal(pictures[True][~beside], pictures[False][~beside])
+    edge = beside & ~(cv2.erode(covered.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    fringes = [np.abs(each[edge][:, ::2] - each[edge][:, 1:2]).mean() for each in pictures.values()]
+    assert fringes[1] > 3 * fringes[0]
 
 
 def test_a_glowing_object_has_bloom_in_every_composite(gpu: GpuContext, tmp_path: Path) -> None:

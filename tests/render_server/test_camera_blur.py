@@ -19,6 +19,7 @@ from deltalight.render_server.post_effects.camera_blur import (
     measure_blur,
     mtf50,
 )
+from deltalight.render_server.post_effects.camera_edges import edge_steps
 
 WIDTH, HEIGHT, FINE = 320, 240, 5
 BOARD = BoardSpec(
@@ -58,21 +59,26 @@ def _larger(picture: Float32[np.ndarray, "h w"], by: float) -> Float32[np.ndarra
     return np.asarray(cv2.warpAffine(picture, turn, (width, height), borderMode=cv2.BORDER_REPLICATE))
 
 
-def shot(
-    sigma_px: float, noise: float = 0.0, red: float = 0.0, blue: float = 0.0, **more: object
-) -> ViewFrame:
-    """The board through a lens of that blur, a pixel's own area included; red and blue are larger by that."""
-    seen, from_world = camera(FINE), np.linalg.inv(pose())
+def sharp(board: BoardSpec, world_from_camera: Float64[np.ndarray, "4 4"]) -> Float32[np.ndarray, "h w"]:
+    """The board as a pinhole shows it, in linear light, each pixel by FINE x FINE."""
+    seen, from_world = camera(FINE), np.linalg.inv(world_from_camera)
     picture = np.full((FINE * HEIGHT, FINE * WIDTH), 0.6, np.float32)
-    cells = BOARD.opencv_dictionary().markerSize + 2 * BOARD.border_bits
-    for name, quad in BOARD.corner_points().items():
+    cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
+    for name, quad in board.corner_points().items():
         pixels = seen.project(quad @ from_world[:3, :3].T + from_world[:3, 3])
-        marker = cv2.aruco.generateImageMarker(BOARD.opencv_dictionary(), name, 40 * cells)
+        marker = cv2.aruco.generateImageMarker(board.opencv_dictionary(), name, 40 * cells)
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32) * 40 * cells - 0.5
         warp = cv2.getPerspectiveTransform(corners, pixels.astype(np.float32))
         ink = cv2.warpPerspective(255 - marker, warp, picture.shape[::-1], flags=cv2.INTER_LINEAR)
         picture -= 0.55 * ink.astype(np.float32) / 255
-    soft = cv2.GaussianBlur(picture, (0, 0), FINE * np.sqrt(sigma_px**2 - PIXEL_VARIANCE))
+    return picture
+
+
+def shot(
+    sigma_px: float, noise: float = 0.0, red: float = 0.0, blue: float = 0.0, **more: object
+) -> ViewFrame:
+    """The board through a lens of that blur, a pixel's own area included; red and blue are larger by that."""
+    soft = cv2.GaussianBlur(sharp(BOARD, pose()), (0, 0), FINE * np.sqrt(sigma_px**2 - PIXEL_VARIANCE))
     colors = np.stack([_larger(soft, each) for each in (red, 0.0, blue)], axis=-1)
     linear = cv2.resize(colors, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) + np.random.default_rng(
         1
@@ -97,7 +103,7 @@ def linear(color: np.ndarray) -> Float32[np.ndarray, "h w 3"]:
 
 @pytest.mark.parametrize(("sigma_px", "noise"), [(0.5, 0.01), (0.8, 0.0), (1.2, 0.01), (1.6, 0.0)])
 def test_mtf50_is_that_of_the_lens(sigma_px: float, noise: float) -> None:
-    found = measure_blur(shot(sigma_px, noise))
+    found = measure_blur(edge_steps(shot(sigma_px, noise)))
     assert found is not None
     assert mtf50(found.sigma_px) == pytest.approx(mtf50(sigma_px), rel=0.1)
     assert (found.red, found.blue) == pytest.approx((0.0, 0.0), abs=3e-4)
@@ -105,7 +111,7 @@ def test_mtf50_is_that_of_the_lens(sigma_px: float, noise: float) -> None:
 
 def test_colours_of_other_sizes_are_found_and_put_on() -> None:
     """Red 0.4 % larger, blue 0.3 % smaller than green: at 100 px from the centre, 0.4 and -0.3 px apart."""
-    found = measure_blur(shot(0.8, noise=0.005, red=0.004, blue=-0.003))
+    found = measure_blur(edge_steps(shot(0.8, noise=0.005, red=0.004, blue=-0.003)))
     assert found is not None
     assert (found.red, found.blue) == pytest.approx((0.004, -0.003), rel=0.15)
     kernels = blur_kernels(LensBlur(0.8, 0.004, -0.003), NO_MOTION, np.array([100.0, 0.0]))
@@ -116,8 +122,8 @@ def test_colours_of_other_sizes_are_found_and_put_on() -> None:
 
 def test_a_board_out_of_sight_says_nothing() -> None:
     away = np.eye(4)
-    assert measure_blur(shot(1.0, pose=BoardPose(away))) is None
-    assert measure_blur(shot(1.0, board=None)) is None
+    assert measure_blur(edge_steps(shot(1.0, pose=BoardPose(away)))) is None
+    assert measure_blur(edge_steps(shot(1.0, board=None))) is None
 
 
 def edge_picture(slope: float = 0.2) -> tuple[np.ndarray, Float32[np.ndarray, "h w"]]:

@@ -2920,7 +2920,7 @@ export interface components {
             readonly bloom: number;
             /**
              * Camera Artifacts
-             * @description Add the camera's noise, blur, vignetting, JPEG artefacts and motion blur, measured from its frames, to the virtual part of the picture.
+             * @description Add the camera's noise, blur, defocus, vignetting, colour mosaic, JPEG artefacts and motion blur, measured from its frames, to the virtual part of the picture.
              * @default false
              */
             readonly camera_artifacts: boolean;
