@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from deltalight.protocol.frames import ViewFrame, decode_lut
 
@@ -58,8 +58,11 @@ def estimate_noise(
     used = still & exposed
     if still.mean() < LEAST_STILL or used.sum() < LEAST_PIXELS:
         return None
+    bins = _bins((first[used].astype(np.float64) + second[used]) / 2)
     steps = np.gradient(lut.astype(np.float64), axis=0)
-    lines = [_fit_line(mean[used, c], difference[used, c], lut[:, c], steps[:, c]) for c in range(3)]
+    lines = [
+        _fit_line(bins[:, c], mean[used, c], difference[used, c], lut[:, c], steps[:, c]) for c in range(3)
+    ]
     read, shot = np.array(lines).T
     return NoiseModel(read, shot, (_correlation(difference, used, 1), _correlation(difference, used, 0)))
 
@@ -74,15 +77,25 @@ def _still_pixels(difference: Float64[np.ndarray, "h w 3"]) -> Bool[np.ndarray, 
     return np.asarray(np.abs(mean) <= STILL_SIGMAS * error)
 
 
+def _bins(codes: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n 3"]:
+    """Return each mean code's bin, about equally full ones of whole codes.
+
+    Pairs whose mean is a whole code differ by an even number of codes, others by an odd one: a bin must hold both.
+    """
+    edges = [np.unique(np.floor(np.quantile(each, np.linspace(0, 1, BINS + 1)[1:-1]))) for each in codes.T]
+    return np.stack(
+        [np.searchsorted(part, each, side="right") for part, each in zip(edges, codes.T, strict=True)], 1
+    )
+
+
 def _fit_line(
+    which: Int64[np.ndarray, " n"],
     mean: Float64[np.ndarray, " n"],
     difference: Float64[np.ndarray, " n"],
     lut: Float64[np.ndarray, " 256"],
     steps: Float64[np.ndarray, " 256"],
 ) -> tuple[float, float]:
     """Return a and b of the variances of bins of intensity, without what rounding to codes adds."""
-    edges = np.quantile(mean, np.linspace(0, 1, BINS + 1))
-    which = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, BINS - 1)
     rows: list[tuple[float, float, float]] = []
     for number in range(BINS):
         inside = which == number

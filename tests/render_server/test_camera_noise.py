@@ -33,6 +33,18 @@ def test_noise_is_found_within_15_percent_in_every_bin(shot: float, read: float)
     assert max(found.correlation) < 0.05
 
 
+@pytest.mark.parametrize(("shot", "read"), [(2e-4, 0.003), (5e-5, 0.006)])
+@pytest.mark.parametrize("levels", [[0.05, 0.5], [0.04, 0.1, 0.3, 0.31, 0.6]])
+def test_areas_of_one_brightness_tell_their_noise(shot: float, read: float, levels: list[float]) -> None:
+    flat = np.repeat(np.array(levels, np.float32), SIZE[1] // len(levels))
+    picture = np.broadcast_to(flat[None, :, None], (SIZE[0], len(flat), 3)).astype(np.float32)
+    rng, sensor = np.random.default_rng(3), ColorSensor(shot, read)
+    found = estimate_noise(sensor.expose(picture, rng), sensor.expose(picture, rng), None)
+    assert found is not None
+    ends = np.array([levels[0], levels[-1]])[:, None].repeat(3, 1)
+    np.testing.assert_allclose(found.variance(ends), read**2 + shot * ends, rtol=0.15)
+
+
 def test_what_moves_is_left_out() -> None:
     """A tenth of the picture moves; the noise stays the rest's. Where all moves, nothing is found."""
     first, second = pair(ColorSensor(2e-4, 0.003))
