@@ -16,6 +16,7 @@ SPARE_EDGE = (
     0.125  # of a volume that stays while its objects move: the light around them changes that far at least
 )
 SNAP_VOXELS = 0.01
+BEHIND = 1e-3  # voxels, as volume.glsl has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +83,13 @@ class VolumePlacement:
         return bool((low < origin + edge).all() and (high > origin).all())
 
     def voxel_bounds(self, points: Float64[np.ndarray, "n 3"]) -> np.ndarray[Any, np.dtype[np.int32]]:
-        """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
-        voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
-        voxels = np.clip(voxels, 0, self.size - 1)
-        low, high = short_axis.bounds(voxels)
+        """Returns (min x, y, z, -max x, y, z) of the voxels of a thing with these points, clipped to the volume.
+
+        As the shaders have it (volume.glsl), a side on the border of two voxels belongs to the one inside.
+        """
+        bounds = short_axis.bounds((points - np.array(self.origin)) / self.voxel_edge)
+        voxels = np.floor(np.stack(bounds) + np.array([[BEHIND], [-BEHIND]]))
+        low, high = short_axis.bounds(np.clip(voxels, 0, self.size - 1))
         return np.concatenate([low, -high]).astype(np.int32)
 
 

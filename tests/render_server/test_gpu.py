@@ -362,6 +362,15 @@ def test_volume_holds_the_objects_and_moves_by_whole_voxels(
     assert np.abs(shift - 3.7 * np.array(steps)).max() <= 1 + 1e-6
 
 
+@pytest.mark.parametrize("error", [0.0, 1e-5, -1e-5])
+def test_sides_on_borders_of_voxels_belong_to_those_inside(error: float) -> None:
+    placed = VolumePlacement((-1.0, 0.0, 0.25), 0.25, 32)
+    corners = np.array([[0.0, 1.0, 2.0], [1.0, 1.5, 3.0]])
+    assert placed.voxel_bounds(corners + error).tolist() == [4, 4, 7, -7, -5, -10]
+    sheet = np.array([[0.0, 1.0, 2.0], [1.0, 1.5, 2.0]])  # with a voxel on either side
+    assert placed.voxel_bounds(sheet + error).tolist() == [4, 4, 6, -7, -5, -7]
+
+
 def block(size: int, level: int, direction: int) -> tuple[slice, slice, slice]:
     """Where a level of a direction lies: (z, y, x) of the texture (shaders/common/volume.glsl)."""
     cells = size >> level
