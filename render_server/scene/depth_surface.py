@@ -395,9 +395,15 @@ def _tiles(mask: Mask) -> Iterator[Window]:
 
 def _runs(is_set: Bool[np.ndarray, " n"]) -> list[slice]:
     """Returns the runs of elements that lie within WINDOW_MARGIN_PX of set ones."""
-    near = _dilated(is_set[:, None], WINDOW_MARGIN_PX)[:, 0]
-    ends = np.flatnonzero(np.diff(near, prepend=False, append=False)).tolist()
-    return [slice(*run) for run in zip(ends[::2], ends[1::2], strict=True)]
+    margin, places = WINDOW_MARGIN_PX, np.flatnonzero(is_set)
+    if not len(places):
+        return []
+    gaps = np.flatnonzero(np.diff(places) > 2 * margin + 1)
+    firsts, lasts = places[np.append(0, gaps + 1)].tolist(), places[np.append(gaps, -1)].tolist()
+    return [
+        slice(max(a - margin, 0), min(b + margin + 1, len(is_set)))
+        for a, b in zip(firsts, lasts, strict=True)
+    ]
 
 
 def _strip_window(box: Int32[np.ndarray, "5"]) -> Window:
