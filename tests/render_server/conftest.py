@@ -11,8 +11,18 @@ from deltalight.render_server.gpu import kernel as kernel_module
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.methods import registry
+from deltalight.render_server.methods.method import SOFTWARE_DEFAULTS
 from tests.render_server.scenes import ObjectsRenderer, Stage
 from tests.render_server.tiny_kernel import OUT, MakeKernel
+
+
+@pytest.fixture(scope="session", autouse=True)
+def same_defaults() -> Iterator[None]:
+    """What a scene leaves open is as in software on every device: a finer volume is another test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "GPU_DEFAULTS", SOFTWARE_DEFAULTS)
+        yield
 
 
 @pytest.fixture(scope="module")
