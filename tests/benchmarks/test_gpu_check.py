@@ -330,6 +330,7 @@ def test_several_processes_compile_what_one_does(tmp_path: Path, monkeypatch: py
         compile_everything(step, processes)
         assert step.record.faults == []
         assert step.record.sentence.endswith("2 of 2 scenes rendered")
+        assert set(parts) <= set(step.record.figures["done_after_s"])
         variants.append(step.record.figures["variants"])
     assert variants[0] == variants[1]
     assert len(variants[0]) > 5
