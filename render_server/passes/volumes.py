@@ -16,7 +16,9 @@ SPARE_EDGE = (
     0.125  # of a volume that stays while its objects move: the light around them changes that far at least
 )
 SNAP_VOXELS = 0.01
-BEHIND = 1e-3  # voxels, as volume.glsl has it
+# Where planes at whole voxels from the world's origin (a floor, sides of a box) lie in the voxel above: on the border
+# of two, rounding would decide between them, and otherwise for a surface than for the light on it.
+BORDER_VOXELS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +85,10 @@ class VolumePlacement:
         return bool((low < origin + edge).all() and (high > origin).all())
 
     def voxel_bounds(self, points: Float64[np.ndarray, "n 3"]) -> np.ndarray[Any, np.dtype[np.int32]]:
-        """Returns (min x, y, z, -max x, y, z) of the voxels of a thing with these points, clipped to the volume.
-
-        As the shaders have it (volume.glsl), a side on the border of two voxels belongs to the one inside.
-        """
-        bounds = short_axis.bounds((points - np.array(self.origin)) / self.voxel_edge)
-        voxels = np.floor(np.stack(bounds) + np.array([[BEHIND], [-BEHIND]]))
-        low, high = short_axis.bounds(np.clip(voxels, 0, self.size - 1))
+        """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
+        voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
+        voxels = np.clip(voxels, 0, self.size - 1)
+        low, high = short_axis.bounds(voxels)
         return np.concatenate([low, -high]).astype(np.int32)
 
 
@@ -98,12 +97,12 @@ def place_volume(
 ) -> VolumePlacement:
     """Places a cube around the objects' bounds: twice their longest edge ([P1]) unless `edge_m` is given.
 
-    Snapping to voxels keeps the grid fixed in the world while the objects move; rounding errors of a place on the
-    border between two voxels do not move it.
+    Snapping to voxels (less BORDER_VOXELS) keeps the grid fixed in the world while the objects move; rounding errors
+    of a place on the border between two voxels do not move it.
     """
     edge = edge_m if edge_m is not None else 2.0 * float(np.max(high - low))
     voxel = edge / size
-    origin = np.floor(((low + high) / 2 - edge / 2) / voxel + SNAP_VOXELS) * voxel
+    origin = (np.floor(((low + high) / 2 - edge / 2) / voxel + SNAP_VOXELS) - BORDER_VOXELS) * voxel
     return VolumePlacement((float(origin[0]), float(origin[1]), float(origin[2])), voxel, size)
 
 

@@ -20,7 +20,7 @@ from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.renderer import SceneRenderer
 
 WIDTH, HEIGHT, VOXELS = 160, 120, 32
-EDGE = 0.2  # of the box, m
+EDGE = 0.1995  # of the box, m: a little less than eight voxels, so that it lies in no ninth
 VOXEL_M = 0.8 / VOXELS
 IRRADIANCE, AMBIENT = 2.0, 0.1
 BASE_COLOR = np.array([0.8, 0.4, 0.2])
@@ -265,8 +265,7 @@ def test_the_shadow_lies_where_geometry_puts_it(
     ambient = np.pi * AMBIENT / (0.8 * IRRADIANCE + np.pi * AMBIENT)
     assert umbra.sum() > 100
     assert np.median(linear[umbra]) == pytest.approx(ambient, abs=0.08)
-    # The box's faces lie on borders of voxels and fill those inside, so its shadow is as narrow as can be.
-    assert np.mean(linear[umbra] < 0.5) > 0.9
+    assert np.mean(linear[umbra] < 0.5) > 0.95
     assert np.mean(np.abs(linear[lit] - 1) < 0.1) > 0.98
 
 

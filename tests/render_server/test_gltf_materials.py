@@ -58,9 +58,7 @@ def draw(objects: ObjectsRenderer, tmp_path: Path) -> Draw:
 
     def drawn(plate: Plate, lights: list[dict[str, Any]] | None = None) -> np.ndarray:
         stage = Stage(tmp_path)
-        # Clear of the floor: one in its plane is no nearer to the camera.
-        pose = {"translation_m": [0.0, 0.0, 1e-4]}
-        asset = {"asset": str(plate.write(tmp_path / "plate.glb")), "up_axis": "z", "pose": pose}
+        asset = {"asset": str(plate.write(tmp_path / "plate.glb")), "up_axis": "z"}
         return objects.linear(unlit(stage.document([asset], lights or [])), seen_from_above())
 
     return drawn

@@ -30,7 +30,12 @@ from deltalight.render_server.gpu.textures import AsyncReadback, gpu_objects, si
 from deltalight.render_server.methods.differential import SolutionVoxels
 from deltalight.render_server.methods.dvct import InjectedVoxels
 from deltalight.render_server.methods.voxel_volumes import DeltaVoxels
-from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
+from deltalight.render_server.passes.volumes import (
+    BORDER_VOXELS,
+    PlacedVolume,
+    VolumePlacement,
+    place_volume,
+)
 from deltalight.render_server.passes.voxels import (
     LARGEST_ITEM_BYTES,
     LEAST_SURFELS,
@@ -353,7 +358,8 @@ def test_volume_holds_the_objects_and_moves_by_whole_voxels(
     placed = place_volume(low, high, size, None)
     origin = np.array(placed.origin)
     assert placed.voxel_edge * size == pytest.approx(2 * (high - low).max())
-    assert np.abs(origin / placed.voxel_edge - np.round(origin / placed.voxel_edge)).max() < 1e-6
+    places = origin / placed.voxel_edge + BORDER_VOXELS
+    assert np.abs(places - np.round(places)).max() < 1e-6
     assert (origin <= low + 1e-9).all()
     assert (origin + placed.voxel_edge * size >= high - 1e-9).all()
     moved = place_volume(low + np.array(steps) * 0.37, high + np.array(steps) * 0.37, size, size * 0.1)
@@ -363,12 +369,15 @@ def test_volume_holds_the_objects_and_moves_by_whole_voxels(
 
 
 @pytest.mark.parametrize("error", [0.0, 1e-5, -1e-5])
-def test_sides_on_borders_of_voxels_belong_to_those_inside(error: float) -> None:
-    placed = VolumePlacement((-1.0, 0.0, 0.25), 0.25, 32)
-    corners = np.array([[0.0, 1.0, 2.0], [1.0, 1.5, 3.0]])
-    assert placed.voxel_bounds(corners + error).tolist() == [4, 4, 7, -7, -5, -10]
-    sheet = np.array([[0.0, 1.0, 2.0], [1.0, 1.5, 2.0]])  # with a voxel on either side
-    assert placed.voxel_bounds(sheet + error).tolist() == [4, 4, 6, -7, -5, -7]
+@pytest.mark.parametrize("size", [32, 64, 256])
+def test_planes_at_whole_voxels_lie_in_the_voxels_above(size: int, error: float) -> None:
+    """Of a box on the floor, whose height is a whole number of voxels, whatever its last bits are."""
+    low, high = np.array([-0.05, 0.1, 0.0]), np.array([0.05, 0.2, 0.1])
+    placed = place_volume(low, high, size, None)
+    bounds = placed.voxel_bounds(np.stack([low, high]) + error * placed.voxel_edge)
+    assert (-bounds[3:] - bounds[:3] == size // 2).all()
+    floor = np.floor((error * placed.voxel_edge - placed.origin[2]) / placed.voxel_edge)
+    assert bounds[2] == floor
 
 
 def block(size: int, level: int, direction: int) -> tuple[slice, slice, slice]:

@@ -86,12 +86,12 @@ void split(Light light, LightView view, ivec2 texel) {
     choose_rounding(view, texel, depth);
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;
-    vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
-    int slot = slot_near(VIRTUAL_SET, coordinate_behind(p, n));
+    int slot = slot_near(VIRTUAL_SET, volume_coordinate(p));
     if (slot < 0) return;
     vec3 flux = texel_light(light, view, s) * virtual_albedo(texel);
     add_flux(VIRTUAL_SET, slot, DELTA, flux);
     add_flux(VIRTUAL_SET, slot, RHO, flux);
+    vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
     add_area(VIRTUAL_SET, slot, lit_area(light, view, s, p, n));
 }
 #else
@@ -105,13 +105,13 @@ void split(Light light, LightView view, ivec2 texel) {
     float depth = first_depth(real_light_depth, view, texel);
     vec3 p = ray_point(view, s, depth);
     choose_rounding(view, texel, depth);
-    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
-    int slot = slot_near(REAL_SET, coordinate_behind(p, n));
+    int slot = slot_near(REAL_SET, volume_coordinate(p));
     if (slot < 0) return;
     Hit object = first_hit(virtual_light_depth, light.views.z, light.views.w, p);
     bool shadowed = object.present && object.depth <= object.ray_depth + bias_real;
     vec3 flux = texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb;
     add_flux(REAL_SET, slot, shadowed ? DELTA : RHO, shadowed ? -flux : flux);
+    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
     add_area(REAL_SET, slot, lit_area(light, view, s, p, n));
 }
 #endif

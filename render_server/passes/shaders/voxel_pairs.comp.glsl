@@ -36,10 +36,9 @@ void list_pair(uint triangle, uint path, ivec3 voxel) {
 }
 
 void list_pairs(uint triangle, uint path, Piece p) {
-    vec3 n = cross(p.b.place - p.a.place, p.c.place - p.a.place);
+    vec3 a = volume_coordinate(p.a.place), b = volume_coordinate(p.b.place), c = volume_coordinate(p.c.place);
+    vec3 n = cross(b - a, c - a);
     if (dot(n, n) == 0.0) return;
-    n = normalize(n);
-    vec3 a = coordinate_behind(p.a.place, n), b = coordinate_behind(p.b.place, n), c = coordinate_behind(p.c.place, n);
     ivec3 low = ivec3(floor(min(a, min(b, c)))), high = ivec3(floor(max(a, max(b, c))));
     ivec3 first = max(low, ivec3(0)), last = min(high, ivec3(volume_size - 1)), extent = last - first + 1;
     if (any(lessThan(extent, ivec3(1)))) return;

@@ -105,9 +105,8 @@ void emit(Piece t, int material, vec4 part, ivec3 voxel, vec3 a, vec3 b, vec3 c,
     if (index >= uint(surfels.length())) return;
     uint v = voxel_index(voxel + ivec3(0, 0, volume * volume_size), volume_size);
     touch(v);
-    vec3 unit = normalize(n), place = volume_origin + (part.xyz + set_back(unit)) * voxel_edge;
-    surfels[index].position_area = vec4(place, part.w * voxel_edge * voxel_edge);
-    surfels[index].normal_material = vec4(unit, float(material));
+    surfels[index].position_area = vec4(volume_origin + part.xyz * voxel_edge, part.w * voxel_edge * voxel_edge);
+    surfels[index].normal_material = vec4(normalize(n), float(material));
     surfels[index].uv_voxel = vec4(uv_at(t, part.xyz, a, b, c, n), uintBitsToFloat(v), double_sided[material]);
     surfels[index].tint = vec4((t.a.tint + t.b.tint + t.c.tint) / 3.0, 1.0);
 }
@@ -116,8 +115,7 @@ void clip_to_voxel(Pair pair) {
     Piece t = piece_of(pair.triangle, pair.path);
     int material = material_of(pair.triangle);
     ivec3 voxel = voxel_of_bits(pair.voxel);
-    vec3 unit = normalize(cross(t.b.place - t.a.place, t.c.place - t.a.place));
-    vec3 a = coordinate_behind(t.a.place, unit), b = coordinate_behind(t.b.place, unit), c = coordinate_behind(t.c.place, unit);
+    vec3 a = volume_coordinate(t.a.place), b = volume_coordinate(t.b.place), c = volume_coordinate(t.c.place);
     vec3 n = cross(b - a, c - a);
     bvec3 within = equal(ivec3(floor(min(a, min(b, c)))), ivec3(floor(max(a, max(b, c)))));
     if (all(within)) {   // most triangles of a depth mesh

@@ -48,13 +48,6 @@ vec4 volume_sample(sampler3D mipmap, int first, int n, vec3 q, int level, int k)
 
 vec3 volume_coordinate(vec3 p) { return (p - volume_origin) / voxel_edge; }
 
-// A point of a surface with that normal as the grid takes it. Of a plane along the axes, a little behind it: where it lies on
-// the border of two voxels, rounding would decide between them, and it belongs to the one whose skin it is.
-const float BEHIND = 1e-3;      // voxels: more than rounding
-const float ALIGNED = 0.9999;   // cosine
-vec3 set_back(vec3 n) { return BEHIND * sign(n) * vec3(greaterThan(abs(n), vec3(ALIGNED))); }
-vec3 coordinate_behind(vec3 p, vec3 n) { return volume_coordinate(p) - set_back(n); }
-
 bool inside_cube(vec3 q, float edge) { return all(greaterThan(q, vec3(0.0))) && all(lessThan(q, vec3(edge))); }
 
 bool inside_volume(vec3 q) { return inside_cube(q, float(volume_size)); }
