@@ -47,7 +47,7 @@ WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # gw0, gw1, ...; None where test
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 
 if WORKER is not None:
-    number = int(WORKER.removeprefix("gw")) % WORKERS  # one that takes the place of another has the next number
+    number = int(WORKER.removeprefix("gw")) % WORKERS  # who replaces another has the next number
     ports.PRIVATE_PORTS = ports.PRIVATE_PORTS[number::WORKERS]
 
 
