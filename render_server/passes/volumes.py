@@ -16,9 +16,9 @@ SPARE_EDGE = (
     0.125  # of a volume that stays while its objects move: the light around them changes that far at least
 )
 SNAP_VOXELS = 0.01
-# Where planes at whole voxels from the world's origin (a floor, sides of a box) lie in the voxel above: on the border
-# of two, rounding would decide between them, and otherwise for a surface than for the light on it.
-BORDER_VOXELS = 1e-3
+# Of the edge: how far planes at whole voxels from the world's origin (a floor, sides of a box) lie in the next voxel.
+# On the border of two, rounding would decide between them, and otherwise for a surface than for the light on it.
+ABOVE_BORDERS = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +97,12 @@ def place_volume(
 ) -> VolumePlacement:
     """Places a cube around the objects' bounds: twice their longest edge ([P1]) unless `edge_m` is given.
 
-    Snapping to voxels (less BORDER_VOXELS) keeps the grid fixed in the world while the objects move; rounding errors
+    Snapping to voxels (less ABOVE_BORDERS) keeps the grid fixed in the world while the objects move; rounding errors
     of a place on the border between two voxels do not move it.
     """
     edge = edge_m if edge_m is not None else 2.0 * float(np.max(high - low))
     voxel = edge / size
-    origin = (np.floor(((low + high) / 2 - edge / 2) / voxel + SNAP_VOXELS) - BORDER_VOXELS) * voxel
+    origin = np.floor(((low + high) / 2 - edge / 2) / voxel + SNAP_VOXELS) * voxel - ABOVE_BORDERS * edge
     return VolumePlacement((float(origin[0]), float(origin[1]), float(origin[2])), voxel, size)
 
 
