@@ -5,7 +5,6 @@ compiling first, which tells the compute shaders; these are compiled, each once;
 what the driver kept on disk.
 """
 
-import time
 import traceback
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -52,39 +51,26 @@ class UncompiledShader(moderngl.ComputeShader):
 
 
 def compile_everything(findings: Findings, processes: int) -> str:
-    """Compile every variant and render every scene; note what the driver refuses, and seconds since the start.
+    """Compile every variant and render every scene; note what the driver refuses, and what was done when.
 
     One process leaves out what several need to share the work.
     """
-    parts, clock = list(shader_parts()), _Clock(findings)
+    parts = list(shader_parts())
     if processes == 1:
         with opened_context() as gpu:
-            return _note_parts(findings, (render_part(gpu, part) for part in parts), len(parts), set(), clock)
-    known = _compile_known(findings, parts, processes, clock)
+            return _note_parts(findings, (render_part(gpu, part) for part in parts), len(parts), set())
+    known = _compile_known(findings, parts, processes)
     rendered = spread(render_part_here, parts, processes)
     found = (done.result or RenderedPart(done.item, (), f"{done.item}: {done.fault}") for done in rendered)
-    return _note_parts(findings, found, len(parts), known, clock)
+    return _note_parts(findings, found, len(parts), known)
 
 
-class _Clock:
-    """Notes after how many seconds things were done: what to make quicker where the time runs out."""
-
-    def __init__(self, findings: Findings) -> None:
-        self._findings, self._started_s = findings, time.monotonic()
-        self._seconds: dict[str, float] = {}
-
-    def note(self, what: str) -> None:
-        """It is done now."""
-        self._seconds[what] = round(time.monotonic() - self._started_s, 1)
-        self._findings.keep(done_after_s=self._seconds)
-
-
-def _compile_known(findings: Findings, parts: Sequence[str], processes: int, clock: _Clock) -> set[str]:
+def _compile_known(findings: Findings, parts: Sequence[str], processes: int) -> set[str]:
     """Compile what the parts ask for, each variant once, and return the labels."""
     known: dict[str, str] = {}
     for asked in spread(asked_variants, parts, processes):
         known |= asked.result or {}
-    clock.note("variants are known")
+    findings.done("variants are known")
     labels: set[str] = set()
     for done in spread(compile_variants, dealt(known, CHUNKS * processes), processes):
         chunk = [label for label, _ in done.item]
@@ -95,12 +81,12 @@ def _compile_known(findings: Findings, parts: Sequence[str], processes: int, clo
             findings.fault(f"one of {', '.join(chunk)}: {done.fault}")
         said = f"{len(labels)} of {len(known)} shader variants compiled, no scene rendered"
         findings.keep(said, variants=sorted(labels))
-    clock.note("variants are compiled")
+    findings.done("variants are compiled")
     return labels
 
 
 def _note_parts(
-    findings: Findings, rendered: "Iterable[RenderedPart]", total: int, variants: set[str], clock: _Clock
+    findings: Findings, rendered: "Iterable[RenderedPart]", total: int, variants: set[str]
 ) -> str:
     for count, part in enumerate(rendered, start=1):
         variants.update(part.labels)
@@ -108,7 +94,7 @@ def _note_parts(
             findings.fault(part.fault)
         said = f"{len(variants)} shader variants so far, {count} of {total} scenes rendered"
         findings.keep(said, variants=sorted(variants))
-        clock.note(part.name)
+        findings.done(part.name)
     return f"{len(variants)} shader variants given to the driver"
 
 

@@ -1,6 +1,7 @@
 """What a step found: written by the step's process as it goes along, read by the one that started it."""
 
 import json
+import time
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -56,12 +57,18 @@ class Findings:
     out: Path
     scratch: Path
     record: Record = field(default_factory=Record)
+    _began_s: float = field(default_factory=time.monotonic, init=False)
 
     def keep(self, sentence: str = "", **figures: object) -> None:
         """Add figures and write the record; `sentence` says how far the step is."""
         self.record.sentence = sentence or self.record.sentence
         self.record.figures |= figures
         write_bytes(self.path, json.dumps(self.record.as_dict()).encode())
+
+    def done(self, what: str) -> None:
+        """Note after how many seconds a part of the step was done: where time runs out, that tells what took it."""
+        seconds = round(time.monotonic() - self._began_s, 1)
+        self.keep(done_after_s={**self.record.figures.get("done_after_s", {}), what: seconds})
 
     def fault(self, sentence: str) -> None:
         """Note something wrong: the step fails at its end."""

@@ -166,15 +166,8 @@ def steady_spans(
 
 
 def objects_of_server(samples: Sequence[Sample], settle_s: float) -> list[list[int]]:
-    """Return the numbers of GL objects that were counted, one list for each render server's id, without its first
-    `settle_s`; those counted once are left out.
-    """
-    found: dict[int, list[int]] = {}
-    began: dict[int, float] = {}
-    for sample in samples:
-        if SERVER not in sample.processes or sample.gl_objects is None:
-            continue
-        number = sample.processes[SERVER].process_id
-        if sample.at_s >= began.setdefault(number, sample.at_s) + settle_s:
-            found.setdefault(number, []).append(sample.gl_objects)
-    return [counts for counts in found.values() if len(counts) > 1]
+    """Return the numbers of GL objects of each render server after its first `settle_s`, if there are two or more."""
+    spans = steady_spans(samples, lambda _at_s: True, settle_s)
+    servers = [span for name, span in spans if name == SERVER]
+    counts = [[each.gl_objects for each in span if each.gl_objects is not None] for span in servers]
+    return [each for each in counts if len(each) > 1]

@@ -396,14 +396,8 @@ def _tiles(mask: Mask) -> Iterator[Window]:
 def _runs(is_set: Bool[np.ndarray, " n"]) -> list[slice]:
     """Returns the runs of elements that lie within WINDOW_MARGIN_PX of set ones."""
     margin, places = WINDOW_MARGIN_PX, np.flatnonzero(is_set)
-    if not len(places):
-        return []
-    gaps = np.flatnonzero(np.diff(places) > 2 * margin + 1)
-    firsts, lasts = places[np.append(0, gaps + 1)].tolist(), places[np.append(gaps, -1)].tolist()
-    return [
-        slice(max(a - margin, 0), min(b + margin + 1, len(is_set)))
-        for a, b in zip(firsts, lasts, strict=True)
-    ]
+    parts = np.split(places, np.flatnonzero(np.diff(places) > 2 * margin + 1) + 1)
+    return [slice(max(int(each[0]) - margin, 0), int(each[-1]) + margin + 1) for each in parts if len(each)]
 
 
 def _strip_window(box: Int32[np.ndarray, "5"]) -> Window:

@@ -295,6 +295,8 @@ def test_a_short_soak_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert all(each.outcome["same_document"] for each in killed)
     figures = {each.what: each.is_met for each in report.figures}
     assert figures["scene equal by pixels"]
+    objects = [each for each in report.courses["GL objects"]["render server"] if each is not None]
+    assert max(objects) == objects[0]  # of all that were started
     assert of["nonsense"]["sent"] > 100
     assert of["kill-recorder"]["frames"] > 0
     written = SoakReport.model_validate(json.loads((tmp_path / "soak.json").read_text()))

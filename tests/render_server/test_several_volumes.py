@@ -187,10 +187,7 @@ def test_a_second_object_far_away_leaves_the_light_around_the_first_as_good(
 def test_light_does_not_jump_where_volumes_part_and_comes_back_to_the_bit(
     gpu: GpuContext, stage: Stage
 ) -> None:
-    """While the second ball is moved away, no step changes much more than those within the one volume do.
-
-    The largest of either kind is one at which voxels change their size, which depends on where planes lie in them.
-    """
+    """While the second ball is moved away by steps, none changes E on the floor (0.8) by more than 0.1."""
     document = room(stage, (0, 0, 0), (0.0, 0, 0))
     renderer = SceneRenderer(gpu, document)
     first, second = document.objects
@@ -209,7 +206,7 @@ def test_light_does_not_jump_where_volumes_part_and_comes_back_to_the_bit(
     for (_, before, _), (_, after, _) in pairwise(steps):
         seen = floor_around(before) & floor_around(after) & (before.position[..., 0] < 0.03)
         changes.append(np.percentile(np.abs(after.cones_rho - before.cones_rho)[seen], 99))
-    assert max(changes[3:]) <= 1.25 * max(changes[:3])
+    assert max(changes) <= 0.1  # at each, voxels are of another size
     back, _, _ = moved_to(float(places[0]))
     renderer.release()
     assert np.array_equal(back, steps[0][0])
