@@ -119,8 +119,8 @@ class SolutionVoxels(DirectionalVoxels):
         light.light_virtual(objects.store, rho, objects.groups, gathered=gathered)
         clear_buffer(self._gpu, real.store.delta_sums)
         self._resolve.resolve_rho(self.rho, real.store, objects.store, real.volume)
-        self._filter.run(self.mu, real.volume)
-        self._filter.run(self.rho, real.volume)
+        self._filter.run(self.mu, real.volume, real.store)
+        self._filter.run(self.rho, real.volume, real.store, objects.store)
 
     def set_support(self, *, everywhere: bool) -> None:
         """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""

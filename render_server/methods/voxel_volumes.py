@@ -160,7 +160,7 @@ class FarScene:
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
             self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume)
             self._occupy.run(self.mipmap, voxels.volume, voxels.store)
-            self._filter.run(self.mipmap, voxels.volume)
+            self._filter.run(self.mipmap, voxels.volume, voxels.store)
         return voxels
 
     @property
@@ -220,11 +220,11 @@ class DirectionalVoxels:
 
     def _filter_mu(self) -> None:
         self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume)
-        self._filter.run(self.mu, self.real.volume)
+        self._filter.run(self.mu, self.real.volume, self.real.store)
 
     def _filter_rho(self) -> None:
         self._resolve.resolve_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
-        self._filter.run(self.rho, self.real.volume)
+        self._filter.run(self.rho, self.real.volume, self.real.store, self.objects.store)
 
     def march_bindings(self, cone_count: int) -> dict[str, Binding]:
         """Returns all bindings that march.glsl reads."""

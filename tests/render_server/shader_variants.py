@@ -183,8 +183,8 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     for tiled in (False, True):
         LpvPropagate(gpu, tiled=tiled).release()
     Kernel(gpu, "clear_buffer").release()
-    for fused in ({}, {"FUSED": 1}):
-        Kernel(gpu, "filter_voxels", **fused).release()
+    for kind in ({}, {"FUSED": 1}, {"LISTED": 1}):
+        Kernel(gpu, "filter_voxels", **kind).release()
     for rows in (2, 8):
         for reuses in (False, True):
             Kernel(

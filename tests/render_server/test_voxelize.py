@@ -25,6 +25,7 @@ from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     SURFEL_BYTES,
     SURFELS_HEADER_BYTES,
+    ClearVoxels,
     FilterVoxels,
     VoxelMipmap,
     VoxelStore,
@@ -277,6 +278,37 @@ def test_levels_filtered_together_are_those_of_one_after_the_other(
         filtering.release()
     assert found[0] == found[1]
     release_all(mipmap, volume)
+
+
+def test_levels_around_touched_voxels_are_those_of_all_cells(gpu: GpuContext, lab: VoxelLab) -> None:
+    """In software, also where the voxels of an earlier mesh were, and where two sets share cells."""
+    rng = np.random.default_rng(5)
+    volume, mipmap = PlacedVolume(gpu, lab.placement), VoxelMipmap(gpu, SIZE, DIRECTIONS)
+    stores = [VoxelStore(gpu, SIZE) for _ in range(2)]
+    clearing, filtering = ClearVoxels(gpu, [mipmap]), FilterVoxels(gpu)
+    for _ in range(2):
+        for store in stores:
+            clearing.run(store, volume)
+            lab.voxelize(store, gpu_mesh(soup(rng, 60, (9.0, 9.0, 9.0))))
+        write_touched(mipmap, stores, rng)
+        filtering.run(mipmap, volume, *stores)
+    found = mipmap.texture.read()
+    filtering.run(mipmap, volume)
+    assert found == mipmap.texture.read()
+    texels = np.frombuffer(found, np.float16).reshape(-1, SIZE, SIZE, 4)
+    assert texels[DIRECTIONS * SIZE :].any()
+    release_all(mipmap, volume, clearing, filtering, *stores)
+
+
+def write_touched(mipmap: VoxelMipmap, stores: list[VoxelStore], rng: np.random.Generator) -> None:
+    """Fills the voxels that the stores touched with noise, in all directions of level 0."""
+    touched = np.zeros(SIZE**3, bool)
+    for store in stores:
+        touched |= np.frombuffer(store.grid.read(), np.uint32) > 0
+    assert touched.any()
+    texels = np.where(touched[:, None], rng.random((DIRECTIONS, SIZE**3, 4)), 0.0).astype(np.float16)
+    place = 0, 0, 0, SIZE, SIZE, DIRECTIONS * SIZE  # level 0 of all directions
+    mipmap.texture.write(texels.tobytes(), viewport=place)
 
 
 def test_on_a_gpu_levels_of_empty_cells_are_emptied_without_a_look_below(gpu: GpuContext) -> None:

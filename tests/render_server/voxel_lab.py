@@ -119,7 +119,7 @@ class VoxelLab:
         self._light.light_virtual(voxels.store, scene)
         self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume)
         self._occupy.run(voxels.rho, self._volume, voxels.store)
-        self._filter.run(voxels.rho, self._volume)
+        self._filter.run(voxels.rho, self._volume, voxels.store)
         materials.release()
         return voxels
 

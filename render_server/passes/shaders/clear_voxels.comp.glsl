@@ -1,4 +1,5 @@
-// Empties the voxels that a set touched: its grid cells, and their texels in all directions of a mipmap or of two.
+// Empties the voxels that a set touched: its grid cells, and their texels in all directions of a mipmap or of two, with those
+// of level 1 above them, which filter_voxels may not visit again.
 #include "common/volume.glsl"
 #include "common/walk.glsl"
 #define GRID_ACCESS
@@ -15,10 +16,12 @@ void main() {
     for (uint i = first_item(); i < slot_count; i += items_apart()) {
         ivec3 v = enter_volume_of(touched[i], volume_size);
         for (int k = 0; k < DIRECTIONS; ++k) {
-            ivec3 texel = level_base(0, k) + v;
+            ivec3 texel = level_base(0, k) + v, above = level_base(1, k) + v / 2;
             imageStore(mipmap, texel, vec4(0.0));
+            imageStore(mipmap, above, vec4(0.0));
 #ifdef TWO
             imageStore(second, texel, vec4(0.0));
+            imageStore(second, above, vec4(0.0));
 #endif
         }
         grid[touched[i]] = 0u;

@@ -1,10 +1,19 @@
 // Filters levels of the six one-sided mipmaps (docs/method.md 4.4): two cells along k composited front to back, mean of
 // the four across. Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do not occlude
 // each other). With FUSED, a workgroup filters a tile of the first level, then the cells above it, which need no others;
-// nothing is read below cells that hold nothing, which are most (in software, asking costs more than that saves).
+// nothing is read below cells that hold nothing, which are most. Software renderers compute such cells as well: with LISTED,
+// they walk the voxels that a set touched, to the cells of level 1 around them, where nearly all of the work is.
 #include "common/volume.glsl"
 
-#ifdef FUSED
+#ifdef LISTED
+#define GRID_ACCESS readonly
+#define TOUCHED_ACCESS readonly
+#include "common/voxel_store.glsl"
+#include "common/walk.glsl"
+
+layout(local_size_x = 64) in;
+layout(rgba16f) uniform image3D mipmap;
+#elif defined(FUSED)
 #include "common/occupancy.glsl"
 
 layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
@@ -15,7 +24,11 @@ const int TILE = 8;
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
 layout(rgba16f) uniform image3D mipmap;
 #endif
+#ifdef LISTED
+const int first_level = 1;
+#else
 uniform int first_level;   // to write; >= 1
+#endif
 
 vec4 fetch(int level, ivec3 cell, int k) { return imageLoad(mipmap, level_base(level - 1, k) + cell); }
 
@@ -52,7 +65,39 @@ void write_cell(int level, ivec3 cell, int k) {
     imageStore(mipmap, level_base(level, k) + cell, sum);
 }
 
-#ifdef FUSED
+#ifdef LISTED
+// Whether no touched voxel precedes this one in its cell.
+bool stands_for_cell(uint i) {
+    int n = volume_size;
+    ivec3 v = voxel_of_index(touched[i], n), inner = v & 1;
+    int first = int(voxel_index(v - inner, n)), own = inner.x + 2 * inner.y + 4 * inner.z;
+    bool stands = true;
+    for (int at = 0; at < 7; ++at) {
+        bool before = grid[first + (at & 1) + n * ((at >> 1 & 1) + n * (at >> 2))] != 0u;
+        stands = stands && !(before && at < own);
+    }
+    return stands;
+}
+
+// Lanes of a processor look for their next cells in a loop of their own, and filter together.
+bool find_cell(inout uint i) {
+    bool found = false;
+    if (i < slot_count) do {
+        found = stands_for_cell(i);
+        if (!found) i += items_apart();
+    } while (i < slot_count && !found);
+    return found;
+}
+
+void main() {
+    uint i = first_item();
+    if (find_cell(i)) do {
+        ivec3 cell = enter_volume_of(touched[i], volume_size) >> 1;
+        for (int k = 0; k < DIRECTIONS; ++k) write_cell(1, cell, k);
+        i += items_apart();
+    } while (find_cell(i));
+}
+#elif defined(FUSED)
 void main() {
     int cells = volume_size >> first_level, tiles = (cells + TILE - 1) / TILE;
     int slab = int(gl_WorkGroupID.z) / tiles, k = slab % DIRECTIONS;
