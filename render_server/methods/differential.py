@@ -64,10 +64,8 @@ class SolutionVoxels(DirectionalVoxels):
     """
 
     def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
-        """Groups the surfels of both sets after voxelisation."""
+        """Makes room for the light of the real surfels after voxelisation."""
         real.groups.reset(real.store)
-        if self._bounces > 0:
-            self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
         return real, objects
 
     def mu_scene(
@@ -92,35 +90,45 @@ class SolutionVoxels(DirectionalVoxels):
     def light(
         self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
     ) -> "SolutionVoxels":
-        """Lights, resolves and filters mu, then rho."""
+        """Lights, resolves and filters mu, then rho; with bounces, what both gather from mu is the first guess."""
         self._occupy.run(self.mu, self.real.volume, self.real.store)
         self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
-        self._light_both(mu, rho, gathered=False)
+        self.objects.forget_light()
+        self._light_mu(mu, gathered=False)
+        self._light_rho(rho, gathered=False)
+        if self._bounces > 0:
+            marching = {**mu, **self.march_bindings(1)}
+            self.real.groups.reset(self.real.store)
+            self._group.run(self.real.store, self.real.groups, self.real.volume.bindings, is_lit=True)
+            for each in (self.real, self.objects):
+                self._gather.gather(each.store, each.groups, self.mu, marching)
+            self._light_rho(rho, gathered=True)
         return self
 
     def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":
-        """Gathers light from each solution's own voxels, and relights them with it."""
+        """Gathers light from each solution's own voxels, relights them with it, and finds the bounces' tail."""
+        self.set_support(everywhere=True)
+        marching = {**mu, **self.march_bindings(1)}
         for _ in range(self._bounces):
-            self.set_support(everywhere=True)
-            marching = {**mu, **self.march_bindings(1)}
             self._gather.gather(self.real.store, self.real.groups, self.mu, marching)
             self._gather.gather(self.real.store, self.real.groups, self.rho, marching, keeps_mu=True)
             self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
-            self._light_both(mu, rho, gathered=True)
+            self._light_mu(mu, gathered=True)
+            self._light_rho(rho, gathered=True)
+        self._find_tail(marching)
         return self
 
-    def _light_both(self, mu: Bindings, rho: Bindings, *, gathered: bool) -> None:
+    def _light_mu(self, scene: Bindings, *, gathered: bool) -> None:
+        real = self.real
+        self._light.light_solution(real.store, scene, real.groups, with_objects=False, gathered=gathered)
+        self._filter_mu()
+
+    def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         real, objects, light = self.real, self.objects, self._light
-        if not gathered:
-            objects.forget_light()
-        light.light_solution(real.store, mu, real.groups, with_objects=False, gathered=gathered)
-        self._resolve.resolve_mu(self.mu, real.store, real.volume)
-        light.light_solution(real.store, rho, real.groups, with_objects=True, gathered=gathered)
-        light.light_virtual(objects.store, rho, objects.groups, gathered=gathered)
+        light.light_solution(real.store, scene, real.groups, with_objects=True, gathered=gathered)
+        light.light_virtual(objects.store, scene, objects.groups, gathered=gathered)
         clear_buffer(self._gpu, real.store.delta_sums)
-        self._resolve.resolve_rho(self.rho, real.store, objects.store, real.volume)
-        self._filter.run(self.mu, real.volume, real.store)
-        self._filter.run(self.rho, real.volume, real.store, objects.store)
+        self._filter_rho()
 
     def set_support(self, *, everywhere: bool) -> None:
         """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""

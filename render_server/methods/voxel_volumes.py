@@ -34,6 +34,7 @@ from deltalight.render_server.passes.volumes import (
 )
 from deltalight.render_server.passes.voxel_light import (
     AlbedoTexture,
+    BounceTail,
     GatherVoxels,
     GroupSurfels,
     LightVoxels,
@@ -190,6 +191,7 @@ class DirectionalVoxels:
         self.far = FarScene(gpu, self._light, is_used=settings.far_volume)
         self._group = GroupSurfels(gpu)
         self._gather = GatherVoxels(gpu, march_defines(settings))
+        self._tail = BounceTail(gpu, march_defines(settings))
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
         self._occupy = OccupyVoxels(gpu)
@@ -214,7 +216,7 @@ class DirectionalVoxels:
         self.objects.groups.reset(self.objects.store)
         if self._bounces > 0:
             self._group.run(
-                self.objects.store, self.objects.groups, self.objects.volume.bindings, has_seen=False
+                self.objects.store, self.objects.groups, self.objects.volume.bindings, is_lit=False
             )
         return self.objects
 
@@ -226,6 +228,12 @@ class DirectionalVoxels:
         self._resolve.resolve_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
         self._filter.run(self.rho, self.real.volume, self.real.store, self.objects.store)
 
+    def _find_tail(self, scene: Bindings) -> None:
+        """Finds what bounces change beyond those that were gathered."""
+        if self._bounces > 0:
+            real = self.real
+            self._tail.find(real.store, real.groups, self.mu, self.rho, scene, bounces=self._bounces)
+
     def march_bindings(self, cone_count: int) -> dict[str, Binding]:
         """Returns all bindings that march.glsl reads."""
         return {
@@ -235,6 +243,7 @@ class DirectionalVoxels:
             "mipmap_rho": self.rho.texture,
             "Occupied": self.rho.occupied,
             "cone_count": cone_count,
+            "bounce_tail": self._tail.irradiance,
         }
 
     def release(self) -> None:
@@ -248,6 +257,7 @@ class DirectionalVoxels:
             self._light,
             self._group,
             self._gather,
+            self._tail,
             self._resolve,
             self._filter,
             self._occupy,
@@ -256,11 +266,12 @@ class DirectionalVoxels:
 
 @dataclass(frozen=True, eq=False)
 class LitVoxels:
-    """The voxels of both geometries with the light of rho, and the bounds of those whose light objects change."""
+    """Voxels of both geometries with the light of rho, the bounds of what objects change, and the bounces' tail."""
 
     real: VoxelSet
     objects: VoxelSet
     support: moderngl.Buffer
+    tail: BounceTail
 
 
 class DeltaVoxels(DirectionalVoxels):
@@ -305,7 +316,7 @@ class DeltaVoxels(DirectionalVoxels):
         if self._bounces == 0:
             return self.mu, voxels
         own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
-        self._group.run(store, groups, own, has_seen=True)
+        self._group.run(store, groups, own, is_lit=True)
         for _ in range(self._bounces):
             self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)}, only_unseen=True)
             self._light.light_real(store, own, groups, gathered=True)
@@ -329,11 +340,25 @@ class DeltaVoxels(DirectionalVoxels):
     def light_joint(
         self, real: VoxelSet, voxels: VoxelSet, objects: GeometryState, scene: Bindings
     ) -> LitVoxels:
-        """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
+        """Lights the objects' surfels, and changes the light of real ones by the objects' shadows.
+
+        With bounces, the light that both gather from mu is the first guess.
+        """
         voxels.forget_light()
         self._light.reset_support(object_voxels(objects, voxels.volume.placements))
-        self._light_rho(scene, gathered=False)
-        return LitVoxels(real, voxels, self._light.support)
+        if self._bounces > 0:
+            self._light_by_mu(scene)
+        else:
+            self._light_rho(scene, gathered=False)
+        return LitVoxels(real, voxels, self._light.support, self._tail)
+
+    def _light_by_mu(self, scene: Bindings) -> None:
+        real, objects, light = self.real, self.objects, self._light
+        light.light_virtual(objects.store, scene, objects.groups)
+        light.keep_direct(real.store, scene, real.groups)
+        self._gather.gather(objects.store, objects.groups, self.mu, {**scene, **self.march_bindings(1)})
+        light.light_virtual(objects.store, scene, objects.groups, gathered=True)
+        light.light_real_delta(real.store, scene, real.groups, gathered=True, from_mu=True)
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         self._light.light_virtual(self.objects.store, scene, self.objects.groups, gathered=gathered)
@@ -348,13 +373,14 @@ class DeltaVoxels(DirectionalVoxels):
     def bounce_joint(
         self, lit: LitVoxels, _rho: VoxelMipmap, scene: Bindings
     ) -> tuple[VoxelMipmap, LitVoxels]:
-        """Gathers light from rho, and relights the objects and the change of real surfaces with it."""
+        """Gathers light from rho, relights the objects and what real surfaces change with it; finds the tail."""
+        marching = {**scene, **self.march_bindings(1)}
         for _ in range(self._bounces):
-            marching = {**scene, **self.march_bindings(1)}
             self._gather.gather_change(self.real.store, self.real.groups, self.mu, self.rho, marching)
             self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_rho(scene, gathered=True)
             self._filter_rho()
+        self._find_tail(marching)
         return self.rho, lit
 
 

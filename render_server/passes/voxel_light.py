@@ -10,7 +10,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32
 
-from deltalight.render_server.gpu.clearing import clear_buffer
+from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
@@ -18,6 +18,7 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.volumes import MOST_VOLUMES
 from deltalight.render_server.passes.voxels import (
+    DIRECTIONS,
     LOWER_SURFELS,
     LOWER_VOLUME,
     VoxelMipmap,
@@ -29,10 +30,14 @@ from deltalight.render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
 SUPPORT_BYTES = 24 * MOST_VOLUMES
 
 SURFEL_LIGHT_BYTES = 2 * 48  # front and back
-GROUP_SUMS_BYTES = 32
+GROUP_SUMS_BYTES = 40
 GROUP_LIGHT_BYTES = 32
 HEADER_BYTES = 4
 NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
+
+# Of shaders/common/bounce_tail.glsl: cells along an edge of a volume, and their sums.
+TAIL_CELLS = 8
+TAIL_SUMS_BYTES = DIRECTIONS * TAIL_CELLS**3 * 8 * 4
 
 GATHER_CONES = 4  # as good as 16 in pictures: cones that see gathered light average over many groups
 # In software, per 64 voxels of edge: lists are short, and more walkers would mostly idle in the last round. Groups
@@ -131,11 +136,25 @@ class LightVoxels:
         self._run("REAL", store, groups, scene, gathered=gathered)
 
     def light_real_delta(
-        self, store: VoxelStore, scene: Bindings, groups: SurfelGroups, *, gathered: bool = False
+        self,
+        store: VoxelStore,
+        scene: Bindings,
+        groups: SurfelGroups,
+        *,
+        gathered: bool = False,
+        from_mu: bool = False,
     ) -> None:
-        """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support."""
+        """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support.
+
+        `from_mu`: the gathered light is that of mu in both.
+        """
         clear_buffer(self._gpu, store.delta_sums)
-        self._run("REAL_DELTA", store, groups, scene, gathered=gathered)
+        own: Bindings = {"adds": True, "from_mu": from_mu}
+        self._run("REAL_DELTA", store, groups, {**scene, **own}, gathered=gathered)
+
+    def keep_direct(self, store: VoxelStore, scene: Bindings, groups: SurfelGroups) -> None:
+        """Keeps the direct light on real surfaces with the objects, for sums with gathered light."""
+        self._run("REAL_DELTA", store, groups, {**scene, "adds": False}, gathered=False)
 
     def light_virtual(
         self,
@@ -203,15 +222,37 @@ class GroupSurfels:
         self._find = Kernel(gpu, "group_surfels")
         self._sum = Kernel(gpu, "group_surfels", SUM=1)
 
-    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
-        """Fills `groups` (after their `reset`); with `has_seen`, its surfel lights mark what the camera sees."""
+    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, is_lit: bool) -> None:
+        """Fills `groups` (after their `reset`); `is_lit`: its surfel lights hold those that `LightVoxels` kept."""
         self._find.run((self._threads,), store.bindings, groups.bindings, scene)
-        self._sum.run((self._threads,), store.bindings, groups.bindings, scene, has_seen=has_seen)
+        self._sum.run((self._threads,), store.bindings, groups.bindings, scene, is_lit=is_lit)
 
     def release(self) -> None:
         """Frees the programs."""
         self._find.release()
         self._sum.release()
+
+
+def gather_threads(gpu: GpuContext, store: VoxelStore) -> int:
+    """Returns the number of threads that walk the groups of a store's surfels."""
+    if not gpu.is_software:
+        return list_threads(gpu)
+    edge = store.volume_size / 64
+    return max(SOFTWARE_WALKERS, round(SOFTWARE_WALKERS * edge * edge)) * store.volume_count
+
+
+def gather_bindings(
+    store: VoxelStore, groups: SurfelGroups, mu: VoxelMipmap, rho: VoxelMipmap
+) -> dict[str, Binding]:
+    """Returns what all kernels of gather_voxels read; it comes before the scene, whose cones are others."""
+    return {
+        **store.bindings,
+        **groups.bindings,
+        "mipmap_mu": mu.texture,
+        "mipmap_rho": rho.texture,
+        "Occupied": rho.occupied,
+        "cone_count": GATHER_CONES,
+    }
 
 
 class GatherVoxels:
@@ -254,26 +295,48 @@ class GatherVoxels:
         mipmaps: tuple[VoxelMipmap, VoxelMipmap],
         scene: Bindings,
     ) -> None:
-        kernel.run(
-            (self._threads(store),),
-            store.bindings,
-            groups.bindings,
-            scene,
-            mipmap_mu=mipmaps[0].texture,
-            mipmap_rho=mipmaps[1].texture,
-            Occupied=mipmaps[1].occupied,
-            cone_count=GATHER_CONES,
-        )
-
-    def _threads(self, store: VoxelStore) -> int:
-        if not self._gpu.is_software:
-            return list_threads(self._gpu)
-        edge = store.volume_size / 64
-        return max(SOFTWARE_WALKERS, round(SOFTWARE_WALKERS * edge * edge)) * store.volume_count
+        kernel.run((gather_threads(self._gpu, store),), gather_bindings(store, groups, *mipmaps), scene)
 
     def release(self) -> None:
         """Frees the programs."""
         release_all(self._whole, self._change)
+
+
+class BounceTail:
+    """What further bounces than those that the voxels hold change on real surfaces (docs/method.md 4.3).
+
+    Irradiance in cells of a coarse grid of each volume (shaders/common/bounce_tail.glsl); zero until it is found.
+    """
+
+    def __init__(self, gpu: GpuContext, defines: Mapping[str, int]) -> None:
+        self._gpu = gpu
+        self._sums = gpu.ctx.buffer(bytes(MOST_VOLUMES * TAIL_SUMS_BYTES))
+        shape = MOST_VOLUMES * TAIL_CELLS, TAIL_CELLS, DIRECTIONS * TAIL_CELLS
+        self.irradiance = gpu.ctx.texture3d(shape, 4, dtype="f2")
+        self.irradiance.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        clear_volume(gpu, self.irradiance)
+        self._gather = Kernel(gpu, "gather_voxels", TAIL=1, **defines)
+        self._sum = Kernel(gpu, "bounce_tail")
+
+    def find(
+        self,
+        store: VoxelStore,
+        groups: SurfelGroups,
+        mu: VoxelMipmap,
+        rho: VoxelMipmap,
+        scene: Bindings,
+        *,
+        bounces: int,
+    ) -> None:
+        """Finds it from what one more gathering from `rho` would add to what `groups` hold after `bounces`."""
+        gathered = {**gather_bindings(store, groups, mu, rho), "only_unseen": False}
+        self._gather.run((gather_threads(self._gpu, store),), gathered, scene, TailSums=self._sums)
+        threads = store.volume_count * self._sum.local_size[0]
+        self._sum.run((threads,), TailSums=self._sums, bounce_tail=self.irradiance, bounces=bounces)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._sums, self.irradiance, self._gather, self._sum)
 
 
 class AlbedoTexture:

@@ -308,9 +308,7 @@ class FilterVoxels:
                 first_level=first,
             )
 
-    def _filter_listed(
-        self, mipmap: VoxelMipmap, volume: PlacedVolume, stores: Sequence[VoxelStore]
-    ) -> int:
+    def _filter_listed(self, mipmap: VoxelMipmap, volume: PlacedVolume, stores: Sequence[VoxelStore]) -> int:
         """Filters the levels where walking the voxels' list is faster; returns how many."""
         if self._listed is None or not stores:
             return 0

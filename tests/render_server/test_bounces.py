@@ -1,5 +1,7 @@
 """Light gathered from voxel to voxel, against closed forms (docs/method.md 4.3)."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +9,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.voxel_light import BounceTail
 from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
@@ -25,6 +28,7 @@ from tests.render_server.scenes import (
     plain,
     shifted,
     solve,
+    sphere_light,
 )
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -168,3 +172,53 @@ def test_gathered_light_follows_a_moving_object(gpu: GpuContext, stage: Stage) -
     assert np.array_equal(found.on_object, fresh.on_object)
     assert color.any()
     renderer.release()
+
+
+def light_taken(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> float:
+    """Share of the light of cones on real surfaces that the objects take."""
+    found = solve(gpu, document, view)
+    real = (found.matte == 0) & (found.fade == 1)
+    return float(1 - found.cones_rho[real].sum() / found.cones_mu[real].sum())
+
+
+@contextmanager
+def no_tail() -> Iterator[None]:
+    """Light of the bounces that are gathered, alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BounceTail, "find", lambda *_, **_given: None)
+        yield
+
+
+def in_a_niche(gpu: GpuContext, stage: Stage, bounces: int) -> float:
+    """What a black cube takes in a niche, of whose walls the camera sees all and measures the light."""
+    niche = shifted(trimesh.creation.box((0.6, 0.56, 0.64)), 0.003, 0.002, 0.005)
+    niche.invert()
+    niche.update_faces(niche.face_normals[:, 1] < 0.5)  # open towards -y
+    lamp, objects = sphere_light((0.05, -0.6, 0.2), 1.0), [stage.virtual(cube(0.16), (0.0,) * 3)]
+    inside = frame(plain(), pose=look_at((0.0, -0.75, 0.03), (0.0, 0.3, 0.0)))
+    return light_taken(gpu, stage.document(objects, [lamp], niche, **settings(bounces)), inside)
+
+
+@pytest.mark.parametrize("bounces", [1, 2])
+def test_the_tail_stands_for_further_gatherings(gpu: GpuContext, stage: Stage, bounces: int) -> None:
+    found, many = in_a_niche(gpu, stage, bounces), in_a_niche(gpu, stage, 4)
+    print(f"{bounces} bounces: {found:.4f} of the light is taken, with four {many:.4f}")
+    assert found == pytest.approx(many, rel=0.03)
+
+
+def test_without_the_tail_a_bounce_takes_much_less_than_four(gpu: GpuContext, stage: Stage) -> None:
+    with no_tail():
+        assert in_a_niche(gpu, stage, 1) < 0.85 * in_a_niche(gpu, stage, 4)
+
+
+def on_a_floor(gpu: GpuContext, stage: Stage) -> NDArray[np.float64]:
+    objects, lights = [stage.virtual(cube(0.16), (0.7,) * 3)], [sphere_light((0.4, -0.3, 0.8)), ambient(0.2)]
+    return solve(gpu, stage.document(objects, lights, floor(), **settings(1))).cones_rho
+
+
+def test_a_floor_sends_itself_nothing_back(gpu: GpuContext, stage: Stage) -> None:
+    """It has no tail: whatever the object changes, the bits are those without."""
+    found = on_a_floor(gpu, stage)
+    with no_tail():
+        alone = on_a_floor(gpu, stage)
+    assert np.array_equal(found, alone)

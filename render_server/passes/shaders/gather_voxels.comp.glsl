@@ -1,6 +1,9 @@
 // Irradiance of each group of surfels by a few cones through one mipmap (docs/method.md 4.3, further bounces): the light of
 // other surfaces, and of the environment where nothing is in front of it. CHANGE: E_rho from E_mu, by the cones that may meet the
-// objects' changes.
+// objects' changes. TAIL: what one more such gathering would add, for some groups of each cell of bounce_tail.glsl.
+#if !defined(CHANGE) && !defined(TAIL)
+#define KEEPS_COVERAGE
+#endif
 #include "common/march.glsl"
 #include "common/walk.glsl"
 #include "common/environment.glsl"
@@ -23,6 +26,47 @@ const vec3 TURN_OF_BLOCK = vec3(0.8191725, 0.6710436, 0.5497005);   // of a full
 
 vec3 sums_at(int at) { return vec3(group_sums[at], group_sums[at + 1], group_sums[at + 2]); }
 
+#ifdef TAIL
+#include "common/bounce_tail.glsl"
+layout(std430) buffer TailSums { int tail_sums[]; };
+const float WHITEST = 0.95;   // as in light_voxels
+const int SAMPLED = 2;   // groups along each side of a cell
+
+// Groups on a lattice across their main axis stand for all: what is summed is smooth.
+bool is_sampled(uint slot) {
+    uint entry = group_entries[slot];
+    int axis = int(entry % 6u) / 2, apart = max(volume_size / (2 * TAIL_CELLS * SAMPLED), 1);
+    ivec3 block = ivec3(block_corner(entry)) / 2;
+    return block[(axis + 1) % 3] % apart == 0 && block[(axis + 2) % 3] % apart == 0;
+}
+
+// Albedo of a group: its radiance over all irradiance, that of the lights and what it `gathered` (luminance).
+float albedo_of(int slot, float area, vec3 gathered) {
+    ivec2 sums = ivec2(group_sums[slot * GROUP_SUMS + GROUP_RADIANCE], group_sums[slot * GROUP_SUMS + GROUP_DIRECT]);
+    vec2 light = vec2(sums) * (FIXED_POINT / (LIGHT_FIXED_POINT * area));
+    return min(PI * light.x / max(light.y + dot(gathered, LUMINANCE), 1e-6), WHITEST);
+}
+
+// `so_far`: change of a group's irradiance; `next`: what one more bounce adds to it; `returned`: albedo times near_coverage.
+void add_to_tail(vec3 corner, int k, float area, vec3 so_far, vec3 next, float returned) {
+    float edge = float(volume_size) / float(TAIL_CELLS);
+    vec2 amounts = vec2(dot(abs(so_far), LUMINANCE), dot(abs(next), LUMINANCE)), back = returned * amounts;
+    float values[TAIL_SUMS] = float[](next.r, next.g, next.b, 1.0, amounts.x, amounts.y, back.x, back.y);
+    float weight = area / (FIXED_POINT * edge * edge) * TAIL_FIXED_POINT;
+    int at = TAIL_SUMS * (volume * TAIL_PLACES + tail_place(ivec3(corner / edge), k));
+    for (int j = 0; j < TAIL_SUMS; ++j) atomicAdd(tail_sums[at + j], int(round(weight * values[j])));
+}
+#else
+bool is_sampled(uint slot) { return true; }
+#endif
+
+void forget(int slot) {
+#ifndef TAIL
+    if (!keeps_mu) group_light[2 * slot] = vec4(0.0);
+    group_light[2 * slot + 1] = vec4(0.0);
+#endif
+}
+
 void gather(int slot) {
     int at = slot * GROUP_SUMS;
     if (only_unseen && group_sums[at + GROUP_UNSEEN] == 0) return;
@@ -30,8 +74,7 @@ void gather(int slot) {
     float area = max(float(group_sums[at + GROUP_AREA]), 1.0);
     vec3 sum = sums_at(at + GROUP_NORMAL);
     if (sum == vec3(0.0)) {
-        if (!keeps_mu) group_light[2 * slot] = vec4(0.0);
-        group_light[2 * slot + 1] = vec4(0.0);
+        forget(slot);
         return;
     }
     vec3 n = normalize(sum);
@@ -39,17 +82,35 @@ void gather(int slot) {
     vec3 q = corner + sums_at(at + GROUP_PLACE) / area;
     float turn = 2.0 * PI * fract(dot(0.5 * corner, TURN_OF_BLOCK));
     ConeSet cones = ConeSet(1, 0, WIDTH, turn);
-#ifdef CHANGE
-    vec3 e_rho = group_light[2 * slot].rgb + diffuse_change(q, n, cones);
+#ifdef TAIL
+    vec4 mu = group_light[2 * slot];
+    vec3 so_far = group_light[2 * slot + 1].rgb - mu.rgb;
+    vec3 next = diffuse_change(q, n, cones) - so_far;
+    add_to_tail(corner, main_axis(n), area, so_far, next, mu.a * albedo_of(slot, area, mu.rgb));
+#elif defined(CHANGE)
+    group_light[2 * slot + 1] = vec4(group_light[2 * slot].rgb + diffuse_change(q, n, cones), 0.0);
 #else
     vec3 e_mu, e_rho;
     diffuse(q, n, cones, true, e_mu, e_rho);
-    if (!keeps_mu) group_light[2 * slot] = vec4(e_mu, 0.0);
-#endif
+    if (!keeps_mu) group_light[2 * slot] = vec4(e_mu, near_coverage);
     group_light[2 * slot + 1] = vec4(e_rho, 0.0);
+#endif
+}
+
+// Lanes of a processor look for groups in a loop of their own, and gather together.
+bool find_group(inout uint i, uint count) {
+    bool found = false;
+    if (i < count) do {
+        found = is_sampled(i);
+        if (!found) i += items_apart();
+    } while (i < count && !found);
+    return found;
 }
 
 void main() {
     uint count = groups_held(), i = first_item();
-    if (i < count) do gather(int(i)); while ((i += items_apart()) < count);
+    if (find_group(i, count)) do {
+        gather(int(i));
+        i += items_apart();
+    } while (find_group(i, count));
 }

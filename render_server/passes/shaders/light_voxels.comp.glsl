@@ -47,6 +47,7 @@ const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no su
 #ifdef REAL_DELTA
 layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 per slot
 layout(std430) buffer Support { int support[]; };        // of each volume, bounds of changed voxels: min xyz, -max xyz
+uniform bool adds;            // or only keeps the direct light
 #endif
 
 #ifdef GATHERED
@@ -54,12 +55,18 @@ layout(std430) buffer Support { int support[]; };        // of each volume, boun
 #define GROUP_ENTRIES_ACCESS readonly
 #define GROUP_LIGHT_ACCESS readonly
 #include "common/surfel_groups.glsl"
+#ifdef REAL_DELTA
+uniform bool from_mu;         // nothing was gathered from rho yet: what was from mu is the first guess
+#define GATHERED_RHO (from_mu ? 0 : 1)
+#else
+const int GATHERED_RHO = 1;
+#endif
 
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     int slot = group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n));
     vec3 ambient = environment_irradiance(n);
     mu = surfel_lights[own].direct_mu.rgb + (slot < 0 ? ambient : group_light[2 * slot].rgb);
-    rho = surfel_lights[own].direct_rho.rgb + (slot < 0 ? ambient : group_light[2 * slot + 1].rgb);
+    rho = surfel_lights[own].direct_rho.rgb + (slot < 0 ? ambient : group_light[2 * slot + GATHERED_RHO].rgb);
 }
 #else
 #ifdef VIRTUAL
@@ -179,7 +186,9 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     bool seen = camera_sees(p, n);
     vec3 back = unseen_albedo(p) / PI;
     vec3 radiance = seen ? measured_radiance(p) : back * mu;
-#ifdef REAL_RHO
+#ifdef REAL_MU
+    if (keep_light) surfel_lights[own].radiance = vec4(radiance, float(seen));
+#else
     if (seen) back = radiance / (mu + 1e-6);
     radiance += change_of(back, mu, rho);
 #endif
@@ -211,6 +220,7 @@ void light(Surfel s, uint own, vec3 n) {
     if (radiance == vec3(0.0)) return;
 #endif
 #ifdef REAL_DELTA
+    if (!adds) return;
     int held = 6 * volume;
     for (int j = 0; j < 3; ++j) { atomicMin(support[held + j], v[j]); atomicMin(support[held + 3 + j], -v[j]); }
 #endif

@@ -16,6 +16,16 @@ layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 w
 #endif
 #ifdef REAL
 layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mean radiance of the specular cone
+#define READS_TAIL
+#include "common/bounce_tail.glsl"
+const float LEAST_CHANGE = 1.0 / 512.0;   // as in light_voxels: where less changes, mu and rho stay equal
+
+vec3 with_further_bounces(vec3 e_mu, vec3 e_rho, vec3 q, vec3 n) {
+    if (!inside_volume(q)) return e_rho;
+    vec3 further = tail_irradiance(q, n);
+    bool seen = any(greaterThan(abs(further), LEAST_CHANGE * e_mu));
+    return seen ? max(e_rho + further, vec3(0.0)) : e_rho;
+}
 #endif
 layout(rgba16f) writeonly uniform image2D specular_rho;
 #include "common/camera.glsl"
@@ -64,6 +74,7 @@ void trace(ivec2 texel) {
     vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
 #ifdef REAL
     diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
+    e_rho = with_further_bounces(e_mu, e_rho, q, s.normal);
 #else
     if (is_fresh(texel)) diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
 #endif

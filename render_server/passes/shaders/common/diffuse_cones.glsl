@@ -67,6 +67,10 @@ vec3 diffuse_change(vec3 q, vec3 n, ConeSet set) {
     return change * PI / float(cone_count);
 }
 
+#ifdef KEEPS_COVERAGE
+float near_coverage;   // of `diffuse`: share of the hemisphere, by cosine, where surfaces of the volume are
+#endif
+
 // Irradiance without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not occlude
 // their own surface. `only_rho` skips mu.
 void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
@@ -75,6 +79,9 @@ void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3
     mat3 basis = basis_around(n);
     e_mu = vec3(0.0);
     e_rho = vec3(0.0);
+#ifdef KEEPS_COVERAGE
+    near_coverage = 0.0;
+#endif
     int k = 0;
     do {   // a loop that tests at its end: march.glsl
         vec3 d = basis * cone_direction(k, set);
@@ -82,6 +89,9 @@ void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3
         vec3 r = environment(d, half_angle);
         e_mu += m.c_mu + m.t_mu * r;
         e_rho += m.c_rho + m.t_rho * r;
+#ifdef KEEPS_COVERAGE
+        near_coverage += near_blocked / float(cone_count);
+#endif
     } while (++k < cone_count);
     e_mu *= PI / float(cone_count);
     e_rho *= PI / float(cone_count);

@@ -32,6 +32,10 @@ const float WALL = 0.5;
 
 struct March { vec3 c_mu; float t_mu; vec3 c_rho; float t_rho; };
 
+#ifdef KEEPS_COVERAGE
+float near_blocked;   // of the last march, the fraction of the cone that ended in the volume where it began
+#endif
+
 struct Crossed { vec3 c; float coverage; };   // radiance gathered, coverage met so far
 
 float blocked_fraction(float coverage) {
@@ -236,6 +240,9 @@ Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differ
         float start = crossed == 0u ? 0.0 : t / voxel_edge + 1.0;   // whose first sample lies inside
         crossed |= 1u << volume;
         t = voxel_edge * (start + march_near(mipmap, volume_coordinate(from) + start * d, d, start, ratio, sum, differs));
+#ifdef KEEPS_COVERAGE
+        if (start == 0.0) near_blocked = blocked_fraction(sum.coverage);
+#endif
         float skip = t > 0.0 ? 0.0 : 1.5;   // as below
         float next = t > 0.0 ? enter_next(from, d, t, crossed) : ENDLESS;
         vec3 leave = (from + t * d - far_origin) / far_edge + skip * d;
@@ -252,6 +259,9 @@ Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differ
     Crossed sum = Crossed(vec3(0.0), 0.0);
     differs = false;
     float t = march_near(mipmap, q, d, 0.0, ratio, sum, differs);
+#ifdef KEEPS_COVERAGE
+    near_blocked = blocked_fraction(sum.coverage);
+#endif
     if (far_size > 0 && sum.coverage < WALL) {
         vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
         // A surface that starts the march outside of the volume must not hit its own coarse voxels.

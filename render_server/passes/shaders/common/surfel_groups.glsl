@@ -4,11 +4,15 @@
 layout(std430) GROUP_SUMS_ACCESS buffer GroupSums { int group_sums[]; };       // GROUP_SUMS a slot
 #endif
 #ifdef GROUP_LIGHT_ACCESS
-layout(std430) GROUP_LIGHT_ACCESS buffer GroupLight { vec4 group_light[]; };   // a slot: irradiance of mu, of rho
+layout(std430) GROUP_LIGHT_ACCESS buffer GroupLight { vec4 group_light[]; };   // a slot: irradiance of mu and
+// near_coverage (diffuse_cones.glsl), irradiance of rho
 #endif
 
 const int GROUP_AREA = 0, GROUP_UNSEEN = 1, GROUP_NORMAL = 2, GROUP_PLACE = 5;   // all weighted by area / h^2
-const int GROUP_SUMS = 8;
+const int GROUP_DIRECT = 8, GROUP_RADIANCE = 9;   // luminance: the lights' irradiance without the objects, L_mu
+const int GROUP_SUMS = 10;
+const float LIGHT_FIXED_POINT = 1024.0;   // of these two: sums up to 2e6
+const vec3 LUMINANCE = vec3(0.2126, 0.7152, 0.0722);
 
 int main_axis(vec3 n) {
     vec3 a = abs(n);
