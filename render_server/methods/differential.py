@@ -64,8 +64,10 @@ class SolutionVoxels(DirectionalVoxels):
     """
 
     def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
-        """Makes room for the light of the real surfels after voxelisation."""
+        """Groups the surfels of both sets after voxelisation."""
         real.groups.reset(real.store)
+        if self._bounces > 0:
+            self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
         return real, objects
 
     def mu_scene(
@@ -98,8 +100,6 @@ class SolutionVoxels(DirectionalVoxels):
         self._light_rho(rho, gathered=False)
         if self._bounces > 0:
             marching = {**mu, **self.march_bindings(1)}
-            self.real.groups.reset(self.real.store)
-            self._group.run(self.real.store, self.real.groups, self.real.volume.bindings, is_lit=True)
             for each in (self.real, self.objects):
                 self._gather.gather(each.store, each.groups, self.mu, marching)
             self._light_rho(rho, gathered=True)

@@ -216,7 +216,7 @@ class DirectionalVoxels:
         self.objects.groups.reset(self.objects.store)
         if self._bounces > 0:
             self._group.run(
-                self.objects.store, self.objects.groups, self.objects.volume.bindings, is_lit=False
+                self.objects.store, self.objects.groups, self.objects.volume.bindings, has_seen=False
             )
         return self.objects
 
@@ -232,7 +232,7 @@ class DirectionalVoxels:
         """Finds what bounces change beyond those that were gathered."""
         if self._bounces > 0:
             real = self.real
-            self._tail.find(real.store, real.groups, self.mu, self.rho, scene, bounces=self._bounces)
+            self._tail.find(real.store, real.groups, self.mu, self.rho, scene)
 
     def march_bindings(self, cone_count: int) -> dict[str, Binding]:
         """Returns all bindings that march.glsl reads."""
@@ -316,7 +316,7 @@ class DeltaVoxels(DirectionalVoxels):
         if self._bounces == 0:
             return self.mu, voxels
         own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
-        self._group.run(store, groups, own, is_lit=True)
+        self._group.run(store, groups, own, has_seen=True)
         for _ in range(self._bounces):
             self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)}, only_unseen=True)
             self._light.light_real(store, own, groups, gathered=True)

@@ -37,7 +37,7 @@ NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
 
 # Of shaders/common/bounce_tail.glsl: cells along an edge of a volume, and their sums.
 TAIL_CELLS = 8
-TAIL_SUMS_BYTES = DIRECTIONS * TAIL_CELLS**3 * 8 * 4
+TAIL_SUMS_BYTES = DIRECTIONS * TAIL_CELLS**3 * 6 * 4
 
 GATHER_CONES = 4  # as good as 16 in pictures: cones that see gathered light average over many groups
 # In software, per 64 voxels of edge: lists are short, and more walkers would mostly idle in the last round. Groups
@@ -222,10 +222,10 @@ class GroupSurfels:
         self._find = Kernel(gpu, "group_surfels")
         self._sum = Kernel(gpu, "group_surfels", SUM=1)
 
-    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, is_lit: bool) -> None:
-        """Fills `groups` (after their `reset`); `is_lit`: its surfel lights hold those that `LightVoxels` kept."""
+    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
+        """Fills `groups` (after their `reset`); with `has_seen`, its surfel lights mark what the camera sees."""
         self._find.run((self._threads,), store.bindings, groups.bindings, scene)
-        self._sum.run((self._threads,), store.bindings, groups.bindings, scene, is_lit=is_lit)
+        self._sum.run((self._threads,), store.bindings, groups.bindings, scene, has_seen=has_seen)
 
     def release(self) -> None:
         """Frees the programs."""
@@ -325,14 +325,12 @@ class BounceTail:
         mu: VoxelMipmap,
         rho: VoxelMipmap,
         scene: Bindings,
-        *,
-        bounces: int,
     ) -> None:
-        """Finds it from what one more gathering from `rho` would add to what `groups` hold after `bounces`."""
+        """Finds it from what one more gathering from `rho` would add to what `groups` hold."""
         gathered = {**gather_bindings(store, groups, mu, rho), "only_unseen": False}
         self._gather.run((gather_threads(self._gpu, store),), gathered, scene, TailSums=self._sums)
         threads = store.volume_count * self._sum.local_size[0]
-        self._sum.run((threads,), TailSums=self._sums, bounce_tail=self.irradiance, bounces=bounces)
+        self._sum.run((threads,), TailSums=self._sums, bounce_tail=self.irradiance)
 
     def release(self) -> None:
         """Frees the GL objects."""

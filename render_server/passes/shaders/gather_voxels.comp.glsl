@@ -10,7 +10,11 @@
 #include "common/diffuse_cones.glsl"
 #include "common/voxel_store.glsl"
 #define GROUP_ENTRIES_ACCESS readonly
+#ifdef TAIL
+#define GROUP_SUMS_ACCESS
+#else
 #define GROUP_SUMS_ACCESS readonly
+#endif
 #define GROUP_LIGHT_ACCESS
 #include "common/surfel_groups.glsl"
 
@@ -40,18 +44,17 @@ bool is_sampled(uint slot) {
     return block[(axis + 1) % 3] % apart == 0 && block[(axis + 2) % 3] % apart == 0;
 }
 
-// Albedo of a group: its radiance over all irradiance, that of the lights and what it `gathered` (luminance).
-float albedo_of(int slot, float area, vec3 gathered) {
-    ivec2 sums = ivec2(group_sums[slot * GROUP_SUMS + GROUP_RADIANCE], group_sums[slot * GROUP_SUMS + GROUP_DIRECT]);
-    vec2 light = vec2(sums) * (FIXED_POINT / (LIGHT_FIXED_POINT * area));
-    return min(PI * light.x / max(light.y + dot(gathered, LUMINANCE), 1e-6), WHITEST);
+// Albedo of a group (luminance), by sums of light_voxels that begin anew.
+float take_albedo(int slot) {
+    int at = slot * GROUP_SUMS, radiance = group_sums[at + GROUP_RADIANCE], irradiance = group_sums[at + GROUP_IRRADIANCE];
+    group_sums[at + GROUP_RADIANCE] = group_sums[at + GROUP_IRRADIANCE] = 0;
+    return min(PI * float(radiance) / float(max(irradiance, 1)), WHITEST);
 }
 
-// `so_far`: change of a group's irradiance; `next`: what one more bounce adds to it; `returned`: albedo times near_coverage.
-void add_to_tail(vec3 corner, int k, float area, vec3 so_far, vec3 next, float returned) {
-    float edge = float(volume_size) / float(TAIL_CELLS);
-    vec2 amounts = vec2(dot(abs(so_far), LUMINANCE), dot(abs(next), LUMINANCE)), back = returned * amounts;
-    float values[TAIL_SUMS] = float[](next.r, next.g, next.b, 1.0, amounts.x, amounts.y, back.x, back.y);
+// `next`: what one more bounce adds to a group's irradiance; `returned`: which share comes back to surfaces.
+void add_to_tail(vec3 corner, int k, float area, vec3 next, float returned) {
+    float edge = float(volume_size) / float(TAIL_CELLS), amount = dot(abs(next), LUMINANCE);
+    float values[TAIL_SUMS] = float[](next.r, next.g, next.b, 1.0, amount, amount * returned);
     float weight = area / (FIXED_POINT * edge * edge) * TAIL_FIXED_POINT;
     int at = TAIL_SUMS * (volume * TAIL_PLACES + tail_place(ivec3(corner / edge), k));
     for (int j = 0; j < TAIL_SUMS; ++j) atomicAdd(tail_sums[at + j], int(round(weight * values[j])));
@@ -84,9 +87,8 @@ void gather(int slot) {
     ConeSet cones = ConeSet(1, 0, WIDTH, turn);
 #ifdef TAIL
     vec4 mu = group_light[2 * slot];
-    vec3 so_far = group_light[2 * slot + 1].rgb - mu.rgb;
-    vec3 next = diffuse_change(q, n, cones) - so_far;
-    add_to_tail(corner, main_axis(n), area, so_far, next, mu.a * albedo_of(slot, area, mu.rgb));
+    vec3 next = mu.rgb + diffuse_change(q, n, cones) - group_light[2 * slot + 1].rgb;
+    add_to_tail(corner, main_axis(n), area, next, mu.a * take_albedo(slot));
 #elif defined(CHANGE)
     group_light[2 * slot + 1] = vec4(group_light[2 * slot].rgb + diffuse_change(q, n, cones), 0.0);
 #else

@@ -15,7 +15,7 @@
 layout(local_size_x = 64) in;
 
 #ifdef SUM
-uniform bool is_lit;    // SurfelLights holds the surfels' light, and marks those that the camera sees
+uniform bool has_seen;    // SurfelLights marks the surfels that the camera sees
 
 void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
     uint entry = group_entry(floatBitsToUint(s.uv_voxel.z), n);
@@ -29,12 +29,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
         atomicAdd(group_sums[at + GROUP_NORMAL + j], fixed_point(weight * n[j]));
         atomicAdd(group_sums[at + GROUP_PLACE + j], fixed_point(weight * place[j]));
     }
-    if (!is_lit) return;
-    SurfelLight light = surfel_lights[2u * surfel + uint(side)];
-    vec2 sums = weight * vec2(dot(light.direct_mu.rgb, LUMINANCE), dot(light.radiance.rgb, LUMINANCE));
-    atomicAdd(group_sums[at + GROUP_DIRECT], int(round(sums.x * LIGHT_FIXED_POINT)));
-    atomicAdd(group_sums[at + GROUP_RADIANCE], int(round(sums.y * LIGHT_FIXED_POINT)));
-    if (light.radiance.w > 0.5) return;
+    if (!has_seen || surfel_lights[2u * surfel + uint(side)].radiance.w > 0.5) return;
     atomicAdd(group_sums[at + GROUP_UNSEEN], 1);
 }
 #else

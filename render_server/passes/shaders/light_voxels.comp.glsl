@@ -52,8 +52,10 @@ uniform bool adds;            // or only keeps the direct light
 
 #ifdef GATHERED
 #define GROUP_GRID_ACCESS readonly
-#define GROUP_ENTRIES_ACCESS readonly
 #define GROUP_LIGHT_ACCESS readonly
+#if defined(REAL_DELTA) || defined(REAL_RHO)
+#define GROUP_SUMS_ACCESS
+#endif
 #include "common/surfel_groups.glsl"
 #ifdef REAL_DELTA
 uniform bool from_mu;         // nothing was gathered from rho yet: what was from mu is the first guess
@@ -179,6 +181,19 @@ vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
 }
 #endif
 
+#if defined(GATHERED) && defined(GROUP_SUMS_ACCESS)
+// Light of mu on a surfel, for its group's albedo.
+void add_to_group(Surfel s, vec3 n, vec3 mu, vec3 radiance) {
+    int slot = group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n));
+    if (slot < 0) return;
+    float scale = s.position_area.w / (voxel_edge * voxel_edge) * LIGHT_FIXED_POINT;
+    atomicAdd(group_sums[slot * GROUP_SUMS + GROUP_IRRADIANCE], int(round(scale * dot(mu, LUMINANCE))));
+    atomicAdd(group_sums[slot * GROUP_SUMS + GROUP_RADIANCE], int(round(scale * dot(radiance, LUMINANCE))));
+}
+#else
+void add_to_group(Surfel s, vec3 n, vec3 mu, vec3 radiance) {}
+#endif
+
 #ifdef SOLUTION
 vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 p = s.position_area.xyz, mu, rho;
@@ -186,9 +201,8 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     bool seen = camera_sees(p, n);
     vec3 back = unseen_albedo(p) / PI;
     vec3 radiance = seen ? measured_radiance(p) : back * mu;
-#ifdef REAL_MU
-    if (keep_light) surfel_lights[own].radiance = vec4(radiance, float(seen));
-#else
+    add_to_group(s, n, mu, radiance);
+#ifdef REAL_RHO
     if (seen) back = radiance / (mu + 1e-6);
     radiance += change_of(back, mu, rho);
 #endif
@@ -205,6 +219,7 @@ const float LEAST_CHANGE = 1.0 / 512.0;
 vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
+    add_to_group(s, n, mu, surfel_lights[own].radiance.rgb);
 #ifdef GATHERED
     if (all(lessThanEqual(abs(rho - mu), LEAST_CHANGE * max(mu, rho)))) return vec3(0.0);
 #endif

@@ -3,10 +3,10 @@
 const int TAIL_CELLS = 8;   // along each edge of a volume
 const float TAIL_FIXED_POINT = 1048576.0;   // as in voxel_store.glsl
 
-// Sums of a cell, weighted by area: what one more bounce adds to the irradiance; the area; and in luminance, without sign, (the
-// amount of all bounces so far, of the next one), and how much of both surfaces of the volume would get back from each other.
-const int TAIL_NEXT = 0, TAIL_AREA = 3, TAIL_AMOUNTS = 4, TAIL_RETURNED = 6;
-const int TAIL_SUMS = 8;
+// Sums of a cell, weighted by area: what one more bounce adds to the irradiance; the area; and in luminance, without sign, that
+// amount, and how much of it returns to surfaces of the volume when these have reflected it.
+const int TAIL_NEXT = 0, TAIL_AREA = 3, TAIL_AMOUNT = 4, TAIL_RETURNED = 5;
+const int TAIL_SUMS = 6;
 const int TAIL_PLACES = 6 * TAIL_CELLS * TAIL_CELLS * TAIL_CELLS;   // of a volume
 
 int tail_place(ivec3 cell, int k) { return ((k * TAIL_CELLS + cell.z) * TAIL_CELLS + cell.y) * TAIL_CELLS + cell.x; }

@@ -9,7 +9,7 @@ layout(std430) GROUP_LIGHT_ACCESS buffer GroupLight { vec4 group_light[]; };   /
 #endif
 
 const int GROUP_AREA = 0, GROUP_UNSEEN = 1, GROUP_NORMAL = 2, GROUP_PLACE = 5;   // all weighted by area / h^2
-const int GROUP_DIRECT = 8, GROUP_RADIANCE = 9;   // luminance: the lights' irradiance without the objects, L_mu
+const int GROUP_IRRADIANCE = 8, GROUP_RADIANCE = 9;   // luminance of mu, of all light
 const int GROUP_SUMS = 10;
 const float LIGHT_FIXED_POINT = 1024.0;   // of these two: sums up to 2e6
 const vec3 LUMINANCE = vec3(0.2126, 0.7152, 0.0722);
@@ -32,6 +32,8 @@ vec3 block_corner(uint entry) { return vec3(2 * enter_volume_of(entry / 6u, volu
 layout(std430) GROUP_ENTRIES_ACCESS buffer GroupEntries { uint group_count; uint group_entries[]; };
 
 uint groups_held() { return min(group_count, uint(group_entries.length())); }
+#elif defined(GROUP_LIGHT_ACCESS)
+uint groups_held() { return uint(group_light.length()) / 2u; }   // as many as there is room for: no less than there are
 #endif
 
 #ifdef GROUP_GRID_ACCESS
