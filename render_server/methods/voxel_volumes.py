@@ -50,6 +50,7 @@ from deltalight.render_server.passes.voxels import (
     ResolveVoxels,
     VoxelMipmap,
     VoxelStore,
+    bounce_tail_bytes,
     volume_memory_bytes,
 )
 
@@ -61,7 +62,7 @@ FAR_MARGIN = 1.05
 def sets_memory_mb(size: int, count: int) -> int:
     """Returns the memory of `count` volume sets of six directions and of the coarse one beyond, MB."""
     taken = 2 * count * volume_memory_bytes(size, DIRECTIONS) + volume_memory_bytes(FAR_SIZE, DIRECTIONS)
-    return math.ceil(taken / MEGABYTE)
+    return math.ceil((taken + bounce_tail_bytes()) / MEGABYTE)
 
 
 def affordable_size(size: int, count: int, budget_mb: int, gpu: GpuContext | None = None) -> int:

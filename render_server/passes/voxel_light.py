@@ -21,6 +21,7 @@ from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     LOWER_SURFELS,
     LOWER_VOLUME,
+    TAIL_CELLS,
     VoxelMipmap,
     VoxelStore,
     group_grid_bytes,
@@ -35,8 +36,7 @@ GROUP_LIGHT_BYTES = 32
 HEADER_BYTES = 4
 NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
 
-# Of shaders/common/bounce_tail.glsl: cells along an edge of a volume, and their sums.
-TAIL_CELLS = 8
+# Of shaders/common/bounce_tail.glsl: the sums of a volume.
 TAIL_SUMS_BYTES = DIRECTIONS * TAIL_CELLS**3 * 6 * 4
 
 GATHER_CONES = 4  # as good as 16 in pictures: cones that see gathered light average over many groups

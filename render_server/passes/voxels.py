@@ -12,10 +12,11 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.volumes import PlacedVolume
+from deltalight.render_server.passes.volumes import MOST_VOLUMES, PlacedVolume
 
 MEGABYTE = 1_000_000
 DIRECTIONS = 6  # of an anisotropic volume; isotropic ones have 1
+TAIL_CELLS = 8  # along an edge of a volume, of the bounces' tail (shaders/common/bounce_tail.glsl)
 
 SURFEL_BYTES = 64
 SUMS_PER_SLOT = 24
@@ -55,6 +56,11 @@ def group_grid_bytes(size: int) -> int:
     return DIRECTIONS * (size // 2) ** 3 * 4
 
 
+def bounce_tail_bytes() -> int:
+    """Returns the bytes of the bounces' tail, RGBA16F, which has room for the most volumes (BounceTail)."""
+    return MOST_VOLUMES * DIRECTIONS * TAIL_CELLS**3 * 8
+
+
 def memory_statement(size: int, directions: int, budget_mb: int, far_size: int = 0) -> str:
     """Returns a sentence that states the memory of a volume set: two mipmaps and two voxel sets.
 
@@ -64,6 +70,8 @@ def memory_statement(size: int, directions: int, budget_mb: int, far_size: int =
         DeltalightError: it exceeds the budget.
     """
     size_bytes = 2 * volume_memory_bytes(size, directions) + volume_memory_bytes(far_size, DIRECTIONS)
+    if directions == DIRECTIONS:
+        size_bytes += bounce_tail_bytes()
     needed = math.ceil(size_bytes / MEGABYTE)
     if needed > budget_mb:
         raise DeltalightError(

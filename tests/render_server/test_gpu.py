@@ -41,6 +41,7 @@ from deltalight.render_server.passes.voxels import (
     LEAST_SURFELS,
     VoxelMipmap,
     VoxelStore,
+    bounce_tail_bytes,
     memory_statement,
     mipmap_shape,
     volume_memory_bytes,
@@ -305,6 +306,7 @@ def test_the_stated_memory_is_what_is_allocated(
     sets = [voxels.real, voxels.objects, *([voxels.far._set] if far_size else [])]
     grids = [grid for each in sets for grid in (each.store.grid, each.groups._grid)]
     stated = 2 * volume_memory_bytes(size, directions) + volume_memory_bytes(far_size, 6)
+    stated += bounce_tail_bytes() if directions == 6 else 0
     mipmaps = [each for each in vars(voxels).values() if isinstance(each, VoxelMipmap)]
     occupied = [each.occupied for each in (*mipmaps, *([voxels.far.mipmap] if far_size else []))]
     assert sum(sizes_bytes([*large, *grids, *occupied])) == stated
