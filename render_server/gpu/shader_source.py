@@ -94,13 +94,16 @@ def _split(text: str) -> list[tuple[list[str], Path | None, int]]:
     maxsize=512
 )  # every shader of the project, in all its variants: renderers are made again and again
 def declarations(source: str) -> Declarations:
-    """What the text of a shader, with its defines, declares."""
+    """What the text of a shader, with its defines, declares.
+
+    Raises:
+        ValueError: conditions that are not computed leave several workgroup sizes.
+    """
     text = _COMMENT.sub(" ", source)
     whole = _declaring(text)
     names = {name for _, _, _, name in _variables(whole)} | {name for _, _, name in _BLOCK.findall(whole)}
     kept, macros = _kept(text)
     text = _expanded(_declaring(kept), macros)
-    sizes = {axis: int(size) for axis, size in _LOCAL_SIZE.findall(text)}
     switches = tuple(dict.fromkeys(_SWITCH.findall(kept)))
     names |= set(switches)
     formats: dict[str, frozenset[str]] = {}
@@ -111,8 +114,17 @@ def declarations(source: str) -> Declarations:
             written |= set() if "readonly" in access else {name}
     for access, kind, name in _BLOCK.findall(text):
         written |= {name} if kind == "buffer" and "readonly" not in access else set()
-    local_size = (sizes.get("x", 1), sizes.get("y", 1), sizes.get("z", 1))
-    return Declarations(frozenset(names), formats, frozenset(written), switches, local_size)
+    return Declarations(frozenset(names), formats, frozenset(written), switches, _local_size(text))
+
+
+def _local_size(text: str) -> tuple[int, int, int]:
+    found = set(_LOCAL_SIZE.findall(text))
+    sizes = {axis: int(size) for axis, size in found}
+    if len(found) > len(sizes):
+        raise ValueError(
+            "A shader declares several workgroup sizes; choose between them by #ifdef, not by #elif."
+        )
+    return sizes.get("x", 1), sizes.get("y", 1), sizes.get("z", 1)
 
 
 def _declaring(text: str) -> str:

@@ -204,13 +204,15 @@ class VoxelStore:
 
 
 class ClearVoxels:
-    """Clears the voxels that a set touched, instead of whole volumes: its slots and its texels of level 0."""
+    """Clears the voxels that a set touched, instead of whole volumes: its slots and its texels."""
 
     def __init__(self, gpu: GpuContext, mipmaps: Sequence[VoxelMipmap]) -> None:
         """`mipmaps`: one or two, of as many directions, in which the set's voxels have texels."""
         first, *second = self._mipmaps = mipmaps
         self._threads = list_threads(gpu)
         defines = {"DIRECTIONS": first.directions, **({"TWO": 1} if second else {})}
+        if gpu.is_software:  # FilterVoxels walks lists there
+            defines["LEVEL_1"] = 1
         self._kernel = Kernel(gpu, "clear_voxels", **defines)
 
     def run(self, store: VoxelStore, volume: PlacedVolume) -> None:

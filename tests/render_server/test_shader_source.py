@@ -1,5 +1,7 @@
 """What a shader's text declares, once its branches are resolved."""
 
+import pytest
+
 from deltalight.render_server.gpu.shader_source import declarations, preprocessed
 
 
@@ -65,3 +67,16 @@ def test_branches_nest_and_uncomputed_ones_stay() -> None:
         ]
     )
     assert preprocessed(text).split() == ["2", "5", "6", "7"]
+
+
+def test_a_workgroup_size_that_hangs_on_an_uncomputed_condition_is_refused() -> None:
+    """Taken from the wrong branch, it would dispatch a multiple of the workgroups, whose results are the same."""
+    size = "layout(local_size_x = {}, local_size_y = 4) in;"
+    source = "\n".join(
+        ["#ifdef B", size.format(1), "#elif defined(A)", size.format(8), "#else", size.format(4), "#endif"]
+    )
+    assert declarations(
+        "#define B\n" + source.replace("#elif defined(A)", "#else\n#ifdef A") + "\n#endif"
+    ).local_size == (1, 4, 1)
+    with pytest.raises(ValueError, match="several workgroup sizes"):
+        declarations("#define A\n" + source)

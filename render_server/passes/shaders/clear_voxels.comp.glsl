@@ -1,5 +1,5 @@
-// Empties the voxels that a set touched: its grid cells, and their texels in all directions of a mipmap or of two, with those
-// of level 1 above them, which filter_voxels may not visit again.
+// Empties the voxels that a set touched: its grid cells, and their texels in all directions of a mipmap or of two; with
+// LEVEL_1 also those above them, which filter_voxels does not visit again where it walks lists.
 #include "common/volume.glsl"
 #include "common/walk.glsl"
 #define GRID_ACCESS
@@ -12,16 +12,20 @@ layout(rgba16f) writeonly uniform image3D mipmap;
 layout(rgba16f) writeonly uniform image3D second;
 #endif
 
+void empty(ivec3 texel) {
+    imageStore(mipmap, texel, vec4(0.0));
+#ifdef TWO
+    imageStore(second, texel, vec4(0.0));
+#endif
+}
+
 void main() {
     for (uint i = first_item(); i < slot_count; i += items_apart()) {
         ivec3 v = enter_volume_of(touched[i], volume_size);
         for (int k = 0; k < DIRECTIONS; ++k) {
-            ivec3 texel = level_base(0, k) + v, above = level_base(1, k) + v / 2;
-            imageStore(mipmap, texel, vec4(0.0));
-            imageStore(mipmap, above, vec4(0.0));
-#ifdef TWO
-            imageStore(second, texel, vec4(0.0));
-            imageStore(second, above, vec4(0.0));
+            empty(level_base(0, k) + v);
+#ifdef LEVEL_1
+            empty(level_base(1, k) + v / 2);
 #endif
         }
         grid[touched[i]] = 0u;

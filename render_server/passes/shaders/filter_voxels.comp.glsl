@@ -13,7 +13,8 @@
 
 layout(local_size_x = 64) in;
 layout(rgba16f) uniform image3D mipmap;
-#elif defined(FUSED)
+#else
+#ifdef FUSED
 #include "common/occupancy.glsl"
 
 layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
@@ -24,9 +25,6 @@ const int TILE = 8;
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
 layout(rgba16f) uniform image3D mipmap;
 #endif
-#ifdef LISTED
-const int first_level = 1;
-#else
 uniform int first_level;   // to write; >= 1
 #endif
 
@@ -97,7 +95,8 @@ void main() {
         i += items_apart();
     } while (find_cell(i));
 }
-#elif defined(FUSED)
+#else
+#ifdef FUSED
 void main() {
     int cells = volume_size >> first_level, tiles = (cells + TILE - 1) / TILE;
     int slab = int(gl_WorkGroupID.z) / tiles, k = slab % DIRECTIONS;
@@ -122,4 +121,5 @@ void main() {
     work_in_volume(slab / DIRECTIONS);
     write_cell(first_level, ivec3(id.xy, id.z - slab * cells), slab % DIRECTIONS);
 }
+#endif
 #endif
