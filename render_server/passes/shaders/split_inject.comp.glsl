@@ -27,17 +27,20 @@ uniform float bias_real;   // m: how far behind the real map an object's surface
 
 const bool REAL_SET = true, VIRTUAL_SET = false;
 const float SNAP = 0.25;   // voxels: a surface on the border of two voxels belongs to the one that it touched
+// Voxels: what lies just above a border (ABOVE_BORDERS of passes/volumes.py) stays there in spite of a map's rounding:
+// rasterisers snap corners of triangles to 1/256 of a texel.
+const float ABOVE_ROUNDING = 0.01;
 
 uint grid_at(bool real_set, ivec3 voxel) {
     uint i = voxel_index(voxel, volume_size);
     return real_set ? grid[i] : virtual_grid[i];
 }
 
-// Slot of the touched voxel at q or next to it, -1 if there is none.
+// Slot of the touched voxel at q, a hair above, or next to it, -1 if there is none.
 int slot_near(bool real_set, vec3 q) {
     for (int j = -1; j < 8; ++j) {
         vec3 corner = j < 0 ? vec3(0.0) : vec3(j & 1, (j >> 1) & 1, j >> 2) * 2.0 - 1.0;
-        vec3 at = q + SNAP * corner;
+        vec3 at = q + ABOVE_ROUNDING + SNAP * corner;
         if (!inside_volume(at)) continue;
         uint entry = grid_at(real_set, ivec3(at));
         if (entry != 0u) return int(entry) - 1;
