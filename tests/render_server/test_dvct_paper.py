@@ -14,10 +14,13 @@ from jaxtyping import Bool, Float32, Float64
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.gpu import kernel
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server.protected_scenes import LEAST_PSNR_DB, cases, pictures_of
+from tests.render_server.scenes import psnr_db
 
 WIDTH, HEIGHT, VOXELS = 160, 120, 32
 EDGE = 0.1995  # of the box, m: a little less than eight voxels, so that it lies in no ninth
@@ -323,3 +326,18 @@ def test_the_view_of_the_error_is_black_where_there_is_none(gpu: GpuContext, ass
     paper, exact = views
     assert exact.max() == 0
     assert paper.max() > 0
+
+
+def test_rounding_of_a_lights_map_moves_no_light_to_the_voxel_below(
+    gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The floor, at z = 0 on the lower border of its voxels, has its underside in those below."""
+    (case,) = (one for one in cases() if str(one) == "paper-model-plain")
+    exact, _ = pictures_of(gpu, case, tmp_path)
+    read, place = kernel.shader_source, "vec3 p = ray_point(view, s, depth);"
+    monkeypatch.setattr(
+        kernel, "shader_source", lambda *args: read(*args).replace(place, f"{place} p.z -= 5e-5;")
+    )
+    rounded, _ = pictures_of(gpu, case, tmp_path)
+    assert any(not np.array_equal(*pair) for pair in zip(exact, rounded, strict=True))
+    assert min(psnr_db(*pair) for pair in zip(exact, rounded, strict=True)) > LEAST_PSNR_DB
