@@ -46,6 +46,7 @@ from deltalight.render_server.passes.lpv import (
 )
 from deltalight.render_server.passes.lpv_lighting import (
     LpvBounce,
+    LpvBounceTail,
     LpvFields,
     LpvInjectMaps,
     LpvInjectSurfaces,
@@ -247,16 +248,17 @@ class DifferenceVolumes:
     """V_rho and V_mu.
 
     V_mu starts from the real scene's light without objects, V_rho from that and the change due to them. Each bounce
-    propagates V_rho again with the light that surfaces reflect of it. `shown` is the injected change, for debug view
-    `volume`.
+    propagates V_rho again with the light that surfaces reflect of it; the last one, if there are two, with what all
+    later ones would add. `shown` is the injected change, for debug view `volume`.
     """
 
     def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: LpvCells) -> None:
         self._gpu, self._settings, self._cells = gpu, settings, cells
         steps = settings.steps or cells.size
         self._mu, self._rho = (Propagated(gpu, settings, cells.size, steps) for _ in range(2))
-        self._bounced_light = injected_sums(gpu, cells.size)
+        self._bounced, self._before = (injected_sums(gpu, cells.size) for _ in range(2))
         self._bounce = LpvBounce(gpu)
+        self._tail = LpvBounceTail(gpu)
         self._shown = VoxelMipmap(gpu, cells.size, 1)
         self._show = LpvShow(gpu)
 
@@ -280,11 +282,17 @@ class DifferenceVolumes:
         through: moderngl.Buffer | None,
     ) -> LightVolume:
         """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
-        for _ in range(self._settings.resolved_bounces):
-            clear_buffer(self._gpu, self._bounced_light)
-            own = {**scene, **query_bindings(self._settings)}
-            self._bounce.run(self._bounced_light, (self._cells.real, self._cells.objects), (mu, rho), own)
-            self._rho.run(through, injected, change, self._bounced_light)
+        own = {**scene, **query_bindings(self._settings)}
+        last = self._settings.resolved_bounces
+        for number in range(1, last + 1):
+            self._bounced, self._before = self._before, self._bounced
+            clear_buffer(self._gpu, self._bounced)
+            self._bounce.run(self._bounced, (self._cells.real, self._cells.objects), (mu, rho), own)
+            if number == 2:
+                self._tail.measure(self._before, self._bounced)
+            if number == last > 1:
+                self._tail.extend(self._before, self._bounced)
+            self._rho.run(through, injected, change, self._bounced)
         return rho
 
     def show(self, change: moderngl.Buffer) -> VoxelMipmap:

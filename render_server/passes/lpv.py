@@ -184,14 +184,14 @@ class LpvShow:
 
         Cells of `direct` may be larger or smaller than those of `change`; both fill the same cube.
         """
-        cells = _cells_of(change)
+        cells = cells_of(change)
         self._kernel.run(
             (cells, cells, cells),
             shown=shown.texture,
             Change=change,
             Direct=change if direct is None else direct,
             cells=cells,
-            direct_cells=0 if direct is None else _cells_of(direct),
+            direct_cells=0 if direct is None else cells_of(direct),
         )
 
     def release(self) -> None:
@@ -199,7 +199,7 @@ class LpvShow:
         self._kernel.release()
 
 
-def _cells_of(sums: moderngl.Buffer) -> int:
+def cells_of(sums: moderngl.Buffer) -> int:
     """Cells an edge of injected sums."""
     return round(math.cbrt(sums.size / (INJECTED_SUMS * 4)))
 

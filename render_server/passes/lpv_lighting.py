@@ -6,10 +6,11 @@ from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
+from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.lpv import LightVolume
+from deltalight.render_server.passes.lpv import LightVolume, cells_of
 from deltalight.render_server.passes.volumes import PlacedVolume
 from deltalight.render_server.passes.voxels import VoxelStore
 
@@ -109,6 +110,32 @@ class LpvBounce:
         """Frees the GL objects."""
         self._real.release()
         self._virtual.release()
+
+
+class LpvBounceTail:
+    """Extends the sums of reflected light by the bounces that are not propagated (docs/method.md 5.6)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._measure = Kernel(gpu, "lpv_bounce_tail", MEASURE=1)
+        self._extend = Kernel(gpu, "lpv_bounce_tail")
+        self._threads = self._measure.local_size[0] ** 2  # as many workgroups as one of `_extend` has threads
+        self._parts = gpu.ctx.buffer(reserve=8 * self._measure.local_size[0])
+
+    def measure(self, first: moderngl.Buffer, both: moderngl.Buffer) -> None:
+        """Finds the share from the sums of the `first` bounce and those of `both` first bounces."""
+        self._run(self._measure, self._threads, first, both)
+
+    def extend(self, before: moderngl.Buffer, bounced: moderngl.Buffer) -> None:
+        """Adds the bounces after the last to `bounced`, the sums of all; `before` lacks the last one."""
+        self._run(self._extend, cells_of(bounced) ** 3, before, bounced)
+
+    def _run(self, kernel: Kernel, threads: int, before: moderngl.Buffer, bounced: moderngl.Buffer) -> None:
+        cells = cells_of(bounced)
+        kernel.run((threads,), Before=before, Injected=bounced, Parts=self._parts, cells=cells)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._measure, self._extend, self._parts)
 
 
 class LpvQuery:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from jaxtyping import Float64
+from jaxtyping import Float64, Int32
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
@@ -13,7 +13,7 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.lpv import CONSTANT, LOBE, LightVolume, injected_sums
-from deltalight.render_server.passes.lpv_lighting import LpvBounce
+from deltalight.render_server.passes.lpv_lighting import LpvBounce, LpvBounceTail
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import GREY, Stage, ambient, cube, floor, frame, shifted, solve, sphere_light
 
@@ -83,13 +83,59 @@ def test_a_floor_reflects_its_albedo_of_what_the_objects_changed(gpu: GpuContext
     assert seen == pytest.approx(np.broadcast_to(albedo * np.pi * 0.3 * edge_m**2, seen.shape), rel=0.01)
 
 
-def test_each_bounce_changes_less_than_the_one_before(gpu: GpuContext, stage: Stage) -> None:
-    """A box of bright walls under a lamp: what the object takes, the walls take from each other again."""
+def extended(
+    gpu: GpuContext, first: Int32[np.ndarray, "z y x 3 4"], second: Int32[np.ndarray, "z y x 3 4"]
+) -> Int32[np.ndarray, "z y x 3 4"]:
+    """The sums of both bounces and the estimate of all others."""
+    before, bounced = injected_sums(gpu, CELLS), injected_sums(gpu, CELLS)
+    before.write(first.tobytes())
+    bounced.write((first + second).tobytes())
+    tail = LpvBounceTail(gpu)
+    tail.measure(before, bounced)
+    tail.extend(before, bounced)
+    found = np.frombuffer(bounced.read(), np.int32).reshape(first.shape)
+    for item in (tail, before, bounced):
+        item.release()
+    return found
+
+
+def random_sums(scale: float) -> Int32[np.ndarray, "z y x 3 4"]:
+    shape = (CELLS, CELLS, CELLS, 3, 4)
+    return np.round(scale * FIXED * np.random.default_rng(5).uniform(-1, 1, shape)).astype(np.int32)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.6])
+def test_the_tail_of_a_geometric_series_is_its_sum(gpu: GpuContext, share: float) -> None:
+    first = random_sums(0.1)
+    second = np.round(share * first).astype(np.int32)
+    assert extended(gpu, first, second) == pytest.approx(first / (1 - share), abs=4)
+
+
+def test_the_tail_of_a_series_that_grows_is_bounded(gpu: GpuContext) -> None:
+    """Two bounces that cannot be: the tail is that of the brightest albedo."""
+    first = random_sums(0.01)
+    assert extended(gpu, first, 2 * first) == pytest.approx(first + 2 * first / (1 - 0.95), rel=1e-5, abs=4)
+
+
+def test_without_light_there_is_no_tail(gpu: GpuContext) -> None:
+    nothing = random_sums(0.0)
+    assert (extended(gpu, nothing, nothing) == 0).all()
+
+
+def niche(stage: Stage) -> SceneDocument:
+    """A dark cube in a box of bright walls under a lamp: what it takes, the walls take from each other again."""
     walls = [shifted(trimesh.creation.box((0.02, 0.4, 0.3)), side * 0.2, 0.1, 0.15) for side in (-1, 1)]
     back = shifted(trimesh.creation.box((0.4, 0.02, 0.3)), 0, 0.3, 0.15)
     room = trimesh.util.concatenate([floor(0.5), back, *walls])
     lights = [sphere_light((0.1, -0.7, 0.8), 1.5, 0.05), ambient(0.05)]
-    document = stage.document([stage.virtual(cube(0.12), (0.3, 0.3, 0.3))], lights, room)
+    return stage.document([stage.virtual(cube(0.12), (0.3, 0.3, 0.3))], lights, room)
+
+
+def test_each_bounce_changes_less_than_the_one_before(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LpvBounceTail, "extend", lambda *_: None)  # those that are propagated alone
+    document = niche(stage)
     solutions = [solve(gpu, dlpv(document, bounces=count)) for count in (0, 1, 2, 3)]
     assert all(np.array_equal(solutions[0].cones_mu, one.cones_mu) for one in solutions[1:])
     seen = (solutions[0].fade == 1) & (solutions[0].matte == 0)
@@ -97,6 +143,27 @@ def test_each_bounce_changes_less_than_the_one_before(gpu: GpuContext, stage: St
     steps = np.abs(np.diff(means))
     assert steps[0] > 1e-3 * means[0]
     assert (steps[1:] < 0.8 * steps[:-1]).all()
+
+
+def test_two_bounces_come_to_what_more_of_them_do(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four propagated bounces are the reference: without the tail, two leave out most of what is missing."""
+    document = niche(stage)
+
+    def change(bounces: int) -> float:
+        solution = solve(gpu, dlpv(document, bounces=bounces))
+        seen = (solution.fade == 1) & (solution.matte == 0)
+        return float((solution.cones_rho - solution.cones_mu)[seen].mean())
+
+    with_tail, many = change(2), change(4)
+    monkeypatch.setattr(LpvBounceTail, "extend", lambda *_: None)
+    without, four = change(2), change(4)
+    print(
+        f"2 bounces {without:.5f}, with the tail {with_tail:.5f}; 4 bounces {four:.5f}, with the tail {many:.5f}"
+    )
+    assert abs(with_tail - many) < 0.3 * abs(without - many)
+    assert abs(many - four) < 0.5 * abs(many - without)
 
 
 def test_the_papers_operator_refuses_bounces() -> None:
