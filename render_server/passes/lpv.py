@@ -14,6 +14,7 @@ from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
+from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.gbuffer import NO_CUTOUTS
 from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.passes.voxels import LOWER_VOLUME, VoxelMipmap, VoxelStore
@@ -264,7 +265,8 @@ class LpvTransmit:
 class LpvPropagate:
     """Propagates light from cell to cell (docs/method.md 5).
 
-    `tiled` runs several steps per dispatch in shared memory (default on a GPU); otherwise each is a dispatch.
+    `tiled` runs several steps per dispatch in shared memory (default on a GPU); otherwise each is a dispatch, or two
+    halves are, if light crosses the volume.
     """
 
     def __init__(self, gpu: GpuContext, *, tiled: bool | None = None) -> None:
@@ -274,33 +276,46 @@ class LpvPropagate:
             if self._tiled
             else {1: Kernel(gpu, "lpv_propagate_plain")}
         )
+        self._half_step = None if self._tiled else Kernel(gpu, "lpv_half_step")
 
     def run(
         self, volume: LightVolume, weights: StepWeights, steps: int, transmitted: moderngl.Buffer | None
     ) -> None:
-        """Runs `steps` steps; without `transmitted` nothing blocks light."""
+        """Runs `steps` steps; without `transmitted` nothing blocks light.
+
+        If not `tiled`, and light crosses the volume, half of the cells have one step more, and `volume` keeps the
+        state before the first step.
+        """
         medium: Bindings = {
             "Transmitted": transmitted,
             "has_geometry": transmitted is not None,
             "transfer": weights.transfer,
             "sideways": weights.sideways,
+            "cells": volume.cells,
         }
+        if self._half_step is not None and steps >= volume.cells:
+            _run_halves(self._half_step, volume, steps, medium)
+        else:
+            self._run_whole(volume, steps, medium)
+
+    def _run_whole(self, volume: LightVolume, steps: int, medium: Bindings) -> None:
         channels = 3 if self._tiled else 1  # the plain kernel loops over them
         threads = (volume.cells, volume.cells, channels * volume.cells)
         while steps > 0:
             count = max(count for count in self._kernels if count <= steps)
             self._kernels[count].run(
-                threads,
-                medium,
-                State=volume.state,
-                Next=volume.next_state,
-                Total=volume.total,
-                cells=volume.cells,
+                threads, medium, State=volume.state, Next=volume.next_state, Total=volume.total
             )
             volume.swap()
             steps -= count
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for kernel in self._kernels.values():
-            kernel.release()
+        release_all(*self._kernels.values(), self._half_step)
+
+
+def _run_halves(half_step: Kernel, volume: LightVolume, steps: int, medium: Bindings) -> None:
+    """Runs so many half steps that every cell of both colours has at least `steps`."""
+    threads = (-(-volume.cells // 2), volume.cells, volume.cells)
+    for number in range(steps + 1):
+        half_step.run(threads, medium, State=volume.state, Total=volume.total, colour=number % 2)

@@ -84,6 +84,21 @@ def test_tiles_in_shared_memory_make_the_same_steps(gpu: GpuContext, weights: St
 
 
 @pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS)
+def test_half_steps_come_to_whole_steps(gpu: GpuContext, weights: StepWeights) -> None:
+    """Cells of one colour hold the totals of CELLS whole steps, those of the other have one step more."""
+    through = np.random.default_rng(1).uniform(0.8, 1, (CELLS, CELLS, CELLS, 8)).astype(np.float32)
+    light = np.random.default_rng(2).uniform(-1, 2, (3, CELLS, CELLS, CELLS, 4)).astype(np.float32)
+    whole, more = (
+        propagated(gpu, light, weights, steps, tiled=True, through=through)[1] for steps in (CELLS, CELLS + 1)
+    )
+    _, halves = propagated(gpu, light, weights, CELLS, tiled=False, through=through)
+    is_odd = np.indices((CELLS, CELLS, CELLS)).sum(axis=0) % 2 == 1
+    assert halves[:, is_odd] == pytest.approx(whole[:, is_odd], abs=1e-5)
+    assert halves[:, ~is_odd] == pytest.approx(more[:, ~is_odd], abs=1e-5)
+    assert np.abs(whole - more).max() > 1e-3
+
+
+@pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS)
 def test_an_even_field_stays_even(gpu: GpuContext, weights: StepWeights) -> None:
     light = np.zeros((3, CELLS, CELLS, CELLS, 4), np.float32)
     light[..., 0] = 1.0

@@ -1,0 +1,22 @@
+// Half a step of propagation, in place: a cell's total is its own light and what enters from its neighbours' totals. Its cells have one
+// colour of a chessboard and all of their neighbours the other, so half steps of alternating colours come to the totals of as many
+// whole steps (lpv_propagate_plain.comp.glsl), each for half of the work.
+#include "common/light_cells.glsl"
+#include "common/light_step.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(std430) readonly buffer State { vec4 state[]; };   // before the first step
+layout(std430) buffer Total { vec4 total[]; };
+uniform int colour;   // 0, 1
+
+vec4 light_of(uint place) { return total[place]; }
+#include "common/light_neighbours.glsl"
+
+void main() {
+    ivec3 cell = ivec3(gl_GlobalInvocationID);
+    cell.x = 2 * cell.x + ((cell.y + cell.z + colour) & 1);
+    if (!in_grid(cell, cells)) return;
+    Neighbours n = neighbours_of(cell);
+    uint here = cell_index(cell, cells), count = uint(cells * cells * cells);
+    for (uint base = 0u; base < 3u * count; base += count) total[base + here] = state[base + here] + entering(n, base);
+}
