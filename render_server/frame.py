@@ -266,7 +266,7 @@ class PictureBuffers:
     ) -> SampleCoverage:
         """Draws several samples per pixel and resolves them into one surface."""
         if self._samples is None:
-            self._samples = SampleCoverage(self._gpu, view.size, self._tier.edge_samples)
+            self._samples = SampleCoverage(self._gpu, view.size, self._raster.size, self._tier.edge_samples)
         plain = view.without_antialiasing
         self._samples.run(
             self._geometry,

@@ -1,12 +1,20 @@
 """Pixel coverage of the virtual objects, and antialiasing and unmixing of the edges around it."""
 
+import math
+
 import moderngl
 
+from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, MOST_WALKERS, list_threads
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
-from deltalight.render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
+from deltalight.render_server.passes.gbuffer import (
+    TRIANGLE_BYTES,
+    GeometryBuffer,
+    MeshBuffers,
+    RasterGeometry,
+)
 from deltalight.render_server.view import CameraView, Rectangle
 
 # Sample positions in 1/16 pixels from the pixel's centre, nearest first. Of all patterns of eight with one sample in
@@ -17,6 +25,7 @@ PATTERN_8 = ((-3, 1), (3, -1), (1, 5), (-1, -5), (-5, -3), (5, 3), (-7, 7), (7, 
 PATTERN_4 = ((-2, -6), (6, -2), (2, 6), (-6, 2))
 PATTERNS = {len(pattern): pattern for pattern in (PATTERN_4, PATTERN_8)}
 STEPS = 16
+TILE = 2  # texels an edge, as in shaders/common/raster_tiles.glsl
 RIM_SIGHT = 6
 """Pixels within which an edge pixel finds both the real thing and the background unmixed.
 
@@ -26,23 +35,90 @@ SURFACE_REACH = 22
 """Pixels within which the surface that represents a mixed pixel may lie: half floats hold so many offsets exactly."""
 
 
+class EdgeTriangles:
+    """The triangles of a mesh that may show in marked tiles of a raster, in its order; a `Drawable`."""
+
+    def __init__(self, gpu: GpuContext, raster: tuple[int, int]) -> None:
+        self._gpu, self._raster = gpu, raster
+        self.tiles = gpu.ctx.buffer(reserve=4 * math.prod(-(-edge // TILE) for edge in raster))
+        self._indices = gpu.ctx.buffer(reserve=4)
+        self._thin = Kernel(gpu, "edge_triangles", FIND_THIN=1)
+        self._chosen = Kernel(gpu, "edge_triangles")
+        self._mesh: MeshBuffers | None = None
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The tiles, for what marks and reads them."""
+        return {"Tiles": self.tiles, "raster_size": self._raster}
+
+    @property
+    def triangle_count(self) -> int:
+        """Triangles that are drawn, those that are left out among them."""
+        return 0 if self._mesh is None else self._mesh.triangle_count
+
+    def clear(self) -> None:
+        """Marks no tile."""
+        clear_buffer(self._gpu, self.tiles)
+
+    def find_thin(self, mesh: MeshBuffers, view: CameraView, raster: GeometryBuffer, scene: Bindings) -> None:
+        """Marks the tiles with triangles of `mesh` that may lie between the samples that `raster` has."""
+        self._run(self._thin, mesh, view, scene, raster.bindings)
+
+    def choose(self, mesh: MeshBuffers, view: CameraView, scene: Bindings) -> None:
+        """Takes the triangles of `mesh` for the tiles that are marked."""
+        self._mesh, needed = mesh, TRIANGLE_BYTES * mesh.triangle_count
+        if self._indices.size < needed:
+            self._indices.orphan(needed)
+        self._run(self._chosen, mesh, view, scene, {"EdgeIndices": self._indices})
+
+    def _run(
+        self, kernel: Kernel, mesh: MeshBuffers, view: CameraView, scene: Bindings, more: Bindings
+    ) -> None:
+        if not mesh.triangle_count:
+            return
+        kernel.run(
+            (min(mesh.triangle_count, MOST_WALKERS),),
+            scene,
+            mesh.solid,
+            self.bindings,
+            more,
+            clip_from_camera=view.clip_from_camera_at((0.0, 0.0)),
+            triangle_count=mesh.triangle_count,
+            behind=0.0,
+        )
+
+    def draw(self, program: moderngl.Program) -> None:
+        """Draws them with `program`."""
+        assert self._mesh is not None
+        self._mesh.draw(program, self._indices)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.tiles, self._indices, self._thin, self._chosen)
+
+
 class SampleCoverage:
     """Draws the objects once per sample and gathers what the picture's pixels see through the lens.
 
-    All rasters share one buffer, so memory does not grow with the number of samples, unlike vertex work. `surface` is
-    the geometry buffer on the picture's grid; `texture` (RGBA16F) holds the fraction in front of the real surface,
-    the fraction behind it, and that fraction times its mean depth; `second_surface` (RGBA32F) the position and
-    fraction of samples that show another surface than `surface`.
+    After the first sample, only the pixels that may differ between samples, and what may show in them. All rasters
+    share one buffer, so memory does not grow with the number of samples. `surface` is the geometry buffer on the
+    picture's grid; `texture` (RGBA16F) holds the fraction in front of the real surface, the fraction behind it, and
+    that fraction times its mean depth; `second_surface` (RGBA32F) the position and fraction of samples that show
+    another surface than `surface`.
     """
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int], samples: int) -> None:
-        self._pattern = PATTERNS[samples]
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], raster: tuple[int, int], samples: int) -> None:
+        self._gpu, self._pattern = gpu, PATTERNS[samples]
         self.surface = GeometryBuffer(gpu, size)
         self.texture = texture_2d(gpu, size, 4, "f2")
         self.second_surface = texture_2d(gpu, size, 4, "f4")
         self._sums = gpu.ctx.framebuffer([self.texture, self.second_surface])
         self._filled: Rectangle = (0, 0, *size)  # what may hold anything
-        self._kernel = Kernel(gpu, "sample_coverage")
+        self._pixels = gpu.ctx.buffer(reserve=LIST_HEADER_BYTES + 4 * math.prod(size))
+        self._threads = list_threads(gpu, math.prod(size))
+        self._triangles = EdgeTriangles(gpu, raster)
+        self._first = Kernel(gpu, "sample_coverage", FIRST=1)
+        self._further = Kernel(gpu, "sample_coverage")
 
     def run(
         self,
@@ -64,7 +140,7 @@ class SampleCoverage:
             offset = (x / STEPS, y / STEPS)
             geometry.run(
                 raster,
-                mesh,
+                self._triangles if number else mesh,
                 view,
                 scene,
                 offset=offset,
@@ -72,34 +148,46 @@ class SampleCoverage:
                 sample=number / len(self._pattern),
                 sample_coverage=self.texture,
             )
-            self._kernel.run(
-                in_picture[2:],
-                raster.bindings,
-                scene,
-                position_out=self.surface.position,
-                normal_out=self.surface.normal,
-                uv_out=self.surface.uv,
-                tint_out=self.surface.tint,
-                sample_coverage=self.texture,
-                second_surface=self.second_surface,
-                rectangle=in_picture,
-                raster_rectangle=in_raster,
-                offset=offset,
-                weight=1.0 / len(self._pattern),
-            )
+            own = self._sampled(offset, in_picture, in_raster)
+            if number:
+                self._further.run((self._threads,), raster.bindings, scene, own)
+            else:
+                self._triangles.find_thin(mesh, view, raster, scene)
+                self._first.run(in_picture[2:], raster.bindings, scene, own, self._triangles.bindings)
+                self._triangles.choose(mesh, view, scene)
+
+    def _sampled(
+        self, offset: tuple[float, float], in_picture: Rectangle, in_raster: Rectangle
+    ) -> dict[str, Binding]:
+        return {
+            "position_out": self.surface.position,
+            "normal_out": self.surface.normal,
+            "uv_out": self.surface.uv,
+            "tint_out": self.surface.tint,
+            "sample_coverage": self.texture,
+            "second_surface": self.second_surface,
+            "Texels": self._pixels,
+            "rectangle": in_picture,
+            "raster_rectangle": in_raster,
+            "offset": offset,
+            "weight": 1.0 / len(self._pattern),
+        }
 
     def _clear(self, rectangle: Rectangle) -> None:
-        """Clears what was filled before and what will be."""
+        """Clears what was filled before and what will be, and the list of pixels."""
         for each in (self._filled, rectangle):
             self.surface.clear(each)
             self._sums.use()
             self._sums.clear(viewport=each)
         self._filled = rectangle
+        self._gpu.clear_start(self._pixels, LIST_HEADER_BYTES)
+        self._triangles.clear()
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self._sums)
-        release_all(self.surface, self.texture, self.second_surface, self._kernel)
+        release_all(self.surface, self.texture, self.second_surface, self._pixels, self._triangles)
+        release_all(self._first, self._further)
 
 
 class ObjectCoverage:

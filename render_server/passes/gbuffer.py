@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Drawable, Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
 from deltalight.render_server.scene.materials import map_table, measured_table
@@ -149,7 +149,7 @@ class MeshBuffers:
         self._indices = gpu.ctx.buffer(reserve=4)
         self._sides = gpu.ctx.buffer(reserve=4)
         self._second_uv: moderngl.Buffer | None = None
-        self._arrays: dict[int, moderngl.VertexArray] = {}
+        self._arrays: dict[tuple[int, int], moderngl.VertexArray] = {}
         self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
         self.triangle_count = 0  # of those that are drawn, with any without area
         self.cutouts = NO_CUTOUTS
@@ -198,16 +198,18 @@ class MeshBuffers:
         self._arrays.clear()
         self._second_uv = None if uv is None else self._ctx.buffer(np.ascontiguousarray(uv, np.float32))
 
-    def draw(self, program: moderngl.Program) -> None:
-        """Draws all triangles with `program`."""
+    def draw(self, program: moderngl.Program, indices: moderngl.Buffer | None = None) -> None:
+        """Draws all triangles with `program`, or those that `indices` has in their places."""
         if not self.triangle_count:
             return
-        if program.glo not in self._arrays:
+        indices = indices or self._indices
+        key = program.glo, indices.glo
+        if key not in self._arrays:
             layout: list[tuple[Any, ...]] = [(self._vertices, *_layout_of(program))]
             if self._second_uv is not None and program.get(SECOND_UV, None) is not None:
                 layout.append((self._second_uv, "2f", SECOND_UV))
-            self._arrays[program.glo] = self._ctx.vertex_array(program, layout, self._indices)
-        self._arrays[program.glo].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
+            self._arrays[key] = self._ctx.vertex_array(program, layout, indices)
+        self._arrays[key].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
 
     def release(self) -> None:
         """Frees all buffers."""
@@ -476,7 +478,7 @@ class RasterGeometry:
     def run(
         self,
         target: GeometryBuffer,
-        mesh: MeshBuffers,
+        mesh: Drawable,
         view: CameraView,
         scene: Bindings,
         *,
