@@ -41,7 +41,7 @@ class EdgeTriangles:
     def __init__(self, gpu: GpuContext, raster: tuple[int, int]) -> None:
         self._gpu, self._raster = gpu, raster
         self.tiles = gpu.ctx.buffer(reserve=4 * math.prod(-(-edge // TILE) for edge in raster))
-        self._indices = gpu.ctx.buffer(reserve=4)
+        self.indices = gpu.ctx.buffer(reserve=4)
         self._thin = Kernel(gpu, "edge_triangles", FIND_THIN=1)
         self._chosen = Kernel(gpu, "edge_triangles")
         self._mesh: MeshBuffers | None = None
@@ -67,9 +67,9 @@ class EdgeTriangles:
     def choose(self, mesh: MeshBuffers, view: CameraView, scene: Bindings) -> None:
         """Takes the triangles of `mesh` for the tiles that are marked."""
         self._mesh, needed = mesh, TRIANGLE_BYTES * mesh.triangle_count
-        if self._indices.size < needed:
-            self._indices.orphan(needed)
-        self._run(self._chosen, mesh, view, scene, {"EdgeIndices": self._indices})
+        if self.indices.size < needed:
+            self.indices.orphan(needed)
+        self._run(self._chosen, mesh, view, scene, {"EdgeIndices": self.indices})
 
     def _run(
         self, kernel: Kernel, mesh: MeshBuffers, view: CameraView, scene: Bindings, more: Bindings
@@ -90,11 +90,11 @@ class EdgeTriangles:
     def draw(self, program: moderngl.Program) -> None:
         """Draws them with `program`."""
         assert self._mesh is not None
-        self._mesh.draw(program, self._indices)
+        self._mesh.draw(program, self.indices)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.tiles, self._indices, self._thin, self._chosen)
+        release_all(self.tiles, self.indices, self._thin, self._chosen)
 
 
 class SampleCoverage:
@@ -104,7 +104,7 @@ class SampleCoverage:
     share one buffer, so memory does not grow with the number of samples. `surface` is the geometry buffer on the
     picture's grid; `texture` (RGBA16F) holds the fraction in front of the real surface, the fraction behind it, and
     that fraction times its mean depth; `second_surface` (RGBA32F) the position and fraction of samples that show
-    another surface than `surface`.
+    another surface than `surface`; `pixels` lists those with more than one sample.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], raster: tuple[int, int], samples: int) -> None:
@@ -114,9 +114,9 @@ class SampleCoverage:
         self.second_surface = texture_2d(gpu, size, 4, "f4")
         self._sums = gpu.ctx.framebuffer([self.texture, self.second_surface])
         self._filled: Rectangle = (0, 0, *size)  # what may hold anything
-        self._pixels = gpu.ctx.buffer(reserve=LIST_HEADER_BYTES + 4 * math.prod(size))
+        self.pixels = gpu.ctx.buffer(reserve=LIST_HEADER_BYTES + 4 * math.prod(size))
         self._threads = list_threads(gpu, math.prod(size))
-        self._triangles = EdgeTriangles(gpu, raster)
+        self.triangles = EdgeTriangles(gpu, raster)
         self._first = Kernel(gpu, "sample_coverage", FIRST=1)
         self._further = Kernel(gpu, "sample_coverage")
 
@@ -140,7 +140,7 @@ class SampleCoverage:
             offset = (x / STEPS, y / STEPS)
             geometry.run(
                 raster,
-                self._triangles if number else mesh,
+                self.triangles if number else mesh,
                 view,
                 scene,
                 offset=offset,
@@ -152,9 +152,9 @@ class SampleCoverage:
             if number:
                 self._further.run((self._threads,), raster.bindings, scene, own)
             else:
-                self._triangles.find_thin(mesh, view, raster, scene)
-                self._first.run(in_picture[2:], raster.bindings, scene, own, self._triangles.bindings)
-                self._triangles.choose(mesh, view, scene)
+                self.triangles.find_thin(mesh, view, raster, scene)
+                self._first.run(in_picture[2:], raster.bindings, scene, own, self.triangles.bindings)
+                self.triangles.choose(mesh, view, scene)
 
     def _sampled(
         self, offset: tuple[float, float], in_picture: Rectangle, in_raster: Rectangle
@@ -166,7 +166,7 @@ class SampleCoverage:
             "tint_out": self.surface.tint,
             "sample_coverage": self.texture,
             "second_surface": self.second_surface,
-            "Texels": self._pixels,
+            "Texels": self.pixels,
             "rectangle": in_picture,
             "raster_rectangle": in_raster,
             "offset": offset,
@@ -180,13 +180,13 @@ class SampleCoverage:
             self._sums.use()
             self._sums.clear(viewport=each)
         self._filled = rectangle
-        self._gpu.clear_start(self._pixels, LIST_HEADER_BYTES)
-        self._triangles.clear()
+        self._gpu.clear_start(self.pixels, LIST_HEADER_BYTES)
+        self.triangles.clear()
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self._sums)
-        release_all(self.surface, self.texture, self.second_surface, self._pixels, self._triangles)
+        release_all(self.surface, self.texture, self.second_surface, self.pixels, self.triangles)
         release_all(self._first, self._further)
 
 

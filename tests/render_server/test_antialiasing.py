@@ -11,7 +11,7 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.coverage import PATTERN_8, STEPS
+from deltalight.render_server.passes.coverage import PATTERN_8, STEPS, EdgeTriangles
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     FOCAL,
@@ -166,6 +166,55 @@ def test_an_inclined_thin_bar_has_no_gap(objects: ObjectsRenderer, stage: Stage)
     rows = found[HEIGHT // 2 - 30 : HEIGHT // 2 + 30]
     assert (rows.sum(axis=1) > 0.2).all()
     assert rows.sum() == pytest.approx(60 * 0.5 / np.cos(np.radians(13)), rel=0.05)
+
+
+def knotted(detail: int) -> trimesh.Trimesh:
+    """A ball, a ring and needles thinner than a pixel, some through each other, some far away."""
+    needles = [
+        sheet(0.4, 60, 10.0 * k - 30, 2.0 * k, 23.0 * k).apply_translation((0, 0, 0.06 - 0.03 * k))
+        for k in range(7)
+    ]
+    ring = trimesh.creation.torus(24 * PIXEL, 5 * PIXEL, 8 * detail, 4 * detail)
+    ring.apply_transform(trimesh.transformations.rotation_matrix(1.1, (1.0, 0.4, 0.2)))
+    specks = [ball(0.3 * PIXEL, (x * 7.3 * PIXEL, -50 * PIXEL, -0.2), 1) for x in range(-4, 5)]
+    return trimesh.util.concatenate(
+        [ball(18 * PIXEL, (0.02, 0.01, 0.0), detail // 2), ring, *needles, *specks]
+    )
+
+
+def everywhere(triangles: EdgeTriangles) -> None:
+    """Marks all tiles, so that every sample of every pixel is drawn."""
+    triangles.tiles.write(b"\3\0\0\0" * (triangles.tiles.size // 4))
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.3])
+@pytest.mark.parametrize("detail", [4, 10])
+def test_samples_at_edges_alone_make_the_same_picture(
+    objects: ObjectsRenderer, stage: Stage, monkeypatch: pytest.MonkeyPatch, distortion: float, detail: int
+) -> None:
+    """Also where a real surface cuts through the objects."""
+    document = stage.document([stage.virtual(knotted(detail))], [directional((1.0, 0.3, -1.0)), ambient(0.3)])
+    lens = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0))
+    view = seen_from_above(1.01, lens)
+    some, matte = objects.linear(antialiased(unlit(document)), view), objects.newest_coverage()
+    monkeypatch.setattr(EdgeTriangles, "clear", everywhere)
+    assert np.array_equal(some, objects.linear(antialiased(unlit(document)), view))
+    assert np.array_equal(matte, objects.newest_coverage())
+    assert ((matte > 0) & (matte < 1)).sum() > 200
+
+
+def test_inside_an_object_a_pixel_has_one_sample(objects: ObjectsRenderer, stage: Stage) -> None:
+    """Of a sheet, the pixels along its outline have all of them, and few triangles show there."""
+    grid = sheet(60, 60, 0.3, 0.3).subdivide_to_size(4 * PIXEL)
+    objects.draw(antialiased(glowing(stage, grid)), seen_from_above())
+    graph = objects.renderer.graph
+    assert graph is not None
+    samples = graph["object surface"].samples
+    listed = int(np.frombuffer(samples.pixels.read(4), np.uint32)[0])
+    assert 4 * 60 <= listed <= 4 * 60 * 4
+    indices = np.frombuffer(samples.triangles.indices.read(), np.uint32)[: grid.faces.size].reshape(-1, 3)
+    drawn = int((indices[:, 0] != indices[:, 1]).sum())
+    assert 0 < drawn < 0.5 * len(grid.faces)
 
 
 def test_without_the_wish_pixels_are_covered_or_not(objects: ObjectsRenderer, stage: Stage) -> None:
