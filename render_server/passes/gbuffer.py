@@ -447,6 +447,7 @@ class GeometryBuffer:
         self.tint = texture_2d(gpu, size, 4, "f1")
         self._depth = gpu.ctx.depth_renderbuffer(size)
         self.framebuffer = gpu.ctx.framebuffer([self.position, self.normal, self.uv, self.tint], self._depth)
+        self._places = gpu.ctx.framebuffer([self.position], self._depth)
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -463,9 +464,15 @@ class GeometryBuffer:
         self.framebuffer.use()  # a clear heeds the scissor of the framebuffer in use
         self.framebuffer.clear(0.0, 0.0, 0.0, 0.0, depth=1.0, viewport=rectangle)
 
+    def clear_positions(self, rectangle: Rectangle) -> None:
+        """Clears positions and depth in the `rectangle`; what else texels without a position hold is of before."""
+        self._places.use()
+        self._places.clear(0.0, 0.0, 0.0, 0.0, depth=1.0, viewport=rectangle)
+
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self.framebuffer)
+        release_target(self._places)
         release_all(self._depth, self.position, self.normal, self.uv, self.tint)
 
 
@@ -493,7 +500,10 @@ class RasterGeometry:
         can show the mesh; the others keep their contents. `sample`: which part 0..1 of what is blended shows here.
         Where `sample_coverage` has a sample in front already, uv and vertex colour are not needed.
         """
-        target.clear(rectangle)
+        if rectangle is None:
+            target.clear()
+        else:
+            target.clear_positions(rectangle)
         self._kernel.draw(
             target.framebuffer,
             mesh,

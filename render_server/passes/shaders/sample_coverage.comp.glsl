@@ -61,13 +61,15 @@ vec4 covered(bool seen, float depth) { return seen ? vec4(1.0, 0.0, 0.0, 0.0) : 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(std430) buffer Tiles { uint tiles[]; };
 
+const ivec2 NEIGHBOURS[8] = ivec2[](ivec2(-1), ivec2(0, -1), ivec2(1, -1), ivec2(-1, 0), ivec2(1, 0), ivec2(-1, 1), ivec2(0, 1), ivec2(1));
+
 // Whether a neighbour's first sample shows what this one's shows: nothing, or the same surface, on the same side of the real one.
-bool shows_the_same(ivec2 pixel, ivec2 beside, vec4 position, vec3 normal) {
+bool shows_the_same(ivec2 beside, float real, vec4 position, vec3 normal) {
     if (any(lessThan(beside, ivec2(0))) || any(greaterThanEqual(beside, ivec2(picture_size)))) return false;
     ivec2 raster = sampled_texel(beside);
     vec4 other = position_at(raster);
     if (position.w <= 0.0 || other.w <= 0.0) return position.w <= 0.0 && other.w <= 0.0;
-    return in_front(pixel, other.w) == in_front(pixel, position.w) && !is_another(position.xyz, normal, other, normal_at(raster));
+    return is_hidden(real, other.w) == is_hidden(real, position.w) && !is_another(position.xyz, normal, other, normal_at(raster));
 }
 
 // Whether all samples show what the first one shows. They do if the eight neighbours' do: of two sides of a straight edge within a
@@ -77,8 +79,9 @@ bool is_even(ivec2 pixel, vec4 position, vec3 normal) {
 #ifdef CUTOUTS
     return false;
 #else
+    float real = texelFetch(real_surface_position, pixel, 0).w;
     bool even = true;
-    for (int i = 0; i < 9 && even; ++i) even = shows_the_same(pixel, pixel + ivec2(i % 3, i / 3) - 1, position, normal);
+    for (int i = 0; i < 8; ++i) even = shows_the_same(pixel + NEIGHBOURS[i], real, position, normal) && even;
     return even;
 #endif
 }
