@@ -92,7 +92,7 @@ class SolutionVoxels(DirectionalVoxels):
     def light(
         self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
     ) -> "SolutionVoxels":
-        """Lights, resolves and filters mu, then rho; with bounces, what both gather from mu is the first guess."""
+        """Lights, resolves and filters mu, then rho; with bounces, what is gathered from mu is both's first guess."""
         self._occupy.run(self.mu, self.real.volume, self.real.store)
         self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
         self.objects.forget_light()
@@ -102,6 +102,7 @@ class SolutionVoxels(DirectionalVoxels):
             marching = {**mu, **self.march_bindings(1)}
             for each in (self.real, self.objects):
                 self._gather.gather(each.store, each.groups, self.mu, marching)
+            self._light_mu(mu, gathered=True)
             self._light_rho(rho, gathered=True)
         return self
 
