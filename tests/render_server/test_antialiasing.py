@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.coverage import PATTERN_8, STEPS, EdgeTriangles
@@ -20,6 +20,7 @@ from tests.render_server.scenes import (
     ObjectsRenderer,
     Stage,
     ambient,
+    array_of,
     ball,
     camera,
     composite,
@@ -166,6 +167,27 @@ def test_an_inclined_thin_bar_has_no_gap(objects: ObjectsRenderer, stage: Stage)
     rows = found[HEIGHT // 2 - 30 : HEIGHT // 2 + 30]
     assert (rows.sum(axis=1) > 0.2).all()
     assert rows.sum() == pytest.approx(60 * 0.5 / np.cos(np.radians(13)), rel=0.05)
+
+
+def test_a_long_thin_bar_is_whole(gpu: GpuContext, stage: Stage) -> None:
+    """Its bounds hold more pixels than a thread of a software renderer may look at."""
+    width, height, length = 480, 360, 420
+    lens = camera(width, height)
+    view = frame(
+        np.full((height, width, 3), 100, np.uint8),
+        pose=ABOVE,
+        camera=lens,
+        depth=DepthImage(np.full((height, width), 3.0), np.ones((height, width), bool), lens, 0.001),
+    )
+    renderer = SceneRenderer(gpu, antialiased(glowing(stage, sheet(0.5, length, 0.2, 0.0, 50.0))))
+    renderer.render(view)
+    graph = renderer.graph
+    assert graph is not None
+    found = array_of(graph["object surface"].coverage.texture)[..., 0]
+    renderer.release()
+    assert found.sum() == pytest.approx(0.5 * length, rel=0.05)
+    columns = found.sum(axis=0)[width // 2 - 150 : width // 2 + 150]
+    assert (columns > 0.2).all()
 
 
 def knotted(detail: int) -> trimesh.Trimesh:

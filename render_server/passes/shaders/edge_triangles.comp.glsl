@@ -38,6 +38,7 @@ bool is_beside(Projected p) {
 layout(std430) buffer Tiles { uint tiles[]; };
 
 const float STOUT = 2.0;   // texels: the least height of a triangle that shows at a texel's centre for certain
+const int MOST_BESIDE = 5;   // texels along an axis from the longest side: sqrt(2) STOUT, 2 REACH and rounding
 
 bool is_stout(Projected p) {
     vec2 ab = p.b - p.a, ac = p.c - p.a, bc = p.c - p.b;
@@ -67,6 +68,22 @@ bool meets(vec2 texel, Projected p) {
 
 void mark(ivec2 texel) { atomicOr(tiles[tile_number(tile_of(vec2(texel)))], THIN); }
 
+// Marks what a large triangle meets that is not stout: it lies beside its longest side. Not all texels within its bounds, because
+// Mesa's software renderer silently ends all loops of a thread after 65535 iterations.
+void mark_along_longest(Projected p, ivec2 first, ivec2 last) {
+    vec2 from = p.a, side = p.b - p.a;
+    if (dot(p.c - p.a, p.c - p.a) > dot(side, side)) side = p.c - p.a;
+    if (dot(p.c - p.b, p.c - p.b) > dot(side, side)) { from = p.b; side = p.c - p.b; }
+    int along = abs(side.x) >= abs(side.y) ? 0 : 1, across = 1 - along;
+    for (int i = first[along]; i <= last[along]; ++i) {
+        int middle = int(round(from[across] + (float(i) - from[along]) * side[across] / side[along]));
+        for (int j = max(middle - MOST_BESIDE, first[across]); j <= min(middle + MOST_BESIDE, last[across]); ++j) {
+            ivec2 texel = along == 0 ? ivec2(i, j) : ivec2(j, i);
+            if (meets(vec2(texel), p)) mark(texel);
+        }
+    }
+}
+
 void find_thin(Piece t) {
     Projected at = projected(t);
     vec3 n = cross(t.b.place - t.a.place, t.c.place - t.a.place);
@@ -74,11 +91,13 @@ void find_thin(Piece t) {
     if (!at.is_whole || size == 0.0 || is_beside(at)) return;
     n *= (dot(n, camera_position - t.a.place) < 0.0 ? -1.0 : 1.0) / size;
     ivec2 first = max(ivec2(ceil(low_of(at) - REACH)), ivec2(0)), last = min(ivec2(floor(high_of(at) + REACH)), raster_size - 1);
-    bool is_large = any(greaterThan(last - first, ivec2(MOST_APART)));
-    if (is_large && is_stout(at)) return;
+    if (any(greaterThan(last - first, ivec2(MOST_APART)))) {
+        if (!is_stout(at)) mark_along_longest(at, first, last);
+        return;
+    }
     for (int y = first.y; y <= last.y; ++y)
         for (int x = first.x; x <= last.x; ++x)
-            if (meets(vec2(x, y), at) && (is_large || shows_behind(ivec2(x, y), t.a.place, n))) mark(ivec2(x, y));
+            if (meets(vec2(x, y), at) && shows_behind(ivec2(x, y), t.a.place, n)) mark(ivec2(x, y));
 }
 
 void main() {
