@@ -7,7 +7,7 @@ const int THREADS = 256;   // = local_size_x
 layout(local_size_x = 256) in;
 layout(std430) buffer TailSums { int tail_sums[]; };
 layout(rgba16f) writeonly uniform image3D bounce_tail;   // rgb irradiance times area, a: area
-shared vec2 parts[THREADS];
+#include "common/workgroup_sum.glsl"
 
 // Sums of all of the volume: (amount, returned).
 vec2 summed_amounts(int first, int thread) {
@@ -16,13 +16,7 @@ vec2 summed_amounts(int first, int thread) {
         int at = (first + place) * TAIL_SUMS;
         sum += vec2(tail_sums[at + TAIL_AMOUNT], tail_sums[at + TAIL_RETURNED]);
     }
-    parts[thread] = sum;
-    barrier();
-    for (int apart = THREADS / 2; apart > 0; apart /= 2) {
-        if (thread < apart) parts[thread] += parts[thread + apart];
-        barrier();
-    }
-    return parts[0];
+    return workgroup_sum(sum, thread);
 }
 
 void main() {

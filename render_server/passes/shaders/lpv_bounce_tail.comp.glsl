@@ -7,17 +7,7 @@ const int THREADS = 64;   // = local_size_x
 layout(local_size_x = 64) in;
 layout(std430) readonly buffer Before { int before[]; };   // sums of all bounces but the last
 uniform int cells;
-shared vec2 sums[THREADS];
-
-vec2 summed(vec2 own, int thread) {
-    sums[thread] = own;
-    barrier();
-    for (int apart = THREADS / 2; apart > 0; apart /= 2) {
-        if (thread < apart) sums[thread] += sums[thread + apart];
-        barrier();
-    }
-    return sums[0];
-}
+#include "common/workgroup_sum.glsl"
 
 #ifdef MEASURE
 layout(std430) readonly buffer Injected { int injected[]; };   // sums of both bounces
@@ -35,7 +25,7 @@ void main() {
         float second = amount(vec3(injected[at], injected[at + 4], injected[at + 8]) - first);
         own += second * vec2(amount(first), second);
     }
-    vec2 all = summed(own, thread);
+    vec2 all = workgroup_sum(own, thread);
     if (thread == 0) parts[gl_WorkGroupID.x] = all;
 }
 #else
@@ -44,7 +34,7 @@ layout(std430) buffer Injected { int injected[]; };
 layout(std430) readonly buffer Parts { vec2 parts[]; };   // THREADS of them
 
 void main() {
-    vec2 amounts = summed(parts[gl_LocalInvocationID.x], int(gl_LocalInvocationID.x));
+    vec2 amounts = workgroup_sum(parts[gl_LocalInvocationID.x], int(gl_LocalInvocationID.x));
     float share = min(amounts.y / max(amounts.x, 1.0), GREATEST_SHARE);
     int first = int(gl_GlobalInvocationID.x) * INJECTED_SUMS;
     if (first >= cells * cells * cells * INJECTED_SUMS) return;
