@@ -16,6 +16,8 @@ PEAK_THRESHOLD = 4.0
 MIN_FRACTION = 0.01
 # Regions of this angular radius are not cut again: sampling the disc of a light resolves the rest.
 MIN_RADIUS_RAD = float(np.radians(5.0))
+# Wider regions are not one lamp, and no disc: as little of them as possible becomes a light.
+MAX_LAMP_RADIUS_RAD = float(np.radians(15.0))
 OcclusionTest = Callable[[Float64[np.ndarray, "3"]], bool]
 
 
@@ -95,22 +97,27 @@ def split_map(
 ) -> Split[MapT]:
     """Split a map into at most `count` lights and a residual (docs/method.md 2).
 
-    R = L min(1, c / lum L) with c = `threshold` times the solid-angle mean of what is known; P = L - R is cut into
-    regions, each of which becomes a light. Regions under 1 % of the map's energy go back to R, and so do those whose
-    direction (unit, world) `is_occluded`. With `whole_map`, as in the papers, everything but occluded regions is cut.
+    What is brighter than c, `threshold` times the solid-angle mean of what is known, is cut into regions. Each
+    becomes a light, and leaves the mean of everything darker in the residual; one wider than 15 degrees, which is no
+    lamp, leaves c. Regions under 1 % of the map's energy go back to the residual, and so do those whose direction
+    (unit, world) `is_occluded`. With `whole_map`, as in the papers, everything but occluded regions is cut.
     """
     luminance = luminance_of(sky.radiance)
     energy = float(np.vdot(luminance, sky.grid.solid_angles))
     limit = 0.0 if whole_map else threshold * energy / max(sky.known_solid_angle, 1e-9)
     least = 0.0 if whole_map else MIN_FRACTION * energy
+    surroundings = _mean_below(sky, luminance, limit)
     frame = _bounding(luminance, limit, Region(0, luminance.shape[0], 0, luminance.shape[1]))
     residual = sky.radiance.copy()
     lights = []
     above = np.maximum(luminance[frame.window] - np.float32(limit), 0)
     for part in variance_cut(above[..., None] * sky.grid.moments[frame.window], count):
         region = _bounding(luminance, limit, _moved(part, frame))
-        peaks = sky.radiance[region.window] * _fraction_above(luminance[region.window], limit)
+        peaks = _peaks(sky, luminance, region, limit, surroundings)
         light = _region_light(sky, region, peaks)
+        if light.angular_radius_rad > MAX_LAMP_RADIUS_RAD:
+            peaks = _peaks(sky, luminance, region, limit, limit)
+            light = _region_light(sky, region, peaks)
         occluded = is_occluded is not None and is_occluded(light.to_light)
         if not occluded and light.irradiance @ LUMINANCE >= least:
             lights.append(light)
@@ -123,10 +130,24 @@ def luminance_of(radiance: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, 
     return np.asarray(cv2.transform(radiance, LUMINANCE[None]), np.float32)
 
 
-def _fraction_above(luminance: Float32[np.ndarray, "h w"], limit: float) -> Float32[np.ndarray, "h w 1"]:
-    """Return the fraction of each pixel's light above the limit, 0..1."""
-    above = np.maximum(luminance - np.float32(limit), 0)
-    return np.asarray(above / np.maximum(luminance, np.float32(1e-30)))[..., None]
+def _mean_below(sky: SkyMap, luminance: Float32[np.ndarray, "h w"], limit: float) -> float:
+    """Return the mean luminance of the known directions that are not above the limit; 0 if there are none."""
+    above = (luminance > np.float32(limit)).astype(np.float32)
+    solid_angles = sky.grid.solid_angles
+    known = sky.known_solid_angle - float(np.vdot(above, solid_angles))
+    energy = float(np.vdot(luminance * (1 - above), solid_angles))
+    return min(energy / known, limit) if known > 0 else 0.0
+
+
+def _peaks(
+    sky: SkyMap, luminance: Float32[np.ndarray, "h w"], region: Region, limit: float, left: float
+) -> Float32[np.ndarray, "a b 3"]:
+    """Return the radiance of a region's pixels above the limit without the luminance that is left there."""
+    bright = luminance[region.window]
+    taken = np.where(bright > np.float32(limit), bright - np.float32(left), 0)
+    return np.asarray(
+        sky.radiance[region.window] * (taken / np.maximum(bright, np.float32(1e-30)))[..., None]
+    )
 
 
 def _bounding(luminance: Float32[np.ndarray, "h w"], limit: float, region: Region) -> Region:

@@ -13,6 +13,7 @@ from deltalight.protocol.light_cutter import LightCutter
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
 from deltalight.render_server.lights.light_distance import fit_distance, paper_light
+from deltalight.render_server.lights.light_placement import distance_by_shading
 from deltalight.render_server.lights.lights import (
     AMBIENT_SIZE,
     DirectionalLight,
@@ -142,6 +143,7 @@ class FisheyeSource:
         self._sky: SkyLights | None = None
         self._remark: str | None = None
         self._distance_m: float | None = None
+        self._measure = ""
         self._wants_distance = lights.fisheye.distance_m == "auto"
         if isinstance(lights.fisheye.distance_m, float):
             self._distance_m = lights.fisheye.distance_m
@@ -180,17 +182,28 @@ class FisheyeSource:
         remarks = () if self._remark is None else (self._remark,)
         if self._distance_m is None or self._document.fisheye.distance_m != "auto":
             return remarks
-        found = f"lights of the fish-eye picture: {self._distance_m:.2g} m away, as the board's paper tells"
+        found = f"lights of the fish-eye picture: {self._distance_m:.2g} m away, as {self._measure}"
         return (*remarks, found)
 
     def _find_distance(self, frame: ViewFrame, sky: SkyLights) -> bool:
-        """Estimates the lights' distance on the first frame with enough paper; returns whether that succeeded."""
-        paper = paper_light(frame) if self._wants_distance and sky.lights else None
-        if paper is None:
+        """Estimates the lights' distance on the first frame that can tell; returns whether that succeeded.
+
+        The board's paper measures best. Where it shows no near lights (a lamp may light only a part of it), and
+        without a board, shading and shadows of all surfaces are asked.
+        """
+        if not (self._wants_distance and sky.lights):
+            return False
+        paper = paper_light(frame)
+        if paper is None and (frame.board is not None or frame.depth is None or frame.pose is None):
             return False
         self._wants_distance = False
-        ambient = irradiance(sky.residual, UP)[0]
-        self._distance_m = fit_distance(paper, sky.world_from_fisheye[:3, 3], sky.lights, ambient)
+        if paper is not None:
+            ambient = irradiance(sky.residual, UP)[0]
+            self._distance_m = fit_distance(paper, sky.world_from_fisheye[:3, 3], sky.lights, ambient)
+            self._measure = "the board's paper tells"
+        if self._distance_m is None:
+            self._distance_m = distance_by_shading(frame, sky)
+            self._measure = "shading and shadows tell"
         return self._distance_m is not None
 
     def _lights(self, sky: SkyLights) -> LightSet:

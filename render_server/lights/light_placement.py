@@ -1,0 +1,208 @@
+"""How far the lights of a fish-eye camera are, by the shading and the shadows that the colour camera sees.
+
+Divided by the irradiance of lights in their right places, a picture is albedo, which has fewer steps than shading:
+shadows and falloff are gone (intrinsic images, Barrow & Tenenbaum 1978).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
+from deltalight.protocol.occlusion import are_occluded
+from deltalight.protocol.octahedral import sample_octahedral
+from deltalight.protocol.sky_lights import SkyLights, TrackedLight
+from deltalight.render_server.lights.octahedral import irradiance_map
+from deltalight.render_server.scene.albedo import unclipped
+from deltalight.render_server.scene.depth_surface import depth_surface, noise_sigma
+
+# Depth is read at this width, shading at every second of its pixels: a few thousand points see soft shadows well.
+WIDTH = 160
+STRIDE = 2
+# Points are compared over 5 and 10 % of the picture's width: closer ones differ by noise, others by material.
+SPANS = (4, 8)
+SAME_CHROMA = 0.1  # largest difference of log colour between points that may be of one material
+LARGEST_STEP = 0.2  # of log albedo: beyond it, materials differ, whatever the light
+MIN_PAIRS = 500
+# Inverse distances to try, 1/m: neighbours differ by less than what shading can tell apart.
+CANDIDATES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
+# Near lights must leave fewer steps than far ones at 2.5 % significance: a paired t-test over tiles of the picture.
+MIN_T = 2.0
+TILE = 10
+SHADOW_STEPS = 32
+OFFSET_SIGMAS = 4.0  # from a surface to where its shadow rays start, in noise of its depth
+
+
+def distance_by_shading(frame: ViewFrame, sky: SkyLights) -> float | None:
+    """Estimates one distance of all lights from the fish-eye camera, m; None where they seem far away.
+
+    Of all distances it is the one under which the picture's albedo has the fewest steps, most of all near the
+    fish-eye camera. Frames without depth or pose, and those that show too little, say nothing.
+    """
+    seen = _seen_points(frame, sky.world_from_fisheye[:3, 3])
+    if seen is None:
+        return None
+    smooth = sample_octahedral(irradiance_map(sky.residual), seen.normals[None])[0]
+    left = [
+        seen.pairs.steps(sum((seen.lit_by(light, sky, inverse) for light in sky.lights), smooth))
+        for inverse in CANDIDATES
+    ]
+    costs = np.array([float(steps.sum()) for steps in left])
+    best = int(np.argmin(costs))
+    if best == 0 or not seen.pairs.has_fewer(left[best], left[0]):
+        return None
+    return float(1 / _vertex(costs, best))
+
+
+def _vertex(costs: Float64[np.ndarray, " n"], best: int) -> float:
+    """Returns the inverse distance of the least cost: a parabola through the best candidate and its neighbours."""
+    if best + 1 == len(costs):
+        return CANDIDATES[best]
+    around = slice(best - 1, best + 2)
+    a, b, _ = np.polyfit(CANDIDATES[around], costs[around], 2)
+    return float(-b / (2 * a))
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs of points that may be of one material: indices, weight (sum 1), difference of log radiance, tile."""
+
+    first: Int64[np.ndarray, " p"]
+    second: Int64[np.ndarray, " p"]
+    weight: Float32[np.ndarray, " p"]
+    difference: Float32[np.ndarray, " p"]
+    tile: Int64[np.ndarray, " p"]
+
+    def steps(self, light: Float32[np.ndarray, "k 3"]) -> Float32[np.ndarray, " p"]:
+        """Returns each pair's weighted step of log albedo under an irradiance of the points."""
+        log = np.log(np.maximum(light, 1e-6)).mean(axis=1)
+        step = np.abs(self.difference - (log[self.first] - log[self.second]))
+        return np.asarray(self.weight * np.minimum(step, LARGEST_STEP))
+
+    def has_fewer(self, steps: Float32[np.ndarray, " p"], others: Float32[np.ndarray, " p"]) -> bool:
+        """Whether `steps` are significantly fewer than `others`."""
+        gain = np.bincount(self.tile, others - steps)[np.bincount(self.tile) > 0]
+        return bool(gain.sum() > MIN_T * np.std(gain) * np.sqrt(len(gain)))
+
+
+@dataclass(frozen=True, eq=False)
+class _SeenPoints:
+    """Points on real surfaces, world metres, and their normals; what hides light from them is in `depth`."""
+
+    depth: DepthImage
+    world_from_camera: Float64[np.ndarray, "4 4"]
+    points: Float32[np.ndarray, "k 3"]
+    normals: Float32[np.ndarray, "k 3"]
+    pairs: _Pairs
+
+    def lit_by(self, light: TrackedLight, sky: SkyLights, inverse: float) -> Float32[np.ndarray, "k 3"]:
+        """Returns the irradiance from a light at an inverse distance from the fish-eye camera."""
+        offset = self.points - sky.world_from_fisheye[:3, 3].astype(np.float32)
+        to_lamp = light.to_light.astype(np.float32) - np.float32(inverse) * offset  # in units of its distance
+        distance = np.linalg.norm(to_lamp, axis=1)
+        cosine = np.einsum("ki,ki->k", to_lamp, self.normals) / distance
+        lit = np.maximum(cosine, 0) / distance**2 * self._sees(to_lamp, light.angular_radius_rad, cosine > 0)
+        return np.asarray(lit[:, None] * light.irradiance.astype(np.float32))
+
+    def _sees(
+        self, to_lamp: Float32[np.ndarray, "k 3"], radius_rad: float, faces: Bool[np.ndarray, " k"]
+    ) -> Bool[np.ndarray, " k"]:
+        """Whether each point sees a place of the lamp, each one another: differences average over soft edges."""
+        places = to_lamp[faces] + np.float32(np.sin(radius_rad)) * _on_discs(to_lamp[faces])
+        ways = places / np.linalg.norm(places, axis=1, keepdims=True)
+        middle_m = float(np.median(self.depth.depth_m[self.depth.valid]))
+        offset = np.float32(OFFSET_SIGMAS * noise_sigma(self.depth) * middle_m**2)
+        starts = self.points[faces] + offset * self.normals[faces]
+        # Densest at the start, where shadows meet what casts them, and as far as the camera sees things.
+        along = middle_m * np.linspace(0, 1, SHADOW_STEPS + 1, dtype=np.float32)[1:] ** 1.5
+        sees = faces.copy()
+        sees[faces] = ~are_occluded(self.depth, self.world_from_camera, starts, ways, along)
+        return sees
+
+
+def _on_discs(axes: Float32[np.ndarray, "k 3"]) -> Float32[np.ndarray, "k 3"]:
+    """Returns a point of the unit disc across each axis, together evenly spread (R2 sequence, Roberts 2018)."""
+    count = np.arange(len(axes))
+    turn, radius = 2 * np.pi * (0.7548776662 * count % 1), np.sqrt(0.5698402910 * count % 1)
+    across = np.cross(axes, np.where(np.abs(axes[:, 2:]) < 0.9, [0.0, 0, 1], [1.0, 0, 0]))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    up = np.cross(axes, across)
+    return np.asarray((np.cos(turn) * across.T + np.sin(turn) * up.T).T * radius[:, None], np.float32)
+
+
+def _seen_points(frame: ViewFrame, centre: Float64[np.ndarray, "3"]) -> _SeenPoints | None:
+    """Returns what a frame shows, most of all around `centre` (world, m)."""
+    if frame.depth is None or frame.pose is None:
+        return None
+    camera = _small_pinhole(frame.depth.camera)
+    rays = np.insert(camera.rays(), 2, 1.0, axis=2)
+    places = frame.depth.camera.project(rays.reshape(-1, 3).astype(np.float64)).astype(np.float32)
+    places = places.reshape(camera.height, camera.width, 2)
+    known = np.where(frame.depth.valid, frame.depth.depth_m, 0).astype(np.float32)
+    depth_m = cv2.remap(known, places, None, cv2.INTER_NEAREST)
+    depth = DepthImage(depth_m, depth_m > 0, camera, frame.depth.noise_sigma_m)
+    if not depth.valid.any():
+        return None
+    world_from_camera, shown = frame.pose.world_from_camera, np.s_[::STRIDE, ::STRIDE]
+    points = ((rays * depth_m[..., None]) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])[shown]
+    normals = depth_surface(depth, camera).normals[shown]
+    is_surface = normals.any(axis=-1)
+    normals[~is_surface] = (0, 0, -1)  # any direction: no pair holds these points
+    color, measured = _measured_color(frame, places)
+    near = np.linalg.norm(points - centre, axis=-1) / (np.median(depth_m[depth.valid]) / 2)
+    pairs = _pairs(color[shown], measured[shown] & is_surface, 1 / (1 + near**2) ** 2)
+    if len(pairs.weight) < MIN_PAIRS:
+        return None
+    return _SeenPoints(
+        depth,
+        world_from_camera,
+        points.reshape(-1, 3).astype(np.float32),
+        (normals @ world_from_camera[:3, :3].T).reshape(-1, 3).astype(np.float32),
+        pairs,
+    )
+
+
+def _small_pinhole(camera: CameraModel) -> CameraModel:
+    """Returns a camera of WIDTH pixels without distortion that sees all that `camera` does."""
+    rays = camera.rays().reshape(-1, 2).astype(np.float64)
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    height = max(round(WIDTH * camera.height / camera.width), 2)
+    focal = (np.array([WIDTH, height]) - 1) / np.maximum(high - low, 1e-9)
+    matrix = np.diag([*focal, 1.0])
+    matrix[:2, 2] = -low * focal
+    return CameraModel(WIDTH, height, matrix)
+
+
+def _measured_color(
+    frame: ViewFrame, places: Float32[np.ndarray, "h w 2"]
+) -> tuple[Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """Returns the mean linear colour around places of the picture, and where nothing is clipped or black."""
+    linear = decode_lut(frame.response)[frame.color, np.arange(3)]
+    measured = unclipped(frame.color, linear).astype(np.uint8)
+    edge = max(1, round(frame.camera.width / WIDTH))
+    color = cv2.remap(cv2.blur(linear, (edge, edge)), places, None, cv2.INTER_LINEAR)
+    return color, cv2.remap(measured, places, None, cv2.INTER_NEAREST) > 0
+
+
+def _pairs(
+    color: Float32[np.ndarray, "h w 3"], usable: Bool[np.ndarray, "h w"], weight: Float[np.ndarray, "h w"]
+) -> _Pairs:
+    """Pairs usable points of similar chroma along rows and columns."""
+    log = np.log(np.maximum(color, 1e-6))
+    mean = log.mean(axis=-1)
+    chroma = log - mean[..., None]
+    index = np.arange(usable.size).reshape(usable.shape)
+    tile = index // usable.shape[1] // TILE * usable.shape[1] + index % usable.shape[1] // TILE
+    parts = []
+    for span in SPANS:
+        for one, other in ((np.s_[:, :-span], np.s_[:, span:]), (np.s_[:-span], np.s_[span:])):
+            alike = np.abs(chroma[one] - chroma[other]).max(axis=-1) < SAME_CHROMA
+            both = usable[one] & usable[other] & alike
+            values = index[one], index[other], weight[one] + weight[other], mean[one] - mean[other], tile[one]
+            parts.append([value[both] for value in values])
+    first, second, weights, difference, tiles = (np.concatenate(part) for part in zip(*parts, strict=True))
+    weights = weights / max(float(weights.sum()), 1e-12)
+    return _Pairs(first, second, weights.astype(np.float32), difference.astype(np.float32), tiles)
