@@ -184,7 +184,8 @@ class FisheyeLights(LightCut):
     distance_m: Distance = Field(
         default="auto",
         description="Distance of the lights from the fish-eye camera, metres; `far` = distant like the sun; "
-        "`auto` = from the falloff of light over the board's paper, or far if no paper is visible.",
+        "`auto` = from the falloff of light over the board's paper, else from shading and shadows; far if neither "
+        "tells.",
     )
 
     @property
