@@ -4,6 +4,7 @@ Divided by the irradiance of lights in their right places, a picture is albedo, 
 shadows and falloff are gone (intrinsic images, Barrow & Tenenbaum 1978).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -46,23 +47,31 @@ def distance_by_shading(frame: ViewFrame, sky: SkyLights) -> float | None:
     if seen is None:
         return None
     smooth = sample_octahedral(irradiance_map(sky.residual), seen.normals[None])[0]
-    left = [
-        seen.pairs.steps(sum((seen.lit_by(light, sky, inverse) for light in sky.lights), smooth))
-        for inverse in CANDIDATES
-    ]
-    costs = np.array([float(steps.sum()) for steps in left])
-    best = int(np.argmin(costs))
+
+    def steps(candidate: int) -> Float32[np.ndarray, " p"]:
+        lit = (seen.lit_by(light, sky, CANDIDATES[candidate]) for light in sky.lights)
+        return seen.pairs.steps(sum(lit, smooth))
+
+    # Every other candidate, then the neighbours of the best one: the sum has one minimum but for noise.
+    left = {candidate: steps(candidate) for candidate in range(0, len(CANDIDATES), 2)}
+    coarse = _least(left)
+    left |= {near: steps(near) for near in (coarse - 1, coarse + 1) if 0 <= near < len(CANDIDATES)}
+    best = _least(left)
     if best == 0 or not seen.pairs.has_fewer(left[best], left[0]):
         return None
-    return float(1 / _vertex(costs, best))
+    return 1 / _vertex({candidate: float(one.sum()) for candidate, one in left.items()}, best)
 
 
-def _vertex(costs: Float64[np.ndarray, " n"], best: int) -> float:
+def _least(left: Mapping[int, Float32[np.ndarray, " p"]]) -> int:
+    return min(left, key=lambda candidate: float(left[candidate].sum()))
+
+
+def _vertex(costs: Mapping[int, float], best: int) -> float:
     """Returns the inverse distance of the least cost: a parabola through the best candidate and its neighbours."""
-    if best + 1 == len(costs):
+    around = [best - 1, best, best + 1]
+    if not all(candidate in costs for candidate in around):
         return CANDIDATES[best]
-    around = slice(best - 1, best + 2)
-    a, b, _ = np.polyfit(CANDIDATES[around], costs[around], 2)
+    a, b, _ = np.polyfit([CANDIDATES[one] for one in around], [costs[one] for one in around], 2)
     return float(-b / (2 * a))
 
 
