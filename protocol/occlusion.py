@@ -51,10 +51,10 @@ def are_occluded(
     height, width = depth.depth_m.shape
     inside = short_axis.all_of((pixels >= 0) & (pixels < (width, height)))
     column, row = np.where(inside[:, None], pixels, 0).astype(int).T
-    surface = np.where(depth.valid, depth.depth_m, 0)[row, column]
+    surface = depth.depth_m[row, column]
     behind = points[:, 2] - surface
     slack = DEPTH_TOLERANCE * np.abs(points[:, 2])
-    shown = inside & (surface > 0)
+    shown = inside & depth.valid[row, column] & (surface > 0)
     before = shown & (behind <= slack)
     through = shown & (behind > slack) & (behind <= slack + THICKNESS_M)
     shape = len(along), len(origins)

@@ -13,7 +13,6 @@ from deltalight.protocol.light_cutter import LightCutter
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
 from deltalight.render_server.lights.light_distance import fit_distance, paper_light
-from deltalight.render_server.lights.light_placement import distance_by_shading
 from deltalight.render_server.lights.lights import (
     AMBIENT_SIZE,
     DirectionalLight,
@@ -24,6 +23,7 @@ from deltalight.render_server.lights.lights import (
     light_set,
 )
 from deltalight.render_server.lights.octahedral import above_horizon, irradiance
+from deltalight.render_server.lights.shading_distance import distance_by_shading
 
 # Fraction of a lamp's radius that it must move to count as moved. Soft edges of its shadows are then off by a
 # twentieth of their width, whereas noise of the marker's pose would make them tremble and cost a rebuild per frame.

@@ -32,7 +32,7 @@ MIN_PAIRS = 500
 CANDIDATES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
 # Near lights must leave fewer steps than far ones at 2.5 % significance: a paired t-test over tiles of the picture.
 MIN_T = 2.0
-TILE = 10
+TILE = 10  # points
 SHADOW_STEPS = 32
 OFFSET_SIGMAS = 4.0  # from a surface to where its shadow rays start, in noise of its depth
 
@@ -99,9 +99,10 @@ class _Pairs:
 
 @dataclass(frozen=True, eq=False)
 class _SeenPoints:
-    """Points on real surfaces, world metres, and their normals; what hides light from them is in `depth`."""
+    """Points on real surfaces, world metres, and their normals; `depth`, of that median, hides light from them."""
 
     depth: DepthImage
+    median_m: float
     world_from_camera: Float64[np.ndarray, "4 4"]
     points: Float32[np.ndarray, "k 3"]
     normals: Float32[np.ndarray, "k 3"]
@@ -122,11 +123,10 @@ class _SeenPoints:
         """Whether each point sees a place of the lamp, each one another: differences average over soft edges."""
         places = to_lamp[faces] + np.float32(np.sin(radius_rad)) * _on_discs(to_lamp[faces])
         ways = places / np.linalg.norm(places, axis=1, keepdims=True)
-        middle_m = float(np.median(self.depth.depth_m[self.depth.valid]))
-        offset = np.float32(OFFSET_SIGMAS * noise_sigma(self.depth) * middle_m**2)
+        offset = np.float32(OFFSET_SIGMAS * noise_sigma(self.depth) * self.median_m**2)
         starts = self.points[faces] + offset * self.normals[faces]
         # Densest at the start, where shadows meet what casts them, and as far as the camera sees things.
-        along = middle_m * np.linspace(0, 1, SHADOW_STEPS + 1, dtype=np.float32)[1:] ** 1.5
+        along = self.median_m * np.linspace(0, 1, SHADOW_STEPS + 1, dtype=np.float32)[1:] ** 1.5
         sees = faces.copy()
         sees[faces] = ~are_occluded(self.depth, self.world_from_camera, starts, ways, along)
         return sees
@@ -136,6 +136,7 @@ def _on_discs(axes: Float32[np.ndarray, "k 3"]) -> Float32[np.ndarray, "k 3"]:
     """Returns a point of the unit disc across each axis, together evenly spread (R2 sequence, Roberts 2018)."""
     count = np.arange(len(axes))
     turn, radius = 2 * np.pi * (0.7548776662 * count % 1), np.sqrt(0.5698402910 * count % 1)
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     across = np.cross(axes, np.where(np.abs(axes[:, 2:]) < 0.9, [0.0, 0, 1], [1.0, 0, 0]))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     up = np.cross(axes, across)
@@ -161,12 +162,14 @@ def _seen_points(frame: ViewFrame, centre: Float64[np.ndarray, "3"]) -> _SeenPoi
     is_surface = normals.any(axis=-1)
     normals[~is_surface] = (0, 0, -1)  # any direction: no pair holds these points
     color, measured = _measured_color(frame, places)
-    near = np.linalg.norm(points - centre, axis=-1) / (np.median(depth_m[depth.valid]) / 2)
+    median_m = float(np.median(depth_m[depth.valid]))
+    near = np.linalg.norm(points - centre, axis=-1) / (median_m / 2)
     pairs = _pairs(color[shown], measured[shown] & is_surface, 1 / (1 + near**2) ** 2)
     if len(pairs.weight) < MIN_PAIRS:
         return None
     return _SeenPoints(
         depth,
+        median_m,
         world_from_camera,
         points.reshape(-1, 3).astype(np.float32),
         (normals @ world_from_camera[:3, :3].T).reshape(-1, 3).astype(np.float32),

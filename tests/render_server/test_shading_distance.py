@@ -9,8 +9,8 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
 from deltalight.protocol.scene_lights import LightCut, Lights
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
-from deltalight.render_server.lights.light_placement import distance_by_shading
 from deltalight.render_server.lights.lights import DirectionalLight, SphereLight
+from deltalight.render_server.lights.shading_distance import distance_by_shading
 from deltalight.render_server.lights.sources import FisheyeSource
 
 LOW, HIGH = np.array([-0.12, 0.05, 0.0]), np.array([-0.02, 0.12, 0.1])
@@ -95,11 +95,16 @@ def test_the_sun_stays_far() -> None:
     assert distance_by_shading(scene(None), sky()) is None
 
 
-def test_a_light_of_another_strength_in_every_channel_is_as_far() -> None:
-    """The map and the picture need not have the same scale: only steps count."""
-    frame = scene(0.8)
-    dimmed = replace(frame, exposure_scale=0.5)
-    assert distance_by_shading(dimmed, sky()) == distance_by_shading(frame, sky())
+def test_only_the_mix_of_the_maps_light_counts_not_its_scale() -> None:
+    """The fish-eye camera's units need not be the colour camera's, but more ambient light is softer shading."""
+    frame, given = scene(0.8), sky()
+    (light,) = given.lights
+    scaled = replace(
+        given, lights=(replace(light, irradiance=5 * light.irradiance),), residual=5 * given.residual
+    )
+    assert distance_by_shading(frame, scaled) == pytest.approx(distance_by_shading(frame, given), rel=1e-3)
+    ambient = distance_by_shading(frame, replace(given, residual=5 * given.residual))
+    assert ambient != pytest.approx(distance_by_shading(frame, given), rel=0.01)
 
 
 def test_frames_that_show_nothing_say_nothing() -> None:
