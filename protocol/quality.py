@@ -12,11 +12,11 @@ class QualityTier:
 
     `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_share` of its voxels an
     edge. `reflection_cones` look up what a pixel of a smooth object reflects, in one of `reflection_step` x
-    `reflection_step` pixels. `edge_samples` smooth an object's edges. `caustic_blocks` x `caustic_blocks` blocks of
-    each light's map of the objects send beams. While objects move, the light that they throw back, block between
-    surfaces and focus is found in one of `bounce_turns` frames; their shadows are in every one. One tile of the
-    picture in `refresh_tiles` gets new light in each frame in which only the camera moves, the others keep that of
-    the frame before; 0: all get new light, and the real scene is built anew whenever the camera moves.
+    `reflection_step` pixels. `caustic_blocks` x `caustic_blocks` blocks of each light's map of the objects send
+    beams. While objects move, the light that they throw back, block between surfaces and focus is found in one of
+    `bounce_turns` frames; their shadows are in every one. One tile of the picture in `refresh_tiles` gets new light
+    in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new light, and
+    the real scene is built anew whenever the camera moves.
     """
 
     cone_count: int = 64
@@ -24,7 +24,6 @@ class QualityTier:
     volume_share: float = 1.0
     reflection_cones: Literal[2, 4] = 4
     reflection_step: Literal[1, 2] = 1
-    edge_samples: Literal[4, 8] = 8
     caustic_blocks: Literal[32, 64] = 64
     refresh_tiles: int = 0
     bounce_turns: int = 1
@@ -40,7 +39,6 @@ TIERS: dict[Quality, QualityTier] = {
         volume_share=0.75,
         reflection_cones=2,
         reflection_step=2,
-        edge_samples=4,
         caustic_blocks=32,
         refresh_tiles=16,
         bounce_turns=3,

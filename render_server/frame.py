@@ -7,7 +7,6 @@ import moderngl
 import numpy as np
 
 from deltalight.protocol.frames import DepthImage, ViewFrame
-from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
@@ -147,6 +146,7 @@ class ObservationBuffers:
         """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
         raster_scene: dict[str, Binding] = {
             "Camera": self.raster_camera,
+            "lens_distortion": view.without_antialiasing.raster_is_bent,
             **self.image.bindings,
             **declared,
             "noise_sigma": scan.noise_sigma,
@@ -164,6 +164,7 @@ class ObservationBuffers:
             self.real_surface.from_model(self._model_raster, raster_scene, tolerance=scan.tolerance)
         bindings: dict[str, Binding] = {
             "Camera": self.camera,
+            "lens_distortion": view.raster_is_bent,
             **self.image.bindings,
             **self.real_surface.bindings,
             **declared,
@@ -180,16 +181,16 @@ class ObservationBuffers:
 class PictureBuffers:
     """Textures and kernels of one picture size that every method shares.
 
-    `measured`: of a tier that keeps the real scene, what lights it: a measurement that outlives the camera's motion.
+    `measured`: where the world is kept, what lights it: a measurement that outlives the camera's motion.
     """
 
-    def __init__(self, gpu: GpuContext, view: CameraView, tier: QualityTier) -> None:
+    def __init__(self, gpu: GpuContext, view: CameraView, *, keeps_world: bool) -> None:
         size, raster_size = view.size, view.raster[1]
         self.key = (size, raster_size)
-        self._gpu, self._tier = gpu, tier
+        self._gpu = gpu
         self._geometry = RasterGeometry(gpu)
         self._observed = ObservationBuffers(gpu, view, self._geometry)
-        self.measured = ObservationBuffers(gpu, view, self._geometry) if tier.refresh_tiles else None
+        self.measured = ObservationBuffers(gpu, view, self._geometry) if keeps_world else None
         self.coverage = ObjectCoverage(gpu, size)
         self._raster = GeometryBuffer(gpu, raster_size)
         self._samples: SampleCoverage | None = None
@@ -266,7 +267,7 @@ class PictureBuffers:
     ) -> SampleCoverage:
         """Draws several samples per pixel and resolves them into one surface."""
         if self._samples is None:
-            self._samples = SampleCoverage(self._gpu, view.size, self._raster.size, self._tier.edge_samples)
+            self._samples = SampleCoverage(self._gpu, view.size, self._raster.size)
         plain = view.without_antialiasing
         self._samples.run(
             self._geometry,
@@ -274,7 +275,12 @@ class PictureBuffers:
             objects.buffers,
             view=plain,
             rectangles=(rectangle, plain.raster_rectangle_around(objects.points)),
-            scene={**seen.bindings, **objects.materials.bindings, "Camera": self._observed.raster_camera},
+            scene={
+                **seen.bindings,
+                **objects.materials.bindings,
+                "Camera": self._observed.raster_camera,
+                "lens_distortion": plain.raster_is_bent,
+            },
         )
         return self._samples
 

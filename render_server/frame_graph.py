@@ -405,7 +405,7 @@ def frame_graphs(
     try:
         for number, view in enumerate(views):
             with graph.of_view(number):
-                buffers.append(PictureBuffers(gpu, view, method.settings.tier))
+                buffers.append(PictureBuffers(gpu, view, keeps_world=method.keeps_world))
                 graph.own(buffers[-1])
                 resources.append(declare_frame(graph, buffers[-1]))
         parts = zip(buffers, together(graph, resources, views), strict=True)

@@ -12,7 +12,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage, ViewFrame
 from deltalight.protocol.messages import MAX_CAMERAS, MAX_PART_BYTES
 from deltalight.protocol.scene_output import Output
-from deltalight.render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
+from deltalight.render_server.gpu.uniform_block import Block, Mat4, Vec2, Vec3, Vec4
 
 NEAR_M = 0.02
 FAR_M = 100.0
@@ -24,6 +24,15 @@ Rectangle = tuple[int, int, int, int]  # first column and row, width and height
 NOWHERE: Rectangle = (0, 0, 0, 0)
 
 
+def union(one: Rectangle, other: Rectangle) -> Rectangle:
+    """Returns the least rectangle that holds both."""
+    if min(one[2:]) <= 0 or min(other[2:]) <= 0:
+        return other if min(one[2:]) <= 0 else one
+    x, y = min(one[0], other[0]), min(one[1], other[1])
+    right, bottom = (max(one[axis] + one[axis + 2], other[axis] + other[axis + 2]) for axis in range(2))
+    return x, y, right - x, bottom - y
+
+
 @dataclass(frozen=True, eq=False)
 class CameraBlock(Block):
     """Uniform block `Camera` (passes/shaders/common/camera.glsl)."""
@@ -33,7 +42,6 @@ class CameraBlock(Block):
     camera_pinhole: Vec4
     raster_pinhole: Vec4
     camera_position: Vec3
-    lens_distortion: Bool
     picture_size: Vec2
 
 
@@ -154,6 +162,11 @@ class CameraView:
         seen = points @ matrix[:3, :3].T + matrix[:3, 3]
         return None if (seen[:, 2] <= NEAR_M).any() else seen
 
+    @property
+    def raster_is_bent(self) -> bool:
+        """Whether the objects' raster is sampled through the lens model."""
+        return self.camera.has_distortion and not self.antialiased
+
     def block(self) -> CameraBlock:
         """Returns the camera's uniform block."""
         matrix = self.camera.matrix
@@ -163,7 +176,6 @@ class CameraView:
             camera_pinhole=(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
             raster_pinhole=tuple(self.raster[0]),
             camera_position=tuple(self.position),
-            lens_distortion=self.camera.has_distortion and not self.antialiased,
             picture_size=self.size,
         )
 

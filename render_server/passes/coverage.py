@@ -1,31 +1,36 @@
 """Pixel coverage of the virtual objects, and antialiasing and unmixing of the edges around it."""
 
 import math
+from collections.abc import Sequence
 
 import moderngl
 
 from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, MOST_WALKERS, list_threads
-from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
-from deltalight.render_server.passes.gbuffer import (
-    TRIANGLE_BYTES,
-    GeometryBuffer,
-    MeshBuffers,
-    RasterGeometry,
+from deltalight.render_server.gpu.list_groups import (
+    LIST_HEADER_BYTES,
+    MOST_WALKERS,
+    ListGroups,
+    list_threads,
 )
-from deltalight.render_server.view import CameraView, Rectangle
+from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
+from deltalight.render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
+from deltalight.render_server.view import NEAR_M, CameraView, Rectangle, union
 
 # Sample positions in 1/16 pixels from the pixel's centre, nearest first. Of all patterns of eight with one sample in
 # each column and row of eighths (an upright edge is exact to 1/16) this one has the least worst-case error for an
 # edge at any angle and position: 0.17 of a pixel, 0.06 r.m.s. It is point symmetric.
-PATTERN_8 = ((-3, 1), (3, -1), (1, 5), (-1, -5), (-5, -3), (5, 3), (-7, 7), (7, -7))
-# Rotated by a quarter turn each: one sample in each column and row of quarters.
-PATTERN_4 = ((-2, -6), (6, -2), (2, 6), (-6, 2))
-PATTERNS = {len(pattern): pattern for pattern in (PATTERN_4, PATTERN_8)}
+PATTERN = ((-3, 1), (3, -1), (1, 5), (-1, -5), (-5, -3), (5, 3), (-7, 7), (7, -7))
 STEPS = 16
-TILE = 2  # texels an edge, as in shaders/common/raster_tiles.glsl
+# Of shaders/common/raster_tiles.glsl: texels an edge of a tile, tiles an edge of one of the next level.
+TILE, MOST_TILES, LEVELS = 2, 16, 4
+EDGE_GROUP = 64  # threads of a workgroup of shaders/edge_samples.comp.glsl
+PLANES_ROW = 1024  # triangles in a row of their planes' image, as in shaders/common/plane.glsl
+TILE_BYTES = NODE_BYTES = NODES_HEADER_BYTES = 8
+# Room for lists: small triangles meet two to four tiles each, large ones as many as there are in layers. Where it
+# does not suffice, edges are not antialiased.
+NODES_PER_TRIANGLE, NODES_PER_TILE = 4, 12
 RIM_SIGHT = 6
 """Pixels within which an edge pixel finds both the real thing and the background unmixed.
 
@@ -36,43 +41,54 @@ SURFACE_REACH = 22
 
 
 class EdgeTriangles:
-    """The triangles of a mesh that may show in marked tiles of a raster, in its order; a `Drawable`."""
+    """The triangles of a mesh that may show in marked tiles of a raster, in a list for each tile."""
 
     def __init__(self, gpu: GpuContext, raster: tuple[int, int]) -> None:
         self._gpu, self._raster = gpu, raster
-        self.tiles = gpu.ctx.buffer(reserve=4 * math.prod(-(-edge // TILE) for edge in raster))
-        self.indices = gpu.ctx.buffer(reserve=4)
+        edges = [TILE * MOST_TILES**level for level in range(LEVELS)]
+        counts = [math.prod(-(-side // edge) for side in raster) for edge in edges]
+        self._starts = tuple(sum(counts[:level]) for level in range(LEVELS))
+        self._least_nodes = NODES_PER_TILE * counts[0]
+        self.tiles = gpu.ctx.buffer(reserve=TILE_BYTES * sum(counts))
+        self.nodes = gpu.ctx.buffer(reserve=NODES_HEADER_BYTES)
+        self._planes = texture_2d(gpu, (3 * PLANES_ROW, 1), 4, "f4")
         self._thin = Kernel(gpu, "edge_triangles", FIND_THIN=1)
-        self._chosen = Kernel(gpu, "edge_triangles")
-        self._mesh: MeshBuffers | None = None
+        self._listed = Kernel(gpu, "edge_triangles")
 
     @property
     def bindings(self) -> dict[str, Binding]:
         """The tiles, for what marks and reads them."""
-        return {"Tiles": self.tiles, "raster_size": self._raster}
+        return {"Tiles": self.tiles, "raster_size": self._raster, "level_starts": self._starts}
 
     @property
-    def triangle_count(self) -> int:
-        """Triangles that are drawn, those that are left out among them."""
-        return 0 if self._mesh is None else self._mesh.triangle_count
+    def lists(self) -> dict[str, Binding]:
+        """The tiles, their lists, and the planes of the triangles in them."""
+        return {**self.bindings, "EdgeNodes": self.nodes, "edge_planes": self._planes}
 
     def clear(self) -> None:
-        """Marks no tile."""
+        """Marks no tile, and empties all lists."""
         clear_buffer(self._gpu, self.tiles)
+        self._gpu.clear_start(self.nodes, NODES_HEADER_BYTES)
 
     def find_thin(self, mesh: MeshBuffers, view: CameraView, raster: GeometryBuffer, scene: Bindings) -> None:
         """Marks the tiles with triangles of `mesh` that may lie between the samples that `raster` has."""
-        self._run(self._thin, mesh, view, scene, raster.bindings)
+        self._run(self._thin, mesh, view, scene, {**self.bindings, **raster.bindings})
 
-    def choose(self, mesh: MeshBuffers, view: CameraView, scene: Bindings) -> None:
-        """Takes the triangles of `mesh` for the tiles that are marked."""
-        self._mesh, needed = mesh, TRIANGLE_BYTES * mesh.triangle_count
-        if self.indices.size < needed:
-            self.indices.orphan(needed)
-        self._run(self._chosen, mesh, view, scene, {"EdgeIndices": self.indices})
+    def list_triangles(self, mesh: MeshBuffers, view: CameraView, scene: Bindings) -> None:
+        """Lists the triangles of `mesh` that may show in tiles that are marked."""
+        nodes = self._least_nodes + NODES_PER_TRIANGLE * mesh.triangle_count
+        size = NODES_HEADER_BYTES + NODE_BYTES * nodes
+        if self.nodes.size < size:
+            self.nodes.orphan(size)
+            self._gpu.clear_start(self.nodes, NODES_HEADER_BYTES)
+        rows = -(-mesh.triangle_count // PLANES_ROW)
+        if self._planes.height < rows:
+            self._planes.release()
+            self._planes = texture_2d(self._gpu, (3 * PLANES_ROW, rows), 4, "f4")
+        self._run(self._listed, mesh, view, scene, self.lists)
 
     def _run(
-        self, kernel: Kernel, mesh: MeshBuffers, view: CameraView, scene: Bindings, more: Bindings
+        self, kernel: Kernel, mesh: MeshBuffers, view: CameraView, scene: Bindings, own: Bindings
     ) -> None:
         if not mesh.triangle_count:
             return
@@ -80,45 +96,38 @@ class EdgeTriangles:
             (min(mesh.triangle_count, MOST_WALKERS),),
             scene,
             mesh.solid,
-            self.bindings,
-            more,
-            clip_from_camera=view.clip_from_camera_at((0.0, 0.0)),
+            own,
+            clip_from_camera=view.clip_from_camera,
             triangle_count=mesh.triangle_count,
             behind=0.0,
         )
 
-    def draw(self, program: moderngl.Program) -> None:
-        """Draws them with `program`."""
-        assert self._mesh is not None
-        self._mesh.draw(program, self.indices)
-
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.tiles, self.indices, self._thin, self._chosen)
+        release_all(self.tiles, self.nodes, self._planes, self._thin, self._listed)
 
 
 class SampleCoverage:
-    """Draws the objects once per sample and gathers what the picture's pixels see through the lens.
+    """Draws the objects' first sample of each pixel, and finds the others where they may differ.
 
-    After the first sample, only the pixels that may differ between samples, and what may show in them. All rasters
-    share one buffer, so memory does not grow with the number of samples. `surface` is the geometry buffer on the
-    picture's grid; `texture` (RGBA16F) holds the fraction in front of the real surface, the fraction behind it, and
-    that fraction times its mean depth; `second_surface` (RGBA32F) the position and fraction of samples that show
-    another surface than `surface`; `pixels` lists those with more than one sample.
+    A raster has the first one; the rays of the others meet the triangles at the objects' edges. `surface` is the
+    geometry buffer on the picture's grid; `texture` (RGBA16F) holds the fraction in front of the real surface, the
+    fraction behind it, and that fraction times its mean depth; `second_surface` (RGBA32F) the position and fraction
+    of samples that show another surface than `surface`; `pixels` lists those with more than one sample.
     """
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int], raster: tuple[int, int], samples: int) -> None:
-        self._gpu, self._pattern = gpu, PATTERNS[samples]
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], raster: tuple[int, int]) -> None:
+        self._gpu = gpu
         self.surface = GeometryBuffer(gpu, size)
         self.texture = texture_2d(gpu, size, 4, "f2")
         self.second_surface = texture_2d(gpu, size, 4, "f4")
-        self._sums = gpu.ctx.framebuffer([self.texture, self.second_surface])
         self._filled: Rectangle = (0, 0, *size)  # what may hold anything
         self.pixels = gpu.ctx.buffer(reserve=LIST_HEADER_BYTES + 4 * math.prod(size))
-        self._threads = list_threads(gpu, math.prod(size))
         self.triangles = EdgeTriangles(gpu, raster)
-        self._first = Kernel(gpu, "sample_coverage", FIRST=1)
-        self._further = Kernel(gpu, "sample_coverage")
+        self._first, self._groups = Kernel(gpu, "sample_coverage"), ListGroups(gpu, EDGE_GROUP)
+        self._further = Kernel(
+            gpu, "edge_samples", SAMPLES=len(PATTERN), OFFSETS_PX=_as_glsl(PATTERN), NEAR=NEAR_M
+        )
 
     def run(
         self,
@@ -135,30 +144,31 @@ class SampleCoverage:
         `scene` brings the camera of `view`, which looks at `raster` through the lens: not `with_antialiasing`.
         """
         in_picture, in_raster = rectangles
-        self._clear(in_picture)
-        for number, (x, y) in enumerate(self._pattern):
-            offset = (x / STEPS, y / STEPS)
-            geometry.run(
-                raster,
-                self.triangles if number else mesh,
-                view,
-                scene,
-                offset=offset,
-                rectangle=in_raster,
-                sample=number / len(self._pattern),
-                sample_coverage=self.texture,
-            )
-            own = self._sampled(offset, in_picture, in_raster)
-            if number:
-                self._further.run((self._threads,), raster.bindings, scene, own)
-            else:
-                self.triangles.find_thin(mesh, view, raster, scene)
-                self._first.run(in_picture[2:], raster.bindings, scene, own, self.triangles.bindings)
-                self.triangles.choose(mesh, view, scene)
+        x, y = PATTERN[0]
+        offset = (x / STEPS, y / STEPS)
+        touched = union(self._filled, in_picture)  # what was filled before is emptied
+        self._filled = in_picture
+        self._gpu.clear_start(self.pixels, LIST_HEADER_BYTES)
+        self.triangles.clear()
+        geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster)
+        self.triangles.find_thin(mesh, view, raster, scene)
+        self._first.run(
+            touched[2:],
+            raster.bindings,
+            scene,
+            self._written,
+            self.triangles.bindings,
+            rectangle=touched,
+            raster_rectangle=in_raster,
+            offset=offset,
+            weight=1.0 / len(PATTERN),
+        )
+        self.triangles.list_triangles(mesh, view, scene)
+        groups = self._groups.count(self.pixels)
+        self._further.run_counted(groups, scene, mesh.solid, self._written, self.triangles.lists)
 
-    def _sampled(
-        self, offset: tuple[float, float], in_picture: Rectangle, in_raster: Rectangle
-    ) -> dict[str, Binding]:
+    @property
+    def _written(self) -> dict[str, Binding]:
         return {
             "position_out": self.surface.position,
             "normal_out": self.surface.normal,
@@ -167,27 +177,18 @@ class SampleCoverage:
             "sample_coverage": self.texture,
             "second_surface": self.second_surface,
             "Texels": self.pixels,
-            "rectangle": in_picture,
-            "raster_rectangle": in_raster,
-            "offset": offset,
-            "weight": 1.0 / len(self._pattern),
         }
-
-    def _clear(self, rectangle: Rectangle) -> None:
-        """Clears what was filled before and what will be, and the list of pixels."""
-        for each in (self._filled, rectangle):
-            self.surface.clear(each)
-            self._sums.use()
-            self._sums.clear(viewport=each)
-        self._filled = rectangle
-        self._gpu.clear_start(self.pixels, LIST_HEADER_BYTES)
-        self.triangles.clear()
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_target(self._sums)
         release_all(self.surface, self.texture, self.second_surface, self.pixels, self.triangles)
-        release_all(self._first, self._further)
+        release_all(self._first, self._further, self._groups)
+
+
+def _as_glsl(pattern: Sequence[tuple[int, int]]) -> str:
+    """Returns the offsets of samples as an array of pixels."""
+    offsets = ", ".join(f"vec2({x / STEPS}, {y / STEPS})" for x, y in pattern)
+    return f"vec2[]({offsets})"
 
 
 class ObjectCoverage:

@@ -149,7 +149,7 @@ class MeshBuffers:
         self._indices = gpu.ctx.buffer(reserve=4)
         self._sides = gpu.ctx.buffer(reserve=4)
         self._second_uv: moderngl.Buffer | None = None
-        self._arrays: dict[tuple[int, int], moderngl.VertexArray] = {}
+        self._arrays: dict[int, moderngl.VertexArray] = {}
         self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
         self.triangle_count = 0  # of those that are drawn, with any without area
         self.cutouts = NO_CUTOUTS
@@ -161,8 +161,13 @@ class MeshBuffers:
 
     @property
     def solid(self) -> dict[str, Binding]:
-        """Vertices, triangles, and whether each material has two sides, for the voxeliser."""
-        return {"Vertices": self._vertices, "Indices": self._indices, "Sides": self._sides}
+        """Vertices, triangles, and whether each material has two sides, for passes that walk triangles."""
+        return {
+            "Vertices": self._vertices,
+            "Indices": self._indices,
+            "Sides": self._sides,
+            "SecondUv": self._second_uv,
+        }
 
     def write(self, mesh: GpuMesh) -> None:
         """Replaces the contents by those of `mesh`."""
@@ -198,18 +203,16 @@ class MeshBuffers:
         self._arrays.clear()
         self._second_uv = None if uv is None else self._ctx.buffer(np.ascontiguousarray(uv, np.float32))
 
-    def draw(self, program: moderngl.Program, indices: moderngl.Buffer | None = None) -> None:
-        """Draws all triangles with `program`, or those that `indices` has in their places."""
+    def draw(self, program: moderngl.Program) -> None:
+        """Draws all triangles with `program`."""
         if not self.triangle_count:
             return
-        indices = indices or self._indices
-        key = program.glo, indices.glo
-        if key not in self._arrays:
+        if program.glo not in self._arrays:
             layout: list[tuple[Any, ...]] = [(self._vertices, *_layout_of(program))]
             if self._second_uv is not None and program.get(SECOND_UV, None) is not None:
                 layout.append((self._second_uv, "2f", SECOND_UV))
-            self._arrays[key] = self._ctx.vertex_array(program, layout, indices)
-        self._arrays[key].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
+            self._arrays[program.glo] = self._ctx.vertex_array(program, layout, self._indices)
+        self._arrays[program.glo].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
 
     def release(self) -> None:
         """Frees all buffers."""
@@ -491,14 +494,11 @@ class RasterGeometry:
         *,
         offset: tuple[float, float] = (0.0, 0.0),
         rectangle: Rectangle | None = None,
-        sample: float = 0.0,
-        sample_coverage: moderngl.Texture | None = None,
     ) -> None:
         """Draws `mesh` as `view` sees it, sampled `offset` pixels from the texels' centres.
 
         `scene` brings the view's camera and the mesh's own materials. `rectangle` limits drawing to the texels that
-        can show the mesh; the others keep their contents. `sample`: which part 0..1 of what is blended shows here.
-        Where `sample_coverage` has a sample in front already, uv and vertex colour are not needed.
+        can show the mesh; the others keep their contents.
         """
         if rectangle is None:
             target.clear()
@@ -509,8 +509,6 @@ class RasterGeometry:
             mesh,
             scene,
             clip_from_camera=view.clip_from_camera_at(offset),
-            blend_sample=sample,
-            sample_coverage=sample_coverage,
         )
 
     def release(self) -> None:

@@ -11,7 +11,8 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.coverage import PATTERN_8, STEPS, EdgeTriangles
+from deltalight.render_server.passes import coverage
+from deltalight.render_server.passes.coverage import PATTERN, STEPS, EdgeTriangles
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     FOCAL,
@@ -85,8 +86,8 @@ def area_shares(normal: np.ndarray, shift: float, steps: int = 32) -> np.ndarray
 
 
 def test_the_pattern_holds_one_sample_in_each_row_and_column() -> None:
-    pattern = np.array(PATTERN_8)
-    places = np.arange(1 - len(PATTERN_8), len(PATTERN_8), STEPS // len(PATTERN_8))
+    pattern = np.array(PATTERN)
+    places = np.arange(1 - len(PATTERN), len(PATTERN), STEPS // len(PATTERN))
     assert np.array_equal(np.sort(pattern[:, 0]), places)
     assert np.array_equal(np.sort(pattern[:, 1]), places)
     assert np.all(np.diff((pattern**2).sum(axis=1)) >= 0)
@@ -205,8 +206,9 @@ def knotted(detail: int) -> trimesh.Trimesh:
 
 
 def everywhere(triangles: EdgeTriangles) -> None:
-    """Marks all tiles, so that every sample of every pixel is drawn."""
-    triangles.tiles.write(b"\3\0\0\0" * (triangles.tiles.size // 4))
+    """Marks all tiles, so that every sample of every pixel is found."""
+    triangles.tiles.write(b"\3\0\0\0\0\0\0\0" * (triangles.tiles.size // 8))
+    triangles.nodes.write(b"\0" * 8)
 
 
 @pytest.mark.parametrize("distortion", [0.0, -0.3])
@@ -226,7 +228,7 @@ def test_samples_at_edges_alone_make_the_same_picture(
 
 
 def test_inside_an_object_a_pixel_has_one_sample(objects: ObjectsRenderer, stage: Stage) -> None:
-    """Of a sheet, the pixels along its outline have all of them, and few triangles show there."""
+    """Of a sheet, the pixels along its outline have all of them, and few triangles are listed there."""
     grid = sheet(60, 60, 0.3, 0.3).subdivide_to_size(4 * PIXEL)
     objects.draw(antialiased(glowing(stage, grid)), seen_from_above())
     graph = objects.renderer.graph
@@ -234,9 +236,31 @@ def test_inside_an_object_a_pixel_has_one_sample(objects: ObjectsRenderer, stage
     samples = graph["object surface"].samples
     listed = int(np.frombuffer(samples.pixels.read(4), np.uint32)[0])
     assert 4 * 60 <= listed <= 4 * 60 * 4
-    indices = np.frombuffer(samples.triangles.indices.read(), np.uint32)[: grid.faces.size].reshape(-1, 3)
-    drawn = int((indices[:, 0] != indices[:, 1]).sum())
-    assert 0 < drawn < 0.5 * len(grid.faces)
+    nodes, _ = np.frombuffer(samples.triangles.nodes.read(8), np.uint32)
+    triangles = np.frombuffer(samples.triangles.nodes.read(8 * nodes, offset=8), np.uint32)[::2]
+    assert 0 < len(np.unique(triangles)) < 0.5 * len(grid.faces)
+
+
+def test_where_lists_lack_room_edges_are_those_of_the_first_sample(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for room in ("NODES_PER_TRIANGLE", "NODES_PER_TILE"):
+        monkeypatch.setattr(coverage, room, 0)
+    objects = ObjectsRenderer(gpu, stage)
+    found = objects.coverage(antialiased(glowing(stage, disc_in_the_middle(9.3))), seen_from_above())
+    objects.renderer.release()
+    assert set(np.unique(found)) == {0.0, 1.0}
+    assert found.sum() == pytest.approx(np.pi * 9.3**2, rel=0.05)
+
+
+def test_the_edge_of_a_floor_that_begins_behind_the_camera(objects: ObjectsRenderer, stage: Stage) -> None:
+    """Its triangles cross the near plane, and may show anywhere."""
+    floor = trimesh.creation.box((20.0, 0.2, 3.0))
+    floor.apply_translation((0.0, -0.2 - 0.4 * PIXEL, 0.5))  # from 1 m behind the camera to 2 m before it
+    found = objects.coverage(antialiased(glowing(stage, floor)), seen_from_above())
+    expected = area_shares(np.array([0.0, 1.0]), -(0.1 / PIXEL + 0.4) / 2)
+    assert 0.1 < expected.mean() < 0.9
+    assert np.abs(found - expected).max() <= 1 / 16 + 1e-3
 
 
 def test_without_the_wish_pixels_are_covered_or_not(objects: ObjectsRenderer, stage: Stage) -> None:

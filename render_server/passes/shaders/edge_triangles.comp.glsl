@@ -1,44 +1,63 @@
 // Triangles of the objects at the edges that the picture has of them. FIND_THIN: marks the tiles of the raster in which a triangle may
-// show that no texel's centre there shows, because it is thinner than a texel. Otherwise: which triangles may show in a marked tile, in
-// the mesh's order; the others become points, which draw nothing.
+// show that no texel's centre there shows, because it is thinner than a texel. Otherwise: lists the triangles that may show in a marked
+// tile; a large one in the lists of larger tiles, marked or not.
 #include "common/solid_mesh.glsl"
 #include "common/camera.glsl"
 #include "common/raster_tiles.glsl"
 #include "common/walk.glsl"
 
 layout(local_size_x = 64) in;
+layout(std430) buffer Tiles { Tile tiles[]; };
 uniform mat4 clip_from_camera;
 uniform uint triangle_count;
 
-const int MOST_APART = 16;   // texels or tiles along an axis: a larger triangle is not looked at one by one
+// In texels; whole: beyond the near plane; beside: all of it before that plane, or beyond one side of the raster.
+struct Projected { vec2 a; vec2 b; vec2 c; bool is_whole; bool is_beside; };
 
-struct Projected { vec2 a; vec2 b; vec2 c; bool is_whole; };   // in texels; whole: beyond the near plane
+vec4 clip_of(vec3 place) { return clip_from_camera * (camera_from_world * vec4(place, 1.0)); }
 
-vec2 texel_of(vec3 place, inout bool is_whole) {
-    vec4 clip = clip_from_camera * (camera_from_world * vec4(place, 1.0));
-    is_whole = is_whole && clip.z >= -clip.w && clip.w > 0.0;
-    return (0.5 * clip.xy / clip.w + 0.5) * vec2(raster_size) - 0.5;
+bool is_beyond_near(vec4 clip) { return clip.z >= -clip.w && clip.w > 0.0; }
+
+vec2 texel_of(vec4 clip) { return (0.5 * clip.xy / clip.w + 0.5) * vec2(raster_size) - 0.5; }
+
+// Beyond which sides a point lies, also behind the camera: left, right, above, below. A texel beyond a side still counts as inside.
+bvec4 sides_of(vec4 clip) {
+    vec2 edge = (1.0 + 2.0 / vec2(raster_size)) * clip.w;
+    return bvec4(lessThan(clip.xy, -edge), greaterThan(clip.xy, edge));
 }
 
 Projected projected(Piece t) {
-    bool is_whole = true;
-    vec2 a = texel_of(t.a.place, is_whole), b = texel_of(t.b.place, is_whole), c = texel_of(t.c.place, is_whole);
-    return Projected(a, b, c, is_whole);
+    vec4 a = clip_of(t.a.place), b = clip_of(t.b.place), c = clip_of(t.c.place);
+    bvec4 one = sides_of(a), other = sides_of(b), last = sides_of(c);
+    bvec3 beyond_near = bvec3(is_beyond_near(a), is_beyond_near(b), is_beyond_near(c));
+    bool is_beside = !any(beyond_near);
+    for (int i = 0; i < 4; ++i) is_beside = is_beside || (one[i] && other[i] && last[i]);
+    return Projected(texel_of(a), texel_of(b), texel_of(c), all(beyond_near), is_beside);
 }
 
 vec2 low_of(Projected p) { return min(min(p.a, p.b), p.c); }
 vec2 high_of(Projected p) { return max(max(p.a, p.b), p.c); }
 
-bool is_beside(Projected p) {
-    return any(lessThan(high_of(p), vec2(-1.0))) || any(greaterThan(low_of(p), vec2(raster_size)));
+// Distance of p beyond the line from a to b, away from c, in units of the line's length.
+float beyond(vec2 p, vec2 a, vec2 b, vec2 c, out float length_along_axes) {
+    vec2 across = vec2(b.y - a.y, a.x - b.x);
+    length_along_axes = abs(across.x) + abs(across.y);
+    return dot(p - a, across) * (dot(c - a, across) > 0.0 ? -1.0 : 1.0);
+}
+
+// Whether a square around a middle, of edges 2 `reach`, meets a triangle whose bounds it meets.
+bool meets(vec2 middle, float reach, Projected p) {
+    vec3 l;
+    vec3 apart = vec3(beyond(middle, p.a, p.b, p.c, l.x), beyond(middle, p.b, p.c, p.a, l.y), beyond(middle, p.c, p.a, p.b, l.z));
+    return all(lessThanEqual(apart, reach * l));
 }
 
 #ifdef FIND_THIN
 #include "common/geometry.glsl"
-layout(std430) buffer Tiles { uint tiles[]; };
-
+const int MOST_TEXELS = 16;   // along an axis: those of a larger triangle are not looked at one by one
 const float STOUT = 2.0;   // texels: the least height of a triangle that shows at a texel's centre for certain
-const int MOST_BESIDE = 5;   // texels along an axis from the longest side: sqrt(2) STOUT, 2 REACH and rounding
+const int MOST_BESIDE = 5;   // texels along an axis from the longest side: sqrt(2) STOUT, 2 HALF and rounding
+const float HALF = 0.5;      // texels: through a lens, samples may lie anywhere in a texel
 
 bool is_stout(Projected p) {
     vec2 ab = p.b - p.a, ac = p.c - p.a, bc = p.c - p.b;
@@ -52,21 +71,7 @@ bool shows_behind(ivec2 texel, vec3 p, vec3 n) {
     return shown.w <= 0.0 || dot(shown.xyz - p, n) < -shown.w / raster_pinhole.x;
 }
 
-// Distance of p beyond the line from a to b, away from c, in units of the line's length.
-float beyond(vec2 p, vec2 a, vec2 b, vec2 c, out float length_along_axes) {
-    vec2 across = vec2(b.y - a.y, a.x - b.x);
-    length_along_axes = abs(across.x) + abs(across.y);
-    return dot(p - a, across) * (dot(c - a, across) > 0.0 ? -1.0 : 1.0);
-}
-
-// Whether the samples of a texel, or the square around them, meet a triangle whose bounds they meet.
-bool meets(vec2 texel, Projected p) {
-    vec3 reach;
-    vec3 apart = vec3(beyond(texel, p.a, p.b, p.c, reach.x), beyond(texel, p.b, p.c, p.a, reach.y), beyond(texel, p.c, p.a, p.b, reach.z));
-    return all(lessThanEqual(apart, REACH * reach));
-}
-
-void mark(ivec2 texel) { atomicOr(tiles[tile_number(tile_of(vec2(texel)))], THIN); }
+void mark(ivec2 texel) { atomicOr(tiles[tile_number(tile_of(vec2(texel), 0), 0)].marks, THIN); }
 
 // Marks what a large triangle meets that is not stout: it lies beside its longest side. Not all texels within its bounds, because
 // Mesa's software renderer silently ends all loops of a thread after 65535 iterations.
@@ -79,7 +84,7 @@ void mark_along_longest(Projected p, ivec2 first, ivec2 last) {
         int middle = int(round(from[across] + (float(i) - from[along]) * side[across] / side[along]));
         for (int j = max(middle - MOST_BESIDE, first[across]); j <= min(middle + MOST_BESIDE, last[across]); ++j) {
             ivec2 texel = along == 0 ? ivec2(i, j) : ivec2(j, i);
-            if (meets(vec2(texel), p)) mark(texel);
+            if (meets(vec2(texel), HALF, p)) mark(texel);
         }
     }
 }
@@ -88,46 +93,67 @@ void find_thin(Piece t) {
     Projected at = projected(t);
     vec3 n = cross(t.b.place - t.a.place, t.c.place - t.a.place);
     float size = length(n);
-    if (!at.is_whole || size == 0.0 || is_beside(at)) return;
+    if (!at.is_whole || size == 0.0 || at.is_beside) return;
     n *= (dot(n, camera_position - t.a.place) < 0.0 ? -1.0 : 1.0) / size;
-    ivec2 first = max(ivec2(ceil(low_of(at) - REACH)), ivec2(0)), last = min(ivec2(floor(high_of(at) + REACH)), raster_size - 1);
-    if (any(greaterThan(last - first, ivec2(MOST_APART)))) {
+    ivec2 first = max(ivec2(ceil(low_of(at) - HALF)), ivec2(0)), last = min(ivec2(floor(high_of(at) + HALF)), raster_size - 1);
+    if (any(greaterThan(last - first, ivec2(MOST_TEXELS)))) {
         if (!is_stout(at)) mark_along_longest(at, first, last);
         return;
     }
     for (int y = first.y; y <= last.y; ++y)
         for (int x = first.x; x <= last.x; ++x)
-            if (meets(vec2(x, y), at) && shows_behind(ivec2(x, y), t.a.place, n)) mark(ivec2(x, y));
+            if (meets(vec2(x, y), HALF, at) && shows_behind(ivec2(x, y), t.a.place, n)) mark(ivec2(x, y));
 }
 
 void main() {
     for (uint i = first_item(); i < triangle_count; i += items_apart()) find_thin(triangle_at(i));
 }
 #else
-layout(std430) readonly buffer Tiles { uint tiles[]; };
-layout(std430) writeonly buffer EdgeIndices { uint edge_indices[]; };
+#include "common/plane.glsl"
+layout(rgba32f) writeonly uniform image2D edge_planes;
+layout(std430) buffer EdgeNodes { uint node_count; uint unused; uvec2 nodes[]; };   // triangle, next node + 1
 
 const float MARGIN = 0.02;   // texels, for rounding
 
-bool is_marked(ivec2 low, ivec2 high) {
-    for (int y = low.y; y <= high.y; ++y)
-        for (int x = low.x; x <= high.x; ++x)
-            if (tiles[tile_number(ivec2(x, y))] != 0u) return true;
-    return false;
+void add_to_list(int tile, uint triangle) {
+    uint node = atomicAdd(node_count, 1u);
+    bool fits = node < uint(nodes.length());
+    uint next = atomicExchange(tiles[tile].first, fits ? node + 1u : FULL);
+    if (fits) nodes[node] = uvec2(triangle, next);
 }
 
-bool is_taken(Piece t) {
-    Projected at = projected(t);
-    if (!at.is_whole) return true;
-    if (is_beside(at)) return false;
-    ivec2 first = tile_of(max(low_of(at) - MARGIN, vec2(0.0))), last = tile_of(min(high_of(at) + MARGIN, vec2(raster_size)));
-    return any(greaterThan(last - first, ivec2(MOST_APART))) || is_marked(first, last);
+void add_to_tiles(uint triangle, Projected p, ivec2 first, ivec2 last, int level) {
+    float edge = float(tile_edge(level));
+    for (int y = first.y; y <= last.y; ++y) {
+        for (int x = first.x; x <= last.x; ++x) {
+            int tile = tile_number(ivec2(x, y), level);
+            bool is_wanted = level > 0 || tiles[tile].marks != 0u;
+            vec2 middle = edge * (vec2(x, y) + 0.5) - 0.5;
+            if (is_wanted && (!p.is_whole || meets(middle, 0.5 * edge + MARGIN, p))) add_to_list(tile, triangle);
+        }
+    }
+}
+
+void store_plane(uint triangle, Piece t) {
+    Plane plane = plane_of(t.a.place, t.b.place, t.c.place);
+    imageStore(edge_planes, plane_texel(triangle, 0), vec4(plane.normal, plane.height));
+    imageStore(edge_planes, plane_texel(triangle, 1), vec4(plane.u, 0.0));
+    imageStore(edge_planes, plane_texel(triangle, 2), vec4(plane.v, 0.0));
+}
+
+// One that is not whole may be anywhere.
+void list(uint triangle) {
+    Piece piece = triangle_at(triangle);
+    Projected at = projected(piece);
+    if (at.is_beside) return;
+    store_plane(triangle, piece);
+    vec2 low = at.is_whole ? low_of(at) - MARGIN : vec2(0.0), high = at.is_whole ? high_of(at) + MARGIN : vec2(raster_size);
+    int level = at.is_whole ? 0 : LEVELS - 1;
+    while (level < LEVELS - 1 && any(greaterThanEqual(tile_of(high, level) - tile_of(low, level), ivec2(MOST_TILES)))) ++level;
+    add_to_tiles(triangle, at, tile_of(low, level), tile_of(high, level), level);
 }
 
 void main() {
-    for (uint i = first_item(); i < triangle_count; i += items_apart()) {
-        bool taken = is_taken(triangle_at(i));
-        for (uint k = 3u * i; k < 3u * i + 3u; ++k) edge_indices[k] = taken ? indices[k] : 0u;
-    }
+    for (uint i = first_item(); i < triangle_count; i += items_apart()) list(i);
 }
 #endif

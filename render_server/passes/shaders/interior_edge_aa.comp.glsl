@@ -18,10 +18,12 @@ float away(ivec2 at, vec3 place) {
     return abs(dot(apart, texelFetch(virtual_raster_normal, at, 0).xyz)) + NEARNESS * length(apart);
 }
 
-vec3 radiance_of_other(ivec2 pixel, vec3 place) {
+// That of the pixel if not wanted. (llvmpipe executes both sides of a branch, but no turn of a loop too many.)
+vec3 radiance_of_other(ivec2 pixel, vec3 place, bool wanted) {
     ivec2 last = textureSize(radiance, 0) - 1, best = pixel;
     float least = away(pixel, place);
-    for (int i = 0; i < 9; ++i) {
+    int count = wanted ? 9 : 0;
+    for (int i = 0; i < count; ++i) {
         ivec2 at = clamp(pixel + ivec2(i % 3, i / 3) - 1, ivec2(0), last);
         float d = away(at, place);
         if (d < least) { least = d; best = at; }
@@ -37,6 +39,7 @@ void main() {
     if (covered == 0.0 && texelFetch(sample_coverage, pixel, 0).g == 0.0) return;
     vec4 second = texelFetch(second_surface, pixel, 0);
     vec3 own = texelFetch(radiance, pixel, 0).rgb;
-    if (second.w > 0.0) own = mix(own, radiance_of_other(pixel, second.xyz), second.w / covered);
+    vec3 other = radiance_of_other(pixel, second.xyz, second.w > 0.0);
+    if (second.w > 0.0) own = mix(own, other, second.w / covered);
     imageStore(radiance_out, pixel, vec4(own, 1.0));
 }

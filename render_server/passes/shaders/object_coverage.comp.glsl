@@ -16,11 +16,13 @@ ivec2 neighbour(ivec2 pixel, int i, ivec2 size) {
     return clamp(pixel + ivec2(i % WINDOW, i / WINDOW) - WINDOW / 2, ivec2(0), size - 1);
 }
 
-// Fraction of the window in front, over the pixels that are near and of similar colour.
-float softened(ivec2 pixel, float z, ivec2 size) {
+// Fraction of the window in front, over the pixels that are near and of similar colour; if not wanted, any. (llvmpipe executes both
+// sides of a branch, but no turn of a loop too many.)
+float softened(ivec2 pixel, float z, ivec2 size, bool wanted) {
     vec3 colour = texelFetch(linear_picture, pixel, 0).rgb;
     float sum = 0.0, weight = 0.0;
-    for (int i = 0; i < WINDOW * WINDOW; ++i) {
+    int count = wanted ? WINDOW * WINDOW : 0;
+    for (int i = 0; i < count; ++i) {
         ivec2 at = neighbour(pixel, i, size);
         vec3 d = (texelFetch(linear_picture, at, 0).rgb - colour) / (0.05 + colour);
         vec2 away = vec2(at - pixel);
@@ -40,8 +42,10 @@ void main() {
     float fraction = 0.0;
     for (int i = 0; i < WINDOW * WINDOW; ++i) fraction += in_front(neighbour(pixel, i, size), z);
     fraction /= float(WINDOW * WINDOW);
-    if (fraction > 0.0 && fraction < 1.0) {
-        fraction = softened(pixel, z, size);
+    bool at_edge = fraction > 0.0 && fraction < 1.0;
+    float smooth_fraction = softened(pixel, z, size, at_edge);
+    if (at_edge) {
+        fraction = smooth_fraction;
         append_texel(pixel, size.x);
     }
     if (antialiased) fraction *= covered_fraction(pixel, z);

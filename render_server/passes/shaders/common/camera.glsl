@@ -5,6 +5,5 @@ layout(std140) uniform Camera {
     vec4 camera_pinhole;    // fx, fy, cx, cy of the picture (pixel centres at integers)
     vec4 raster_pinhole;    // the same of the objects' raster, which is slightly wider
     vec3 camera_position;   // optical centre, world m
-    bool lens_distortion;   // the raster is sampled through the lens model
     vec2 picture_size;      // width and height, pixels
 };

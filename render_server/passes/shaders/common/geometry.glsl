@@ -6,6 +6,7 @@ uniform sampler2D virtual_raster_position; // world m; w: depth along the optica
 uniform sampler2D virtual_raster_normal;   // world; w: material index
 uniform sampler2D picture_rays;           // (x/z, y/z) of each pixel
 #include "common/camera.glsl"
+#pragma switch bool lens_distortion   // the raster is sampled through the lens model
 
 // Raster texel that a picture pixel sees.
 ivec2 raster_texel(ivec2 pixel) {
