@@ -26,7 +26,6 @@ STEPS = 16
 # Of shaders/common/raster_tiles.glsl: texels an edge of a tile, tiles an edge of one of the next level.
 TILE, MOST_TILES, LEVELS = 2, 16, 4
 EDGE_GROUP = 64  # threads of a workgroup of shaders/edge_samples.comp.glsl
-PLANES_ROW = 1024  # triangles in a row of their planes' image, as in shaders/common/plane.glsl
 TILE_BYTES = NODE_BYTES = NODES_HEADER_BYTES = 8
 # Room for lists: small triangles meet two to four tiles each, large ones as many as there are in layers. Where it
 # does not suffice, edges are not antialiased.
@@ -51,7 +50,6 @@ class EdgeTriangles:
         self._least_nodes = NODES_PER_TILE * counts[0]
         self.tiles = gpu.ctx.buffer(reserve=TILE_BYTES * sum(counts))
         self.nodes = gpu.ctx.buffer(reserve=NODES_HEADER_BYTES)
-        self._planes = texture_2d(gpu, (3 * PLANES_ROW, 1), 4, "f4")
         self._thin = Kernel(gpu, "edge_triangles", FIND_THIN=1)
         self._listed = Kernel(gpu, "edge_triangles")
 
@@ -62,8 +60,8 @@ class EdgeTriangles:
 
     @property
     def lists(self) -> dict[str, Binding]:
-        """The tiles, their lists, and the planes of the triangles in them."""
-        return {**self.bindings, "EdgeNodes": self.nodes, "edge_planes": self._planes}
+        """The tiles and their lists."""
+        return {**self.bindings, "EdgeNodes": self.nodes}
 
     def clear(self) -> None:
         """Marks no tile, and empties all lists."""
@@ -81,10 +79,6 @@ class EdgeTriangles:
         if self.nodes.size < size:
             self.nodes.orphan(size)
             self._gpu.clear_start(self.nodes, NODES_HEADER_BYTES)
-        rows = -(-mesh.triangle_count // PLANES_ROW)
-        if self._planes.height < rows:
-            self._planes.release()
-            self._planes = texture_2d(self._gpu, (3 * PLANES_ROW, rows), 4, "f4")
         self._run(self._listed, mesh, view, scene, self.lists)
 
     def _run(
@@ -95,16 +89,15 @@ class EdgeTriangles:
         kernel.run(
             (min(mesh.triangle_count, MOST_WALKERS),),
             scene,
-            mesh.solid,
             own,
+            mesh_corners=mesh.corners,
             clip_from_camera=view.clip_from_camera,
             triangle_count=mesh.triangle_count,
-            behind=0.0,
         )
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.tiles, self.nodes, self._planes, self._thin, self._listed)
+        release_all(self.tiles, self.nodes, self._thin, self._listed)
 
 
 class SampleCoverage:
@@ -165,7 +158,9 @@ class SampleCoverage:
         )
         self.triangles.list_triangles(mesh, view, scene)
         groups = self._groups.count(self.pixels)
-        self._further.run_counted(groups, scene, mesh.solid, self._written, self.triangles.lists)
+        self._further.run_counted(
+            groups, scene, mesh.solid, self._written, self.triangles.lists, mesh_corners=mesh.corners
+        )
 
     @property
     def _written(self) -> dict[str, Binding]:

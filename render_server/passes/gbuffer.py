@@ -135,6 +135,7 @@ def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray
 NO_CUTOUTS: Bindings = {"CUTOUTS": False}
 NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
 VERTEX_BYTES, TRIANGLE_BYTES = 48, 12  # of a row of VERTEX_LAYOUT, and of three indices
+CORNERS_ROW = 1024  # triangles in a row of their corners' texels
 
 
 class MeshBuffers:
@@ -144,11 +145,13 @@ class MeshBuffers:
     """
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._ctx = gpu.ctx
+        self._gpu, self._ctx = gpu, gpu.ctx
         self._vertices = gpu.ctx.buffer(reserve=4)
         self._indices = gpu.ctx.buffer(reserve=4)
         self._sides = gpu.ctx.buffer(reserve=4)
         self._second_uv: moderngl.Buffer | None = None
+        self._corners: moderngl.Texture | None = None
+        self._written: GpuMesh | None = None  # if not by a kernel
         self._arrays: dict[int, moderngl.VertexArray] = {}
         self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
         self.triangle_count = 0  # of those that are drawn, with any without area
@@ -169,10 +172,22 @@ class MeshBuffers:
             "SecondUv": self._second_uv,
         }
 
+    @property
+    def corners(self) -> moderngl.Texture:
+        """Positions of the triangles' corners as shaders/common/plane.glsl reads them; of a mesh that was written."""
+        assert self._written is not None
+        if self._corners is None:
+            rows = max(-(-len(self.triangles) // CORNERS_ROW), 1)
+            texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
+            texels[: len(self.triangles), :, :3] = self._written.corners
+            self._corners = texture_2d(self._gpu, (3 * CORNERS_ROW, rows), 4, "f4", data=texels.tobytes())
+        return self._corners
+
     def write(self, mesh: GpuMesh) -> None:
         """Replaces the contents by those of `mesh`."""
         vertices = np.ascontiguousarray(mesh.vertices, np.float32)
         self.reserve(len(vertices), len(mesh.triangles), mesh)
+        self._written = mesh
         self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
         if self.triangle_count:
             self._vertices.write(vertices)
@@ -187,7 +202,9 @@ class MeshBuffers:
             self._vertices = self._ctx.buffer(reserve=max(vertex_bytes, 4))
             self._indices = self._ctx.buffer(reserve=max(index_bytes, 4))
             self._sides = self._ctx.buffer(reserve=4)
-        self.triangles, self.triangle_count = NO_TRIANGLES, triangle_count
+        self.triangles, self.triangle_count, self._written = NO_TRIANGLES, triangle_count, None
+        release_all(self._corners)
+        self._corners = None
         if triangle_count:
             self._write_sides(materials.material_table[:, DOUBLE_SIDED])
 
@@ -216,9 +233,10 @@ class MeshBuffers:
 
     def release(self) -> None:
         """Frees all buffers."""
-        release_all(*self._arrays.values(), self._vertices, self._indices, self._sides, self._second_uv)
+        release_all(*self._arrays.values(), self._vertices, self._indices, self._sides)
+        release_all(self._second_uv, self._corners)
         self._arrays.clear()
-        self._second_uv = None
+        self._second_uv = self._corners = None
 
 
 def _layout_of(program: moderngl.Program) -> tuple[str, ...]:

@@ -13,7 +13,6 @@ layout(rgba8) writeonly uniform image2D tint_out;
 layout(rgba16f) uniform image2D sample_coverage;   // as in sample_coverage.comp.glsl
 // samples of another surface: the first one's position, w: their fraction
 layout(rgba32f) writeonly uniform image2D second_surface;
-layout(rgba32f) readonly uniform image2D edge_planes;
 layout(std430) readonly buffer Tiles { Tile tiles[]; };
 layout(std430) readonly buffer EdgeNodes { uint node_count; uint unused; uvec2 nodes[]; };   // triangle, next node + 1
 
@@ -51,14 +50,8 @@ bool is_there(uint triangle, int k) {
 bool is_there(uint triangle, int k) { return true; }
 #endif
 
-// Of an image, because software renderers load buffers lane by lane, number by number.
-Plane listed_plane(uint triangle) {
-    vec4 normal = imageLoad(edge_planes, plane_texel(triangle, 0));
-    return Plane(normal.xyz, imageLoad(edge_planes, plane_texel(triangle, 1)).xyz, imageLoad(edge_planes, plane_texel(triangle, 2)).xyz, normal.w);
-}
-
 void meet(uint triangle) {
-    Plane plane = listed_plane(triangle);
+    Plane plane = plane_of(corners_of(triangle));
     mat3 products = mat3(plane.normal, plane.u, plane.v);   // of all three with a ray: linear in it
     vec3 at = ray * products, beside = right * products, below = down * products;
     for (int k = 1; k < SAMPLES; ++k) {

@@ -1,8 +1,7 @@
 // Triangles of the objects at the edges that the picture has of them. FIND_THIN: marks the tiles of the raster in which a triangle may
 // show that no texel's centre there shows, because it is thinner than a texel. Otherwise: lists the triangles that may show in a marked
 // tile; a large one in the lists of larger tiles, marked or not.
-#include "common/solid_mesh.glsl"
-#include "common/camera.glsl"
+#include "common/plane.glsl"
 #include "common/raster_tiles.glsl"
 #include "common/walk.glsl"
 
@@ -26,8 +25,8 @@ bvec4 sides_of(vec4 clip) {
     return bvec4(lessThan(clip.xy, -edge), greaterThan(clip.xy, edge));
 }
 
-Projected projected(Piece t) {
-    vec4 a = clip_of(t.a.place), b = clip_of(t.b.place), c = clip_of(t.c.place);
+Projected projected(mat3 corners) {
+    vec4 a = clip_of(corners[0]), b = clip_of(corners[1]), c = clip_of(corners[2]);
     bvec4 one = sides_of(a), other = sides_of(b), last = sides_of(c);
     bvec3 beyond_near = bvec3(is_beyond_near(a), is_beyond_near(b), is_beyond_near(c));
     bool is_beside = !any(beyond_near);
@@ -89,12 +88,12 @@ void mark_along_longest(Projected p, ivec2 first, ivec2 last) {
     }
 }
 
-void find_thin(Piece t) {
-    Projected at = projected(t);
-    vec3 n = cross(t.b.place - t.a.place, t.c.place - t.a.place);
+void find_thin(mat3 corners) {
+    Projected at = projected(corners);
+    vec3 n = cross(corners[1] - corners[0], corners[2] - corners[0]);
     float size = length(n);
     if (!at.is_whole || size == 0.0 || at.is_beside) return;
-    n *= (dot(n, camera_position - t.a.place) < 0.0 ? -1.0 : 1.0) / size;
+    n *= (dot(n, camera_position - corners[0]) < 0.0 ? -1.0 : 1.0) / size;
     ivec2 first = max(ivec2(ceil(low_of(at) - HALF)), ivec2(0)), last = min(ivec2(floor(high_of(at) + HALF)), raster_size - 1);
     if (any(greaterThan(last - first, ivec2(MOST_TEXELS)))) {
         if (!is_stout(at)) mark_along_longest(at, first, last);
@@ -102,15 +101,13 @@ void find_thin(Piece t) {
     }
     for (int y = first.y; y <= last.y; ++y)
         for (int x = first.x; x <= last.x; ++x)
-            if (meets(vec2(x, y), HALF, at) && shows_behind(ivec2(x, y), t.a.place, n)) mark(ivec2(x, y));
+            if (meets(vec2(x, y), HALF, at) && shows_behind(ivec2(x, y), corners[0], n)) mark(ivec2(x, y));
 }
 
 void main() {
-    for (uint i = first_item(); i < triangle_count; i += items_apart()) find_thin(triangle_at(i));
+    for (uint i = first_item(); i < triangle_count; i += items_apart()) find_thin(corners_of(i));
 }
 #else
-#include "common/plane.glsl"
-layout(rgba32f) writeonly uniform image2D edge_planes;
 layout(std430) buffer EdgeNodes { uint node_count; uint unused; uvec2 nodes[]; };   // triangle, next node + 1
 
 const float MARGIN = 0.02;   // texels, for rounding
@@ -134,19 +131,10 @@ void add_to_tiles(uint triangle, Projected p, ivec2 first, ivec2 last, int level
     }
 }
 
-void store_plane(uint triangle, Piece t) {
-    Plane plane = plane_of(t.a.place, t.b.place, t.c.place);
-    imageStore(edge_planes, plane_texel(triangle, 0), vec4(plane.normal, plane.height));
-    imageStore(edge_planes, plane_texel(triangle, 1), vec4(plane.u, 0.0));
-    imageStore(edge_planes, plane_texel(triangle, 2), vec4(plane.v, 0.0));
-}
-
 // One that is not whole may be anywhere.
 void list(uint triangle) {
-    Piece piece = triangle_at(triangle);
-    Projected at = projected(piece);
+    Projected at = projected(corners_of(triangle));
     if (at.is_beside) return;
-    store_plane(triangle, piece);
     vec2 low = at.is_whole ? low_of(at) - MARGIN : vec2(0.0), high = at.is_whole ? high_of(at) + MARGIN : vec2(raster_size);
     int level = at.is_whole ? 0 : LEVELS - 1;
     while (level < LEVELS - 1 && any(greaterThanEqual(tile_of(high, level) - tile_of(low, level), ivec2(MOST_TILES)))) ++level;

@@ -22,10 +22,9 @@ mat3 corner_vectors(uvec3 corners, uint column) {
 vec2 second_uv_of(uint vertex) { return vertex < uint(second_uvs.length()) ? second_uvs[vertex] : vec2(0.0); }
 
 // `right`, `down`: what a pixel adds to the ray.
-void find_maps(inout Fragment f, uvec3 corners, mat3 uv, Plane plane, vec3 weights, vec3 ray, vec3 right, vec3 down) {
+void find_maps(inout Fragment f, uvec3 corners, mat3 places, mat3 uv, Plane plane, vec3 weights, vec3 ray, vec3 right, vec3 down) {
     mat3x2 second = mat3x2(second_uv_of(corners.x), second_uv_of(corners.y), second_uv_of(corners.z));
     vec3 beside = corner_weights(plane, ray + right) - weights, below = corner_weights(plane, ray + down) - weights;
-    mat3 places = corner_vectors(corners, 0u);
     f.second_uv = second * weights;
     f.uv_slopes = vec4((uv * beside).xy, (uv * below).xy);
     f.second_uv_slopes = vec4(second * beside, second * below);
@@ -37,8 +36,8 @@ void find_maps(inout Fragment f, uvec3 corners, mat3 uv, Plane plane, vec3 weigh
 // Where `ray`, whose length along the optical axis is 1, meets a triangle; `right`, `down`: what a pixel adds to it.
 Fragment fragment_at(uint triangle, vec3 ray, vec3 right, vec3 down) {
     uvec3 corners = vertices_of(triangle);
-    mat3 places = corner_vectors(corners, 0u), uv = corner_vectors(corners, 6u);
-    Plane plane = plane_of(places[0], places[1], places[2]);
+    mat3 places = corners_of(triangle), uv = corner_vectors(corners, 6u);
+    Plane plane = plane_of(places);
     vec3 weights = corner_weights(plane, ray);
     float towards = dot(ray, plane.normal);
     Fragment f;
@@ -51,7 +50,7 @@ Fragment fragment_at(uint triangle, vec3 ray, vec3 right, vec3 down) {
     f.material = material_of(triangle);
     f.is_front = towards > 0.0;
 #ifdef MATERIAL_MAPS
-    find_maps(f, corners, uv, plane, weights, ray, right, down);
+    find_maps(f, corners, places, uv, plane, weights, ray, right, down);
 #endif
     return f;
 }
