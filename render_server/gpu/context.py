@@ -144,8 +144,8 @@ class GpuContext:
 
     @cached_property
     def defines(self) -> dict[str, str]:
-        """What all shaders are compiled with: in software, the cores that share a kernel (common/walk.glsl)."""
-        return {"CORES": f"{os.cpu_count() or 1}u"} if self.is_software else {}
+        """What all shaders are compiled with: SOFTWARE, and the cores that then share a kernel (common/walk.glsl)."""
+        return {"SOFTWARE": "1", "CORES": f"{os.cpu_count() or 1}u"} if self.is_software else {}
 
     def compiled(self, label: str, sources: Mapping[str, str]) -> None:
         """Tells the compile watchers about a program."""

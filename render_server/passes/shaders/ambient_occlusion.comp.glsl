@@ -4,7 +4,7 @@
 #include "common/basis.glsl"
 #include "common/interleaved.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(r16f) writeonly uniform image2D occlusion_out;   // cosine-weighted fraction of the hemisphere that is open
 uniform ivec4 rectangle;          // that may show an object: first pixel, size
 uniform float occlusion_radius;   // m, within which things count in full, and fade up to twice of it

@@ -4,7 +4,7 @@
 #include "common/low_res_grid.glsl"
 #include "common/continuation.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D traced_rho;
 layout(rgba16f) writeonly uniform image2D irradiance_rho;
 #ifdef REAL

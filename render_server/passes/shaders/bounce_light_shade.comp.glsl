@@ -4,7 +4,7 @@
 #include "common/object_field.glsl"
 #include "common/low_res_grid.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba32f) uniform image2D bounce_irradiance;   // rgb irradiance
 layout(rgba32f) uniform image2D bounce_mirrored;     // rgb radiance
 uniform sampler3D bounce_light;                      // a slab per coefficient

@@ -1,5 +1,5 @@
 // Which cells of CELL x CELL texels of the light views' depth maps show anything: 0 those, FAR the others.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(r32f) writeonly uniform image2D cells_out;
 uniform sampler2D depth_map;
 uniform int tile_size;    // texels an edge

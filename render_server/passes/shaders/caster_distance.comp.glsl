@@ -1,6 +1,6 @@
 // One axis of the squared distance, in cells, from any point of a cell to the nearest cell that shows anything (separable,
 // as in Felzenszwalb and Huttenlocher 2012). Distances are between the cells' borders, so they are never too large.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(r32f) readonly uniform image2D cells;
 layout(r32f) writeonly uniform image2D cells_out;
 uniform int tile_cells;   // an edge

@@ -15,7 +15,7 @@
 #define APPENDS_SENT_BEAMS
 #include "common/sent_beams.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D virtual_light_uv;
 uniform sampler2D virtual_light_normal;
 uniform int view_index;

@@ -6,7 +6,7 @@
 #endif
 #include "common/work_list.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
 #ifdef RATIO
 layout(rgba16f) writeonly uniform image2D change_ratio_out;

@@ -129,13 +129,15 @@ vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b, out vec3 ratio) {
     return w * b * ratio + max(vec3(0.0), glossy + specular_change(c, glossy));
 }
 
-// Where depth is unknown the change of light continues from surroundings of similar colour; 1 if there are none.
-vec3 surrounding_ratio(ivec2 pixel, vec3 b) {
+// Where depth is unknown the change of light continues from surroundings of similar colour; 1 if there are none, or if not wanted.
+// (llvmpipe executes both sides of a branch, but no turn of a loop too many.)
+vec3 surrounding_ratio(ivec2 pixel, vec3 b, bool wanted) {
     ivec2 centre = pixel / scale, last = textureSize(sample_pixels, 0) - 1;
     float total = 1e-4;   // no change if all are far away or of another colour
     vec3 sum = vec3(total);
-    for (int j = -FILL_RADIUS; j <= FILL_RADIUS; ++j)
-        for (int i = -FILL_RADIUS; i <= FILL_RADIUS; ++i) {
+    int reach = wanted ? FILL_RADIUS : -1;
+    for (int j = -reach; j <= reach; ++j)
+        for (int i = -reach; i <= reach; ++i) {
             ivec2 texel = clamp(centre + ivec2(i, j), ivec2(0), last);
             vec4 ratio = texelFetch(change_ratio, texel, 0);
             if (ratio.a == 0.0) continue;
@@ -172,8 +174,10 @@ void compose(ivec2 pixel) {
         Change c = change_at(at, position, normal);
         if (c.any_change) { result = relit(at, c, normal, b, ratio); changed = true; }
     }
-    if (relights && position.w <= 0.0) {
-        ratio = surrounding_ratio(pixel, b);
+    bool is_unknown = relights && position.w <= 0.0;
+    vec3 around = surrounding_ratio(pixel, b, is_unknown);
+    if (is_unknown) {
+        ratio = around;
         if (ratio != vec3(1.0)) { result = b * ratio; changed = true; }
     }
     if (shown > 0.0) {

@@ -1,5 +1,5 @@
 // One picture going over into another, in codes. Where both show the same, so does this.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform usampler2D before;
 uniform usampler2D after;
 uniform float share;       // of `after`

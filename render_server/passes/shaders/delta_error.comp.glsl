@@ -3,7 +3,7 @@
 #include "common/paper_cones.glsl"
 #include "common/low_res_grid.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D error_out;   // rgb E, a: 1 where known
 uniform sampler3D volume_mu;      // of the real scene alone, with its own opacity
 uniform sampler3D volume_rho;     // a: V_eta, of the real scene and the objects

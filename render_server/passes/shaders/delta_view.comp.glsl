@@ -2,7 +2,7 @@
 // alone: gained light in its own colour, lost light as red, both amplified; objects black.
 #include "common/srgb.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 uniform sampler2D linear_picture;
 uniform sampler2D relit;

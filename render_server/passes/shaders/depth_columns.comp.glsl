@@ -1,6 +1,6 @@
 // Change of w by pixel, by least squares over the window of rows around each pixel; whether it is known, and whether the
 // window crosses an edge. Offsets count from the pixel itself, so that no large numbers cancel.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D inverse_depth;
 uniform sampler2D row_moments;   // as depth_rows leaves them
 uniform sampler2D row_depth;

@@ -2,7 +2,7 @@
 // between surfaces.
 #include "common/depth_fit.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D depth_map;   // m along the optical axis, 0 unknown
 layout(r32f) writeonly uniform image2D inverse_out;
 

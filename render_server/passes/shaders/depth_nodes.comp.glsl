@@ -11,7 +11,7 @@ uniform int depth_view_number;   // of this camera
 uniform int coarseness;          // of this mesh: 0 fine, 1 coarse
 #endif
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D node_rays;       // (x/z, y/z) of the cells' centres
 uniform sampler2D grazing_depth;   // 1/m, of surfaces too oblique to measure; 0 elsewhere
 uniform int stride;                // pixels

@@ -1,7 +1,7 @@
 // Joins neighbouring nodes of a depth image's mesh that lie on one surface: two triangles for each quad of nodes, of which
 // those that are not there have no area (scene/depth_mesh.py). Seen from the camera, they are counter-clockwise. A triangle
 // goes if others show all of its corners larger, so that meshes of several cameras overlap where they meet.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D nodes;         // as depth_nodes leaves them
 uniform vec2 node_threshold;     // of w, from node to node: per w, and at least
 uniform int first_vertex, first_triangle;

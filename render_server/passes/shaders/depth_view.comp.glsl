@@ -2,7 +2,7 @@
 #define FITS_DEPTH
 #include "common/fitted_normal.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform int layer;
 layout(r32f) writeonly uniform image2DArray inverse_out;
 

@@ -1,6 +1,6 @@
 // A picture of the camera's size from a relit one that is smaller: what it shows, and the camera's own detail, in codes. Where the
 // objects change nothing, the camera's bytes.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform usampler2D picture;             // the camera's
 uniform usampler2D small_picture;       // the same, smaller
 uniform usampler2D small_composite;

@@ -1,6 +1,6 @@
 // [P1] eq. 9 in the colours of [P1] fig. 3: the channel of E / pi, the radiance of a white surface, that differs most, squared
 // and enhanced. Black, red, yellow where the relit picture is too dark, black, blue, white where it is too bright.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 uniform sampler2D delta_error;   // rgb E at 1/scale of the picture, a: 1 where known
 uniform bool has_error;

@@ -17,7 +17,7 @@
 #endif
 #endif
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform sampler2D virtual_raster_tint;
 #ifdef PRECOMPUTED

@@ -1,6 +1,6 @@
 // Where samples of a pixel show another surface of the objects than the shaded one, mixes in the light of that
 // surface from the neighbour that shows it, by the samples' fraction.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform sampler2D radiance;
 uniform sampler2D sample_coverage;

@@ -3,7 +3,7 @@
 #include "common/lights.glsl"
 #include "common/low_res_grid.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D changes;
 uniform sampler2D unoccluded;
 uniform sampler2D natural;

@@ -1,7 +1,7 @@
 // Camera code -> linear camera units; a = 0 where a channel is clipped.
 #include "common/camera_codes.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D linear_out;
 
 void main() {

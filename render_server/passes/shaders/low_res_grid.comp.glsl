@@ -6,7 +6,7 @@
 #define APPENDS_PIXELS
 #include "common/shown_pixels.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16i) writeonly uniform iimage2D sample_pixels_out;
 uniform sampler2D object_coverage;
 uniform ivec2 picture_pixels;

@@ -10,7 +10,7 @@
 #include "common/volume.glsl"
 #include "common/inject_light.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D real_albedo;
 uniform sampler2D real_light_normal;
 uniform sampler2D virtual_light_uv;

@@ -7,7 +7,7 @@
 #include "common/lpv_light.glsl"
 #include "common/low_res_grid.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 #ifdef REAL
 layout(rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where known
 layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade

@@ -1,7 +1,7 @@
 // Copies what a camera measures, its linear picture and depth, into its layer of those of all cameras.
 #include "common/camera_image.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2DArray radiance_out;
 layout(r32f) writeonly uniform image2DArray depth_out;
 uniform int layer;

@@ -4,7 +4,7 @@
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba32f) writeonly uniform image2D position_out;   // world m; w: 1 if there is one
 layout(rgba16f) writeonly uniform image2D normal_out;     // world; w: material
 uniform isampler2D sample_pixels;

@@ -3,7 +3,7 @@
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D reflection;
 layout(rgba16f) writeonly uniform image2D traced;
 layout(r16f) writeonly uniform image2D hit_distance;

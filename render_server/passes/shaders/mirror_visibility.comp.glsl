@@ -4,7 +4,7 @@
 #include "common/geometry.glsl"
 #include "common/surfaces.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rg16f) writeonly uniform image2DArray visibility_out;
 uniform int first_image;       // index of the first light that is a mirror image
 #include "common/camera.glsl"

@@ -1,7 +1,7 @@
 // Least known depth (in all components; 0: none is known) over a window of `source`, whose last component is depth:
 // first over blocks of pixels, then over neighbouring blocks. A minimum keeps its place in comparisons: what it lies
 // behind, all of the window lies behind.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba32f) writeonly uniform image2D nearest_out;
 uniform sampler2D source;
 uniform ivec4 blocks;   // first column and row, width and height

@@ -5,7 +5,7 @@
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(r16f) writeonly uniform image2D object_coverage_out;
 uniform sampler2D linear_picture;
 uniform ivec2 first_pixel;     // of the rectangle that may show an object; the rest was cleared

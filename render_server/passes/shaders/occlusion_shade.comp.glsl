@@ -7,7 +7,7 @@
 #include "common/object_field.glsl"
 #include "common/low_res_grid.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba32f) uniform image2D unoccluded; // rgb: remaining fraction of E
 layout(rgba32f) uniform image2D natural;    // rgb: E of each object's surroundings times weight; a: weight
 layout(rgba32f) uniform image2D mirrored;   // rgb: mean radiance in the mirror direction times weight; a: remaining fraction

@@ -5,7 +5,7 @@
 #include "common/light_probe.glsl"
 #include "common/object_field.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
 uniform sampler2D linear_picture;
 layout(std430) buffer ProbeSums { int sums[]; };   // 4 per texel: radiance x solid angle, solid angle

@@ -3,7 +3,7 @@
 #include "common/measured_surfaces.glsl"
 #include "common/fitted_normal.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D depth_map;   // m along the optical axis, 0 unknown
 layout(rgba32f) writeonly uniform image2D position_out;
 layout(rgba16f) writeonly uniform image2D normal_out;
@@ -15,24 +15,27 @@ vec3 world_at(ivec2 pixel, float z) { return (world_from_camera * vec4(camera_at
 #ifdef DECLARED_SURFACES
 bool is_plane(int entry) { return entry >= 0 && surfaces[entry].region[0].w == PLANE; }
 
-// Whether most of the pixel and its neighbours are off the plane: single ones are outliers of the noise.
+// Whether the entry is a plane that most of the pixel and its neighbours are off: single ones are outliers of the noise. (llvmpipe
+// executes both sides of a branch, but no turn of a loop too many.)
 bool leaves_plane(int entry, ivec2 pixel) {
     ivec2 last = textureSize(depth_map, 0) - 1;
-    int known = 0, off = 0;
-    for (int j = 0; j < 9; ++j) {
+    int known = 0, off = 0, count = is_plane(entry) ? 9 : 0;
+    SurfaceEntry plane = surfaces[max(entry, 0)];
+    vec2 fit = plane_fits[max(entry, 0)];
+    for (int j = 0; j < count; ++j) {
         ivec2 at = clamp(pixel + ivec2(j % 3, j / 3) - 1, ivec2(0), last);
         float z = texelFetch(depth_map, at, 0).r;
-        if (z <= 0.0) continue;
-        ++known;
-        off += int(is_off_plane(entry, world_at(at, z), z));
+        known += int(z > 0.0);
+        off += int(z > 0.0 && is_off_plane(plane, fit, world_at(at, z), z));
     }
     return 2 * off > known;
 }
 
 // `normal`: zero if unknown.
 int entry_of(ivec2 pixel, vec3 world, float z, vec3 normal) {
-    int entry = measured_entry(0, world, z, normal, -2.0);
-    while (is_plane(entry) && leaves_plane(entry, pixel)) entry = measured_entry(entry + 1, world, z, normal, -2.0);
+    int entry = -1;
+    do entry = measured_entry(entry + 1, world, z, normal, -2.0);
+    while (leaves_plane(entry, pixel));
     return entry;
 }
 #else

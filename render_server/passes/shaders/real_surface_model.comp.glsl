@@ -2,7 +2,7 @@
 #include "common/geometry.glsl"
 #include "common/measured_surfaces.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform sampler2D model_raster_position;   // like the objects' raster (common/geometry.glsl)
 uniform sampler2D model_raster_normal;
 layout(rgba32f) uniform image2D position_out;
@@ -13,7 +13,7 @@ uniform vec2 tolerance;       // up to which both agree: m, and m at 1 m
 #ifdef DECLARED_SURFACES
 int entry_of(vec4 position, vec4 seen) {
     int entry = measured_entry(0, position.xyz, position.w, seen.xyz, seen.w);
-    while (entry >= 0 && surfaces[entry].region[0].w == PLANE && is_off_plane(entry, position.xyz, position.w))
+    while (entry >= 0 && surfaces[entry].region[0].w == PLANE && is_off_plane(surfaces[entry], plane_fits[entry], position.xyz, position.w))
         entry = measured_entry(entry + 1, position.xyz, position.w, seen.xyz, seen.w);
     return entry;
 }

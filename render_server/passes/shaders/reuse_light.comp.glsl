@@ -4,7 +4,7 @@
 #include "common/last_texels.glsl"
 #include "common/lit_pixels.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
 uniform usampler2D stale_texels;
 #ifdef CAUSTICS

@@ -1,5 +1,5 @@
 // The reflective shadow maps: what the lights see of the real scene (left) and of the objects (right), as normals.
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 uniform sampler2D real_light_normal;
 uniform sampler2D virtual_light_normal;

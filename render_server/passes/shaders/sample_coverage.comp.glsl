@@ -7,7 +7,7 @@
 #include "common/raster_tiles.glsl"
 #pragma switch CUTOUTS
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba32f) writeonly uniform image2D position_out;
 layout(rgba16f) writeonly uniform image2D normal_out;
 layout(rg32f) writeonly uniform image2D uv_out;

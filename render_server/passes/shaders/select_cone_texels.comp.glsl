@@ -11,7 +11,7 @@
 #include "common/reprojection.glsl"
 #endif
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D irradiance_mu;
 layout(rgba16f) writeonly uniform image2D irradiance_rho;
 layout(rgba16f) writeonly uniform image2D specular_mu;

@@ -3,7 +3,7 @@
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform ivec2 low_resolution_size;
 uniform int scale;
 

@@ -5,7 +5,7 @@
 #include "common/reprojection.glsl"
 #include "common/last_texels.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
 layout(r8ui) writeonly uniform uimage2D stale_out;
 layout(rgba32f) writeonly uniform image2D real_texels_out;

@@ -3,7 +3,7 @@
 #include "common/volume.glsl"
 #include "common/srgb.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+#include "common/pixel_group.glsl"
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 uniform usampler2D picture;
 uniform sampler2D picture_rays;

@@ -13,10 +13,10 @@ const float FLUSH = 0.7071;     // cosine: what leans by more than 45 degrees st
 // Change of a measured point by one metre of its depth.
 vec3 ray_of(vec3 p, float z) { return (p - camera_position) / z; }
 
-// Whether a point stands higher or lower than noise explains.
-bool is_off_plane(int i, vec3 p, float z) {
-    float slope = abs(dot(ray_of(p, z), surfaces[i].region[1].xyz));
-    return abs(plane_height(surfaces[i], p) - plane_fits[i].x) > SIGMAS * plane_fits[i].y * z * z * slope;
+// Whether a point stands higher or lower than noise explains. `fit`: the plane's, of plane_fits.
+bool is_off_plane(SurfaceEntry plane, vec2 fit, vec3 p, float z) {
+    float slope = abs(dot(ray_of(p, z), plane.region[1].xyz));
+    return abs(plane_height(plane, p) - fit.x) > SIGMAS * fit.y * z * z * slope;
 }
 
 // Where the ray to a point within a plane's tolerance meets the plane.
