@@ -14,13 +14,14 @@ from deltalight.render_server.gpu.uniform_block import UniformBlock
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.passes.camera_image import CameraImage
 from deltalight.render_server.passes.coverage import (
     EdgeUnmixing,
     InteriorEdgeAA,
     ObjectCoverage,
     SampleCoverage,
 )
-from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry
+from deltalight.render_server.passes.gbuffer import GeometryBuffer, RasterGeometry
 from deltalight.render_server.passes.matting import Matting
 from deltalight.render_server.passes.measured_views import MeasuredViews
 from deltalight.render_server.passes.real_surface import RealSurface

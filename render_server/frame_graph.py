@@ -29,9 +29,10 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.lighting import Layers
 from deltalight.render_server.methods.registry import MethodChoice
+from deltalight.render_server.passes.camera_image import CameraImage
 from deltalight.render_server.passes.composite import Composite, DebugViews, RelitLayers
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
-from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer
+from deltalight.render_server.passes.gbuffer import GeometryBuffer
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.voxel_light import AlbedoTexture

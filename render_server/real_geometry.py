@@ -13,7 +13,7 @@ from deltalight.render_server.camera_history import CameraHistory
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import ChooseBacks, DrawnMesh, GeometryState
 from deltalight.render_server.passes.depth_mesh import DepthFrame, DepthMesher
-from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.voxelize import Chosen
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, BOUND_POINTS, REAL_MATERIAL
 from deltalight.render_server.scene.depth_surface import noise_sigma

@@ -46,8 +46,8 @@ from deltalight.render_server.methods.voxel_volumes import (
 )
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceCones
-from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.passes.shading import DirectLightPair
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.passes.voxel_light import AlbedoTexture

@@ -17,8 +17,8 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import Light, LightSet
 from deltalight.render_server.lights.mirror_lights import mirror_lights
 from deltalight.render_server.methods.method import ResolvedSettings
-from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers, MirrorVisibility
+from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.view import NOWHERE, Rectangle

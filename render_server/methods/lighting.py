@@ -21,9 +21,9 @@ from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeams, Caustics
 from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
-from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.measured_views import SURFEL_PICTURE_LOD
+from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.reflections import (
     RAY_ROUGHNESS,
     ROUGHEST,

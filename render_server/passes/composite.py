@@ -11,9 +11,9 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.camera_image import CameraImage, rgba
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.coverage import SURFACE_REACH
-from deltalight.render_server.passes.gbuffer import CameraImage, rgba
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
 from deltalight.render_server.passes.shading import DirectLight

@@ -15,7 +15,8 @@ from deltalight.render_server.gpu.list_groups import (
     list_threads,
 )
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
-from deltalight.render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
+from deltalight.render_server.passes.gbuffer import GeometryBuffer, RasterGeometry
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.view import NEAR_M, CameraView, Rectangle, union
 
 # Sample positions in 1/16 pixels from the pixel's centre, nearest first. Of all patterns of eight with one sample in

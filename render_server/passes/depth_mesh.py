@@ -16,7 +16,7 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.depth_fit import DepthFit
 from deltalight.render_server.passes.depth_views import DepthViewLayers, FittedDepth
-from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.scene.depth_mesh import node_rays, stride_for_budget
 from deltalight.render_server.scene.depth_surface import jump_terms
 from deltalight.render_server.scene.triangle_mesh import GpuMesh

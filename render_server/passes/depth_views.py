@@ -10,8 +10,8 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
-from deltalight.render_server.passes.gbuffer import MeshBuffers
 from deltalight.render_server.passes.measured_views import packed_view
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.view import CameraView
 
 VIEW_TEXELS = 8  # of a DepthView in shaders/common/depth_views.glsl

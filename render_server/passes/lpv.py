@@ -15,7 +15,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.gbuffer import NO_CUTOUTS
+from deltalight.render_server.passes.mesh_buffers import NO_CUTOUTS
 from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.passes.voxels import LOWER_VOLUME, VoxelMipmap, VoxelStore
 

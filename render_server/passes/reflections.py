@@ -11,7 +11,7 @@ from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGrou
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
-from deltalight.render_server.passes.gbuffer import ObjectBvh
+from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.shading import DirectLight
 
 # Of equal energy each: up to RAY_ROUGHNESS they are closer together than voxels. There the cone of the lobe is 48

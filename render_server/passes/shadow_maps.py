@@ -15,7 +15,7 @@ from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.lights.lights import DirectionalLight, Lamp, Light
 from deltalight.render_server.lights.mirror_lights import MirrorLight
-from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
 FAR_MARGIN = 1.02

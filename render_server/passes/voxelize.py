@@ -13,7 +13,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
 from deltalight.render_server.gpu.textures import DelayedRead, release_all
-from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import LOWER_SURFELS, VoxelStore
 

@@ -13,7 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.gbuffer import MeshBuffers, ObjectBvh, bvh_texture
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers, ObjectBvh, bvh_texture
 from deltalight.render_server.scene.bvh import LEAF_SIZE, Bvh, RayCaster, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

@@ -14,7 +14,7 @@ from deltalight.protocol.frames import DepthImage
 from deltalight.protocol.scene_objects import RealScene
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.depth_mesh import DepthFrame, DepthMesher
-from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.real_geometry import EMPTY_MESH, RealGeometry
 from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, bound_points, depth_mesh
 from deltalight.render_server.scene.triangle_mesh import merge_for_gpu

@@ -13,7 +13,7 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.gltf_meshes import load_gltf
 from deltalight.render_server.virtual_objects import VirtualObjects

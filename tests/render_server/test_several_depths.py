@@ -16,7 +16,7 @@ from deltalight.render_server import live_scene
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.passes.depth_mesh import DepthFrame, DepthMesher
-from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.real_geometry import EMPTY_MESH, RealGeometry
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, BOUND_POINTS, stride_for_budget

@@ -13,7 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
 from deltalight.render_server.passes.voxelize import (
     LONGEST_EDGE_VOXELS,

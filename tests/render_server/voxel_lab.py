@@ -9,8 +9,8 @@ import trimesh
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Kernel
 from deltalight.render_server.gpu.uniform_block import UniformBlock
-from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.volumes import FarVolumeBlock, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxel_light import LightVoxels
 from deltalight.render_server.passes.voxelize import Voxelize, VoxelizedMesh

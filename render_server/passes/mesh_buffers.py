@@ -1,0 +1,356 @@
+"""Meshes on the GPU: vertices and triangles, the objects' hierarchy for rays, and materials with their textures."""
+
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import Any
+
+import moderngl
+import numpy as np
+from jaxtyping import Float32, Float64, Int32
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.scene.bvh import Bvh, build_bvh
+from deltalight.render_server.scene.materials import map_table, measured_table
+from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
+from deltalight.render_server.scene.threads import begun
+from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
+
+SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
+METALLIC, REFLECTANCE, ROUGHNESS, DOUBLE_SIDED, BY_LIGHT = (
+    3,
+    slice(4, 7),
+    7,
+    12,
+    14,
+)  # columns of the material table, as materials.glsl has them
+
+TEXEL_BYTES = 16
+BVH_ROW_BYTES = 1024 * TEXEL_BYTES
+
+# Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
+# hierarchy may become half as expensive again before it is rebuilt.
+WORN = 1.5
+
+NO_CUTOUTS: Bindings = {"CUTOUTS": False}
+NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
+VERTEX_BYTES, TRIANGLE_BYTES = 48, 12  # of a row of VERTEX_LAYOUT, and of three indices
+CORNERS_ROW = 1024  # triangles in a row of their corners' texels
+
+
+class MeshBuffers:
+    """Vertex and index buffers that are rewritten when the mesh changes.
+
+    `cutouts` binds what tells where the mesh is not there (`MaterialTable`).
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu, self._ctx = gpu, gpu.ctx
+        self._vertices = gpu.ctx.buffer(reserve=4)
+        self._indices = gpu.ctx.buffer(reserve=4)
+        self._sides = gpu.ctx.buffer(reserve=4)
+        self._second_uv: moderngl.Buffer | None = None
+        self._corners: moderngl.Texture | None = None
+        self._written: GpuMesh | None = None  # if not by a kernel
+        self._arrays: dict[int, moderngl.VertexArray] = {}
+        self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
+        self.triangle_count = 0  # of those that are drawn, with any without area
+        self.cutouts = NO_CUTOUTS
+
+    @property
+    def storage(self) -> dict[str, Binding]:
+        """Vertices (rows of `VERTEX_LAYOUT`), for shaders that trace rays."""
+        return {"Vertices": self._vertices}
+
+    @property
+    def solid(self) -> dict[str, Binding]:
+        """Vertices, triangles, and whether each material has two sides, for passes that walk triangles."""
+        return {
+            "Vertices": self._vertices,
+            "Indices": self._indices,
+            "Sides": self._sides,
+            "SecondUv": self._second_uv,
+        }
+
+    @property
+    def corners(self) -> moderngl.Texture:
+        """Positions of the triangles' corners as shaders/common/plane.glsl reads them; of a mesh that was written."""
+        assert self._written is not None
+        if self._corners is None:
+            rows = max(-(-len(self.triangles) // CORNERS_ROW), 1)
+            texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
+            texels[: len(self.triangles), :, :3] = self._written.corners
+            self._corners = texture_2d(self._gpu, (3 * CORNERS_ROW, rows), 4, "f4", data=texels.tobytes())
+        return self._corners
+
+    def write(self, mesh: GpuMesh) -> None:
+        """Replaces the contents by those of `mesh`."""
+        vertices = np.ascontiguousarray(mesh.vertices, np.float32)
+        self.reserve(len(vertices), len(mesh.triangles), mesh)
+        self._written = mesh
+        self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
+        if self.triangle_count:
+            self._vertices.write(vertices)
+            self._indices.write(self.triangles)
+        self._write_second_uv(mesh.second_uv)
+
+    def reserve(self, vertex_count: int, triangle_count: int, materials: GpuMesh) -> None:
+        """Makes room for triangles of the materials of a mesh, which a kernel is to write (`solid`)."""
+        vertex_bytes, index_bytes = vertex_count * VERTEX_BYTES, triangle_count * TRIANGLE_BYTES
+        if vertex_bytes > self._vertices.size or index_bytes > self._indices.size:
+            self.release()
+            self._vertices = self._ctx.buffer(reserve=max(vertex_bytes, 4))
+            self._indices = self._ctx.buffer(reserve=max(index_bytes, 4))
+            self._sides = self._ctx.buffer(reserve=4)
+        self.triangles, self.triangle_count, self._written = NO_TRIANGLES, triangle_count, None
+        release_all(self._corners)
+        self._corners = None
+        if triangle_count:
+            self._write_sides(materials.material_table[:, DOUBLE_SIDED])
+
+    def _write_sides(self, double_sided: Float32[np.ndarray, " k"]) -> None:
+        if self._sides.size != double_sided.nbytes:
+            self._sides.orphan(double_sided.nbytes)
+        self._sides.write(double_sided.tobytes())
+
+    def _write_second_uv(self, uv: Float32[np.ndarray, "n 2"] | None) -> None:
+        if uv is None and self._second_uv is None:
+            return
+        release_all(*self._arrays.values(), self._second_uv)
+        self._arrays.clear()
+        self._second_uv = None if uv is None else self._ctx.buffer(np.ascontiguousarray(uv, np.float32))
+
+    def draw(self, program: moderngl.Program) -> None:
+        """Draws all triangles with `program`."""
+        if not self.triangle_count:
+            return
+        if program.glo not in self._arrays:
+            layout: list[tuple[Any, ...]] = [(self._vertices, *_layout_of(program))]
+            if self._second_uv is not None and program.get(SECOND_UV, None) is not None:
+                layout.append((self._second_uv, "2f", SECOND_UV))
+            self._arrays[program.glo] = self._ctx.vertex_array(program, layout, self._indices)
+        self._arrays[program.glo].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
+
+    def release(self) -> None:
+        """Frees all buffers."""
+        release_all(*self._arrays.values(), self._vertices, self._indices, self._sides)
+        release_all(self._second_uv, self._corners)
+        self._arrays.clear()
+        self._second_uv = self._corners = None
+
+
+def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
+    """Returns format and attributes of a vertex; attributes that the compiler removed become padding."""
+    parts = list(zip(VERTEX_LAYOUT.split(), VERTEX_ATTRIBUTES, strict=True))
+    active = {name for _, name in parts if program.get(name, None) is not None}
+    formats = (part if name in active else f"{int(part[0]) * 4}x" for part, name in parts)
+    return " ".join(formats), *(name for _, name in parts if name in active)
+
+
+def bvh_texture(gpu: GpuContext, data: bytes) -> moderngl.Texture:
+    """Returns packed nodes or triangles in rows one after the other, as shaders/common/ray_mesh.glsl reads them."""
+    rows = max(-(-len(data) // BVH_ROW_BYTES), 1)
+    size = BVH_ROW_BYTES // TEXEL_BYTES, rows
+    return texture_2d(gpu, size, 4, "u4", data=data.ljust(rows * BVH_ROW_BYTES, b"\0"))
+
+
+class ObjectBvh:
+    """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced.
+
+    Where rays were traced before, that begins on another thread as soon as the objects are set.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._nodes: moderngl.Texture | None = None
+        self._faces: moderngl.Texture | None = None
+        self._corners = self._built = np.zeros((0, 3, 3), np.float32)
+        self._mesh: MeshBuffers | None = None
+        self._bvh: Bvh | None = None
+        self._packed: Future[tuple[bytes, bytes]] | None = (
+            None  # of what was built last, until it is uploaded
+        )
+        self._is_traced = False  # since the triangles changed
+        self._fresh_cost = 0.0
+        self.centre = np.zeros(3)
+        self.radius = 0.0
+
+    def set_triangles(
+        self,
+        corners: Float32[np.ndarray, "m 3 3"],
+        bounds: tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
+        mesh: MeshBuffers,
+    ) -> None:
+        """Sets triangles, their bounds (m) and vertices; a changed array is a changed shape."""
+        low, high = bounds
+        self.centre, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+        self._corners, self._mesh = corners, mesh
+        if self._is_traced and corners is not self._built:
+            self._begin()
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The bindings of shaders/common/ray_mesh.glsl; brings the hierarchy up to date first."""
+        assert self._mesh is not None
+        if self._corners is not self._built:
+            self._begin()
+        if self._packed is not None:
+            nodes, faces = self._packed.result()
+            self._packed = None
+            self.release()
+            self._nodes, self._faces = bvh_texture(self._gpu, nodes), bvh_texture(self._gpu, faces)
+        self._is_traced = True
+        return {"bvh_nodes": self._nodes, "bvh_faces": self._faces, **self._mesh.storage}
+
+    def _begin(self) -> None:
+        """Begins to bring the hierarchy up to date, after what was begun before."""
+        assert self._mesh is not None
+        before, positions, triangles = self._packed, np.ascontiguousarray(self._corners), self._mesh.triangles
+        self._built, self._is_traced = self._corners, False
+
+        def packed() -> tuple[bytes, bytes]:
+            if before is not None:
+                before.result()
+            bvh = self._renewed(positions)
+            return bvh.packed(), bvh.packed_triangles(positions, triangles)
+
+        self._packed = begun(packed)
+
+    def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
+        """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
+        bvh = self._bvh
+        if bvh is not None and len(bvh.order) == len(positions):
+            bvh = bvh.refitted(positions)
+            if bvh.cost <= WORN * self._fresh_cost:
+                return bvh
+        self._bvh = build_bvh(positions)
+        self._fresh_cost = self._bvh.cost
+        return self._bvh
+
+    def release(self) -> None:
+        """Frees the textures."""
+        release_all(self._nodes, self._faces)
+
+
+class MaterialTable:
+    """Materials in a storage buffer; if any has maps or alpha, their textures in two arrays (common/materials.glsl).
+
+    `smoothest` is the least roughness of those that reflect specularly, 1 if none does; `transmits` tells whether
+    light passes through any. `draws_maps`: false for the
+    real scene, of which the camera tells how it looks.
+    """
+
+    def __init__(self, gpu: GpuContext, mesh: GpuMesh, *, draws_maps: bool = True) -> None:
+        maps = [
+            each
+            for material in mesh.materials
+            for each in (*material.maps, *material.maps_by_light)
+            if each is not None
+        ]
+        self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
+        self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
+        self.smoothest = _smoothest(mesh)
+        self.transmits = any(material.transmits for material in mesh.materials)
+        self._colors = self._data = None
+        table = mesh.material_table
+        if self._has_maps:
+            self._colors = MapArray(gpu, [each for each in maps if each.is_color], "f2")
+            self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
+            table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
+            for row, material in zip(table, mesh.materials, strict=True):
+                if material.maps_by_light:
+                    row[BY_LIGHT] = 1 + self._layer(material.maps_by_light[0])
+        self._buffer = gpu.ctx.buffer(np.ascontiguousarray(table, np.float32).tobytes())
+        self._transmittances = gpu.ctx.buffer(_transmittances(mesh).tobytes()) if self.transmits else None
+        self._measured = _measured_texture(gpu, mesh)
+
+    def _layer(self, each: TextureMap) -> int:
+        array = self._colors if each.is_color else self._data
+        assert array is not None
+        return array.layer(each)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Table and textures by GLSL name, and which of their features are used."""
+        return {
+            "Materials": self._buffer,
+            "color_maps": None if self._colors is None else self._colors.texture,
+            "data_maps": None if self._data is None else self._data.texture,
+            "MATERIAL_MAPS": self._has_maps,
+            "CUTOUTS": self._has_cutouts,
+            "TRANSMISSION": self.transmits,
+            "Transmittances": self._transmittances,
+            "MEASURED": self._measured is not None,
+            "measured_brdfs": self._measured,
+        }
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._buffer, self._transmittances, self._measured, self._colors, self._data)
+
+
+class MapArray:
+    """Textures of one kind as layers of one array, with mip levels; each texture once.
+
+    All layers have the size of the largest texture, a power of 2, less if they would take too much
+    (`map_edge`).
+    """
+
+    def __init__(self, gpu: GpuContext, maps: Sequence[TextureMap], dtype: str) -> None:
+        unique = {(id(each.texels), each.is_nearest): each for each in maps}
+        self._layers = {key: layer for layer, key in enumerate(unique)}
+        limit = int(gpu.ctx.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
+        if len(unique) > limit:
+            raise DeltalightError(
+                f"the objects have {len(unique)} textures of one kind, and this GPU takes {limit}: use fewer."
+            )
+        size = map_edge(list(unique.values()), 4 * int(dtype[1]))
+        self.texture = gpu.ctx.texture_array((size, size, max(len(unique), 1)), 4, dtype=dtype)
+        for layer, each in enumerate(unique.values()):
+            data = resampled(each, size)
+            self.texture.write(data.tobytes(), viewport=(0, 0, layer, size, size, 1))
+        self.texture.build_mipmaps()
+        self.texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+
+    def layer(self, each: TextureMap) -> int:
+        """Returns the layer of one of the maps."""
+        return self._layers[id(each.texels), each.is_nearest]
+
+    def release(self) -> None:
+        """Frees the texture."""
+        self.texture.release()
+
+
+def _measured_texture(gpu: GpuContext, mesh: GpuMesh) -> moderngl.Texture | None:
+    """Returns the table of measured materials; None if there are none."""
+    table = measured_table(mesh.materials)
+    if any(material.by_light is not None for material in mesh.materials) and not len(table):
+        table = np.zeros((1, *table.shape[1:]), np.float32)  # an image cannot be without texels
+    if not len(table):
+        return None
+    texture = texture_2d(gpu, (table.shape[1], len(table)), 4, "f4")
+    texture.write(table.tobytes())
+    return texture
+
+
+def _transmittances(mesh: GpuMesh) -> Float32[np.ndarray, "k 4"]:
+    """Returns what each material lets through of light in its shadow, and its alpha (common/lights.glsl)."""
+    rows = np.zeros((len(mesh.materials), 4), np.float32)
+    for index, material in enumerate(mesh.materials):
+        if material.transmits:
+            rows[index] = *material.mean_transmittance(mesh.mean_path_m(index)), material.roughness**2
+    return rows
+
+
+def _smoothest(mesh: GpuMesh) -> float:
+    table = mesh.material_table
+    reflects = (table[:, METALLIC] > 0) | (table[:, REFLECTANCE] > 0).any(axis=1)
+    reflects |= np.array([material.transmits for material in mesh.materials])
+    darkest = np.array([_least_green(material.metallic_roughness_map) for material in mesh.materials])
+    return float(min((table[:, ROUGHNESS] * darkest)[reflects], default=1.0))
+
+
+def _least_green(each: TextureMap | None) -> float:
+    return 1.0 if each is None else float(each.texels[..., 1].min()) / 255
