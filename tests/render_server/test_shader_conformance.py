@@ -22,7 +22,7 @@ from tests.render_server import shader_variants
 
 VALIDATOR = shutil.which("glslangValidator")
 pytestmark = [
-    pytest.mark.slow(seconds=50),
+    pytest.mark.slow(seconds=150),
     pytest.mark.skipif(VALIDATOR is None, reason="glslangValidator (package glslang-tools) is not installed"),
 ]
 

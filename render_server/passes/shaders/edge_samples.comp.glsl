@@ -78,14 +78,16 @@ bool meet_list(int tile) {
     return at != FULL;
 }
 
+// Of the tiles of each level, once each: corners that follow one another, or the last and the first, may share one.
 bool meet_lists() {
     bool is_whole = true;
     for (int level = 0; level < LEVELS; ++level) {
-        int before = -1;
-        for (int corner = 0; corner < 4; ++corner) {
-            int tile = tile_number(tile_of(place + REACH * (2.0 * vec2(corner & 1, corner >> 1) - 1.0), level), level);
-            if (tile != before) is_whole = meet_list(tile) && is_whole;
+        int first = -1, before = -1;
+        for (int i = 0; i < 4; ++i) {
+            int tile = tile_around(place, i ^ (i >> 1), level);
+            if (tile != before && tile != first) is_whole = meet_list(tile) && is_whole;
             before = tile;
+            if (i == 0) first = tile;
         }
     }
     return is_whole;

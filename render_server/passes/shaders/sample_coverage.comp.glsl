@@ -69,7 +69,7 @@ bool is_even(ivec2 pixel, vec4 position, vec3 normal) {
 
 bool may_be_thin(vec2 place) {
     uint marks = 0u;
-    for (int i = 0; i < 4; ++i) marks |= tiles[tile_around(place, i)].marks;
+    for (int i = 0; i < 4; ++i) marks |= tiles[tile_around(place, i, 0)].marks;
     return (marks & THIN) != 0u;
 }
 
@@ -86,5 +86,5 @@ void main() {
     imageStore(second_surface, pixel, vec4(0.0));
     if (even) return;
     append_texel(pixel, int(picture_size.x));
-    for (int i = 0; i < 4; ++i) atomicOr(tiles[tile_around(place, i)].marks, UNEVEN);
+    for (int i = 0; i < 4; ++i) atomicOr(tiles[tile_around(place, i, 0)].marks, UNEVEN);
 }

@@ -26,7 +26,7 @@ int tile_number(ivec2 tile, int level) {
     return level_starts[level] + tile.y * ((raster_size.x + edge - 1) / edge) + tile.x;
 }
 
-// The tiles of level 0 around a place that hold the samples of a pixel there.
-int tile_around(vec2 place, int corner) {
-    return tile_number(tile_of(place + REACH * (2.0 * vec2(corner & 1, corner >> 1) - 1.0), 0), 0);
+// The tiles around a place that hold the samples of a pixel there.
+int tile_around(vec2 place, int corner, int level) {
+    return tile_number(tile_of(place + REACH * (2.0 * vec2(corner & 1, corner >> 1) - 1.0), level), level);
 }
