@@ -246,7 +246,7 @@ def test_counted_frames_agree_with_what_the_graph_ran(
         "uniform_writes": 0,
     }
     camera = count_motion(renderer, list(steps_of("camera", take, scene, 6)), 2)
-    assert camera.per_frame["draws"] >= 9  # eight samples of the objects, and a shadow map
+    assert camera.per_frame["draws"] == 2  # the objects' first samples, and a shadow map
     assert camera.per_frame["dispatches"] > 10
     assert 0 < camera.python_ms.median <= camera.python_ms.p95
 
@@ -334,4 +334,4 @@ def test_counts_are_printed_as_table_and_as_json(capsys: pytest.CaptureFixture[s
     assert "reads that wait for the GPU" in capsys.readouterr().out
     counts = json.loads(report.read_text())["methods"]["paper:cone_scale=4"]
     assert counts["still"]["per_frame"]["dispatches"] == 2
-    assert counts["camera"]["per_frame"]["draws"] >= 9
+    assert counts["camera"]["per_frame"]["draws"] == 2

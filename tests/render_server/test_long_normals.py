@@ -32,7 +32,10 @@ from tests.render_server.tiny_kernel import MakeKernel, floats
 pytestmark = pytest.mark.usefixtures("clean_gl")
 LONG = 1.0 + 2.0**-10  # the longest that rounding makes it: half a step of each component
 LENGTHENED = {
-    "geometry_buffer.frag.glsl": ("out_normal = vec4(n,", f"out_normal = vec4({LONG!r} * n,"),
+    "geometry_buffer.frag.glsl": (
+        "out_normal = s.normal;",
+        f"out_normal = vec4({LONG!r} * s.normal.xyz, s.normal.w);",
+    ),
     "real_surface.comp.glsl": (
         "normal_out, pixel, vec4(normal,",
         f"normal_out, pixel, vec4({LONG!r} * normal,",

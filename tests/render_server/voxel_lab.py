@@ -114,6 +114,7 @@ class VoxelLab:
             "bias_real": 0.0,
             "bias_virtual": 0.0,
             "has_caustics": False,
+            "lens_distortion": False,
         }
         self.voxelize(voxels.store, mesh)
         self._light.light_virtual(voxels.store, scene)
