@@ -32,10 +32,10 @@ class GeometryBuffer:
             "virtual_raster_tint": self.tint,
         }
 
-    def clear(self, rectangle: Rectangle | None = None) -> None:
-        """Clears it, or only the `rectangle`."""
+    def clear(self) -> None:
+        """Clears it."""
         self.framebuffer.use()  # a clear heeds the scissor of the framebuffer in use
-        self.framebuffer.clear(0.0, 0.0, 0.0, 0.0, depth=1.0, viewport=rectangle)
+        self.framebuffer.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
 
     def clear_positions(self, rectangle: Rectangle) -> None:
         """Clears positions and depth in the `rectangle`; what else texels without a position hold is of before."""
