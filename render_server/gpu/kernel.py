@@ -39,12 +39,14 @@ SAMPLERS: Final = {  # of textures, and what their texels are read as: float, si
     0x8DD2: (moderngl.Texture, "u"),  # usampler2D
     0x8B5F: (moderngl.Texture3D, "f"),  # sampler3D
     0x8DC1: (moderngl.TextureArray, "f"),  # sampler2DArray
+    0x8DD3: (moderngl.Texture3D, "u"),  # usampler3D
 }
 IMAGES: Final = {
     0x904D: moderngl.Texture,  # image2D
     0x9058: moderngl.Texture,  # iimage2D
     0x9063: moderngl.Texture,  # uimage2D
     0x904E: moderngl.Texture3D,  # image3D
+    0x9064: moderngl.Texture3D,  # uimage3D
     0x9053: moderngl.TextureArray,  # image2DArray
 }
 

@@ -52,6 +52,17 @@ def texture_2d(
     return texture
 
 
+def texture_3d(
+    gpu: GpuContext, size: tuple[int, int, int], components: int, dtype: str
+) -> moderngl.Texture3D:
+    """Creates a texture of zeros of `size` (width, height, depth), clamped at its borders, nearest."""
+    zeros = bytes(math.prod(size) * components * int(dtype[1]))
+    texture = gpu.ctx.texture3d(size, components, zeros, dtype=dtype, alignment=1)
+    texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+    texture.repeat_x = texture.repeat_y = texture.repeat_z = False
+    return texture
+
+
 def image_format(texture: moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray) -> str:
     """Returns the format layout qualifier (GLSL 4.30) of the texels; "no image format" if GLSL has none for them."""
     return IMAGE_FORMATS.get(texture.dtype, {}).get(texture.components, "no image format")

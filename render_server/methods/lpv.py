@@ -136,7 +136,7 @@ class LpvCells:
             self._surfaces.add_real(self._real_light, real, scene)
         return self._real_light
 
-    def cover_real(self, real: VoxelStore, volume: PlacedVolume) -> moderngl.Buffer | None:
+    def cover_real(self, real: VoxelStore, volume: PlacedVolume) -> moderngl.Texture3D | None:
         """Computes the transmittance between cells of the real scene; None: nothing is blocked."""
         if not self._has_geometry:
             return None
@@ -170,8 +170,8 @@ class LpvCells:
         objects: VoxelStore,
         state: GeometryState,
         volume: PlacedVolume,
-        _real: moderngl.Buffer | None,
-    ) -> moderngl.Buffer | None:
+        _real: moderngl.Texture3D | None,
+    ) -> moderngl.Texture3D | None:
         """Computes the transmittance between cells with the objects; None: nothing is blocked."""
         if not self._has_geometry:
             return None
@@ -196,7 +196,7 @@ class CellStages:
     joint: Resource[dict[str, Binding]]
     real_light: Resource[moderngl.Buffer]
     change: Resource[moderngl.Buffer]
-    through: Resource[moderngl.Buffer | None]
+    through: Resource[moderngl.Texture3D | None]
 
 
 def cell_stages(
@@ -233,7 +233,7 @@ class Propagated:
         self._start = LpvStart(gpu)
         self._propagate = LpvPropagate(gpu)
 
-    def run(self, through: moderngl.Buffer | None, *injected: moderngl.Buffer) -> LightVolume:
+    def run(self, through: moderngl.Texture3D | None, *injected: moderngl.Buffer) -> LightVolume:
         """Propagates the light of one to three injected sums, added up; without `through` nothing blocks it."""
         self._start.run(self.light, *injected)
         self._propagate.run(self.light, self._weights, self._steps, through)
@@ -262,12 +262,12 @@ class DifferenceVolumes:
         self._shown = VoxelMipmap(gpu, cells.size, 1)
         self._show = LpvShow(gpu)
 
-    def propagate_mu(self, injected: moderngl.Buffer, through: moderngl.Buffer | None) -> LightVolume:
+    def propagate_mu(self, injected: moderngl.Buffer, through: moderngl.Texture3D | None) -> LightVolume:
         """Propagates V_mu."""
         return self._mu.run(through, injected)
 
     def propagate_rho(
-        self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Buffer | None
+        self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Texture3D | None
     ) -> LightVolume:
         """Propagates V_rho."""
         return self._rho.run(through, real, change)
@@ -279,7 +279,7 @@ class DifferenceVolumes:
         injected: moderngl.Buffer,
         change: moderngl.Buffer,
         scene: Bindings,
-        through: moderngl.Buffer | None,
+        through: moderngl.Texture3D | None,
     ) -> LightVolume:
         """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
         own = {**scene, **query_bindings(self._settings)}
@@ -327,12 +327,12 @@ class PrintedVolumes:
         self._show = LpvShow(gpu)
 
     def propagate_rho(
-        self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Buffer | None
+        self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Texture3D | None
     ) -> LightVolume:
         """Propagates V_rho."""
         return self._rho.run(through, real, change)
 
-    def propagate_delta(self, change: moderngl.Buffer, through: moderngl.Buffer | None) -> LightVolume:
+    def propagate_delta(self, change: moderngl.Buffer, through: moderngl.Texture3D | None) -> LightVolume:
         """Propagates the indirect change ([P2] 4.3.1)."""
         return self._delta.run(through, change)
 
@@ -344,7 +344,7 @@ class PrintedVolumes:
         return self._direct_light
 
     def propagate_direct(
-        self, injected: moderngl.Buffer, through: moderngl.Buffer | None
+        self, injected: moderngl.Buffer, through: moderngl.Texture3D | None
     ) -> LightVolume | None:
         """Propagates and filters the direct change; None where shadow maps bring it."""
         if self._direct is None:

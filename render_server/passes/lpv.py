@@ -14,15 +14,13 @@ from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
-from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.textures import release_all, texture_3d
 from deltalight.render_server.passes.mesh_buffers import NO_CUTOUTS
 from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.passes.voxels import LOWER_VOLUME, VoxelMipmap, VoxelStore
 
-COEFFICIENT_BYTES = 16  # per cell and channel: 4 floats
 INJECTED_SUMS = 12  # per cell: 4 coefficients x 3 channels
 COVERED_SUMS = 6  # per cell: its low faces on three axes, surfaces that face - and +
-TRANSMITTED_BYTES = 8  # per cell: its six neighbours, a byte each, padded
 CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0 and Y_1 along its axis
 LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # of the clamped cosine in them
 FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # solid angles seen from the centre of the neighbouring cell
@@ -87,21 +85,20 @@ def moment_weights(cells: int) -> StepWeights:
 
 
 class LightVolume:
-    """The state between steps (two buffers that swap) and the total; 3 channels x cells x 4 coefficients each."""
+    """The state between steps (two textures that swap) and the total; (3 channels x) cells x 4 coefficients each."""
 
     def __init__(self, gpu: GpuContext, cells: int) -> None:
         self.cells = cells
-        size = 3 * cells**3 * COEFFICIENT_BYTES
-        self.state, self.next_state, self.total = (gpu.storage_buffer(size, LOWER_VOLUME) for _ in range(3))
+        size = (cells, cells, 3 * cells)
+        self.state, self.next_state, self.total = (texture_3d(gpu, size, 4, "f4") for _ in range(3))
 
     def swap(self) -> None:
         """Makes the last output the current state."""
         self.state, self.next_state = self.next_state, self.state
 
     def release(self) -> None:
-        """Frees the buffers."""
-        for buffer in (self.state, self.next_state, self.total):
-            buffer.release()
+        """Frees the textures."""
+        release_all(self.state, self.next_state, self.total)
 
 
 def injected_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
@@ -114,9 +111,9 @@ def covered_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
     return _zeros(gpu, cells**3 * COVERED_SUMS * 4)
 
 
-def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Buffer:
-    """Creates packed transmittances into each cell from its neighbours; zero until `LpvTransmit` writes them."""
-    return _zeros(gpu, cells**3 * TRANSMITTED_BYTES)
+def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Texture3D:
+    """Creates transmittances into each cell from its six neighbours, a byte each; zero until `LpvTransmit` writes."""
+    return texture_3d(gpu, (cells, cells, cells), 2, "u4")
 
 
 def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
@@ -139,8 +136,8 @@ class LpvStart:
             First=first,
             Second=second,
             Third=third,
-            State=volume.state,
-            Total=volume.total,
+            state=volume.state,
+            total=volume.total,
             cells=volume.cells,
             count_of_sums=len(sums),
         )
@@ -165,7 +162,7 @@ class LpvBoxFilter:
             return
         threads = (volume.cells, volume.cells, 3 * volume.cells)
         self._kernel.run(
-            threads, Total=volume.total, Filtered=volume.next_state, cells=volume.cells, radius=radius
+            threads, total=volume.total, filtered=volume.next_state, cells=volume.cells, radius=radius
         )
         volume.total, volume.next_state = volume.next_state, volume.total
 
@@ -250,11 +247,15 @@ class LpvTransmit:
         self._joint = Kernel(gpu, "lpv_transmit", JOINT=1)
 
     def run(
-        self, out: moderngl.Buffer, cells: int, real: moderngl.Buffer, virtual: moderngl.Buffer | None = None
+        self,
+        out: moderngl.Texture3D,
+        cells: int,
+        real: moderngl.Buffer,
+        virtual: moderngl.Buffer | None = None,
     ) -> None:
         """Fills `out` from the covered faces of the real scene, and of the objects if given."""
         kernel = self._real if virtual is None else self._joint
-        kernel.run((cells**3,), RealCovered=real, VirtualCovered=virtual, Transmitted=out, cells=cells)
+        kernel.run((cells**3,), RealCovered=real, VirtualCovered=virtual, transmitted=out, cells=cells)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -279,7 +280,7 @@ class LpvPropagate:
         self._half_step = None if self._tiled else Kernel(gpu, "lpv_half_step")
 
     def run(
-        self, volume: LightVolume, weights: StepWeights, steps: int, transmitted: moderngl.Buffer | None
+        self, volume: LightVolume, weights: StepWeights, steps: int, transmitted: moderngl.Texture3D | None
     ) -> None:
         """Runs `steps` steps; without `transmitted` nothing blocks light.
 
@@ -287,7 +288,7 @@ class LpvPropagate:
         state before the first step.
         """
         medium: Bindings = {
-            "Transmitted": transmitted,
+            "transmitted": transmitted,
             "has_geometry": transmitted is not None,
             "transfer": weights.transfer,
             "sideways": weights.sideways,
@@ -304,7 +305,7 @@ class LpvPropagate:
         while steps > 0:
             count = max(count for count in self._kernels if count <= steps)
             self._kernels[count].run(
-                threads, medium, State=volume.state, Next=volume.next_state, Total=volume.total
+                threads, medium, state=volume.state, next_state=volume.next_state, total=volume.total
             )
             volume.swap()
             steps -= count
@@ -318,4 +319,4 @@ def _run_halves(half_step: Kernel, volume: LightVolume, steps: int, medium: Bind
     """Runs so many half steps that every cell of both colours has at least `steps`."""
     threads = (-(-volume.cells // 2), volume.cells, volume.cells)
     for number in range(steps + 1):
-        half_step.run(threads, medium, State=volume.state, Total=volume.total, colour=number % 2)
+        half_step.run(threads, medium, state=volume.state, total=volume.total, colour=number % 2)

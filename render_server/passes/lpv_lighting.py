@@ -17,7 +17,7 @@ from deltalight.render_server.passes.voxels import VoxelStore
 
 def light_volume_bindings(mu: LightVolume, rho: LightVolume) -> dict[str, Binding]:
     """Returns the light without and with objects, as shaders/common/lpv_light.glsl reads it."""
-    return {"WithoutObjects": mu.total, "WithObjects": rho.total}
+    return {"light_mu": mu.total, "light_rho": rho.total}
 
 
 class LpvInjectMaps:

@@ -2,8 +2,8 @@
 #include "common/light_cells.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(std430) readonly buffer Total { vec4 total[]; };   // channel by channel
-layout(std430) writeonly buffer Filtered { vec4 filtered[]; };
+uniform sampler3D total;
+layout(rgba32f) writeonly uniform image3D filtered;
 uniform int cells;
 uniform int radius;
 
@@ -12,11 +12,10 @@ void main() {
     int channel = int(gl_GlobalInvocationID.z) / cells;
     if (!in_grid(cell, cells) || channel > 2) return;
     ivec3 low = max(cell - radius, ivec3(0)), high = min(cell + radius, ivec3(cells - 1));
-    uint base = uint(channel * cells * cells * cells);
     vec4 sum = vec4(0.0);
     for (int z = low.z; z <= high.z; ++z)
         for (int y = low.y; y <= high.y; ++y)
-            for (int x = low.x; x <= high.x; ++x) sum += total[base + cell_index(ivec3(x, y, z), cells)];
+            for (int x = low.x; x <= high.x; ++x) sum += texelFetch(total, in_channel(ivec3(x, y, z), channel, cells), 0);
     float edge = float(2 * radius + 1);
-    filtered[base + cell_index(cell, cells)] = sum / (edge * edge * edge);
+    imageStore(filtered, in_channel(cell, channel, cells), sum / (edge * edge * edge));
 }

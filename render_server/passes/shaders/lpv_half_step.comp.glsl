@@ -5,11 +5,11 @@
 #include "common/light_step.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(std430) readonly buffer State { vec4 state[]; };   // before the first step
-layout(std430) buffer Total { vec4 total[]; };
+layout(rgba32f) readonly uniform image3D state;   // before the first step
+layout(rgba32f) uniform image3D total;
 uniform int colour;   // 0, 1
 
-vec4 light_of(uint place) { return total[place]; }
+vec4 light_of(ivec3 texel) { return imageLoad(total, texel); }
 #include "common/light_neighbours.glsl"
 
 void main() {
@@ -17,6 +17,8 @@ void main() {
     cell.x = 2 * cell.x + ((cell.y + cell.z + colour) & 1);
     if (!in_grid(cell, cells)) return;
     Neighbours n = neighbours_of(cell);
-    uint here = cell_index(cell, cells), count = uint(cells * cells * cells);
-    for (uint base = 0u; base < 3u * count; base += count) total[base + here] = state[base + here] + entering(n, base);
+    for (int channel = 0; channel < 3; ++channel) {
+        ivec3 texel = in_channel(cell, channel, cells);
+        imageStore(total, texel, imageLoad(state, texel) + entering(cell, n, channel));
+    }
 }

@@ -5,10 +5,10 @@
 #include "common/light_step.glsl"
 
 layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
-layout(std430) readonly buffer State { vec4 state[]; };
-layout(std430) writeonly buffer Next { vec4 next_state[]; };
-layout(std430) buffer Total { vec4 total[]; };
-layout(std430) readonly buffer Transmitted { uvec2 transmitted[]; };
+layout(rgba32f) readonly uniform image3D state;
+layout(rgba32f) writeonly uniform image3D next_state;
+layout(rgba32f) uniform image3D total;
+uniform usampler3D transmitted;
 uniform int cells;
 uniform bool has_geometry;
 
@@ -36,17 +36,16 @@ const int ROUNDS = ((WIDE - 2) * (WIDE - 2) * (WIDE - 2) + THREADS - 1) / THREAD
 
 void main() {
     int tiles = cells / TILE, thread = int(gl_LocalInvocationIndex);
-    uint base = uint(int(gl_WorkGroupID.z) / tiles) * uint(cells * cells * cells);
+    int channel = int(gl_WorkGroupID.z) / tiles;
     ivec3 low = ivec3(gl_WorkGroupID.xy, int(gl_WorkGroupID.z) % tiles) * TILE;
     for (int i = thread; i < WIDE * WIDE * WIDE; i += THREADS) {
         ivec3 cell = low + in_cube(i, WIDE) - FUSED;
-        tile[i] = in_grid(cell, cells) ? state[base + cell_index(cell, cells)] : vec4(0.0);
+        tile[i] = in_grid(cell, cells) ? imageLoad(state, in_channel(cell, channel, cells)) : vec4(0.0);
     }
     memoryBarrierShared();
     barrier();
-    ivec3 own = ivec3(gl_LocalInvocationID);
-    uint own_index = base + cell_index(low + own, cells);
-    vec4 sum = total[own_index], mine = vec4(0.0);
+    ivec3 own = ivec3(gl_LocalInvocationID), texel = in_channel(low + own, channel, cells);
+    vec4 sum = imageLoad(total, texel), mine = vec4(0.0);
     for (int done = 1; done <= FUSED; ++done) {
         int edge = WIDE - 2 * done;   // the part of the border that is still valid
         vec4 results[ROUNDS];
@@ -54,7 +53,7 @@ void main() {
             int i = thread + j * THREADS;
             ivec3 c = in_cube(min(i, edge * edge * edge - 1), edge) + done, cell = low + c - FUSED;
             bool inside = in_grid(cell, cells);
-            uvec2 open = has_geometry && inside ? transmitted[cell_index(cell, cells)] : uvec2(0xffffffffu);
+            uvec2 open = has_geometry && inside ? texelFetch(transmitted, cell, 0).xy : uvec2(0xffffffffu);
             results[j] = inside ? gathered(c, open) : vec4(0.0);
         }
         memoryBarrierShared();
@@ -68,6 +67,6 @@ void main() {
         mine = tile[tile_index(own + FUSED)];
         sum += mine;
     }
-    total[own_index] = sum;
-    next_state[own_index] = mine;
+    imageStore(total, texel, sum);
+    imageStore(next_state, texel, mine);
 }

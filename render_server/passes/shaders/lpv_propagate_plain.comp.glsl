@@ -3,21 +3,21 @@
 #include "common/light_step.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(std430) readonly buffer State { vec4 state[]; };
-layout(std430) writeonly buffer Next { vec4 next_state[]; };
-layout(std430) buffer Total { vec4 total[]; };
+layout(rgba32f) readonly uniform image3D state;
+layout(rgba32f) writeonly uniform image3D next_state;
+layout(rgba32f) uniform image3D total;
 
-vec4 light_of(uint place) { return state[place]; }
+vec4 light_of(ivec3 texel) { return imageLoad(state, texel); }
 #include "common/light_neighbours.glsl"
 
 void main() {
     ivec3 cell = ivec3(gl_GlobalInvocationID);
     if (!in_grid(cell, cells)) return;
     Neighbours n = neighbours_of(cell);
-    uint here = cell_index(cell, cells), count = uint(cells * cells * cells);
-    for (uint base = 0u; base < 3u * count; base += count) {
-        vec4 sum = entering(n, base);
-        next_state[base + here] = sum;
-        total[base + here] += sum;
+    for (int channel = 0; channel < 3; ++channel) {
+        ivec3 texel = in_channel(cell, channel, cells);
+        vec4 sum = entering(cell, n, channel);
+        imageStore(next_state, texel, sum);
+        imageStore(total, texel, imageLoad(total, texel) + sum);
     }
 }

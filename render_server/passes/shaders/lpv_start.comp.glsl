@@ -5,24 +5,25 @@ layout(local_size_x = 64) in;
 layout(std430) readonly buffer First { int first[]; };
 layout(std430) readonly buffer Second { int second[]; };
 layout(std430) readonly buffer Third { int third[]; };
-layout(std430) writeonly buffer State { vec4 state[]; };   // channel by channel
-layout(std430) writeonly buffer Total { vec4 total[]; };
+layout(rgba32f) writeonly uniform image3D state;
+layout(rgba32f) writeonly uniform image3D total;
 uniform int cells;
 uniform int count_of_sums;
 
 void main() {
     uint count = uint(cells * cells * cells), i = gl_GlobalInvocationID.x;
     if (i >= count) return;
-    for (uint channel = 0u; channel < 3u; ++channel) {
+    ivec3 cell = cell_of_index(i, cells);
+    for (int channel = 0; channel < 3; ++channel) {
         vec4 light;
         for (uint k = 0u; k < 4u; ++k) {
-            uint at = i * uint(INJECTED_SUMS) + 4u * channel + k;
+            uint at = i * uint(INJECTED_SUMS) + 4u * uint(channel) + k;
             int sum = first[at];
             if (count_of_sums > 1) sum += second[at];
             if (count_of_sums > 2) sum += third[at];
             light[k] = float(sum) / INJECTED_STEPS;
         }
-        state[channel * count + i] = light;
-        total[channel * count + i] = light;
+        imageStore(state, in_channel(cell, channel, cells), light);
+        imageStore(total, in_channel(cell, channel, cells), light);
     }
 }

@@ -5,7 +5,7 @@
 layout(local_size_x = 64) in;
 layout(std430) readonly buffer RealCovered { int real_covered[]; };
 layout(std430) readonly buffer VirtualCovered { int virtual_covered[]; };
-layout(std430) writeonly buffer Transmitted { uvec2 transmitted[]; };
+layout(rg32ui) writeonly uniform uimage3D transmitted;
 uniform int cells;
 
 const float FIXED_POINT_STEPS = 1048576.0;   // voxel_store.glsl's
@@ -32,5 +32,5 @@ void main() {
     ivec3 cell = cell_of_index(i, cells);
     vec4 xy = vec4(through(cell, 0, 0), through(cell, 0, 1), through(cell, 1, 0), through(cell, 1, 1));
     vec4 z = vec4(through(cell, 2, 0), through(cell, 2, 1), 0.0, 0.0);
-    transmitted[i] = uvec2(packUnorm4x8(xy), packUnorm4x8(z));
+    imageStore(transmitted, cell, uvec4(packUnorm4x8(xy), packUnorm4x8(z), 0u, 0u));
 }

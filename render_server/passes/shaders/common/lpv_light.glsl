@@ -2,12 +2,16 @@
 // cell edge squared), trilinear about the point half a cell above the surface. Needs volume.glsl.
 #include "common/light_cells.glsl"
 
-layout(std430) readonly buffer WithoutObjects { vec4 light_mu[]; };   // channel by channel; or the direct change
-layout(std430) readonly buffer WithObjects { vec4 light_rho[]; };     // or the change itself, indirect
+uniform sampler3D light_mu;    // or the direct change
+uniform sampler3D light_rho;   // or the change itself, indirect
 uniform bool has_geometry;   // cells behind the surface are dark and must not be read
 uniform float damping;
 
 const float PER_FACE = 2.0 / 3.0;   // of 1 / edge^2: a uniform field's intensity in radiance
+
+vec4 light_of(bool with_objects, ivec3 texel) {
+    return with_objects ? texelFetch(light_rho, texel, 0) : texelFetch(light_mu, texel, 0);
+}
 
 struct Light12 { vec4 r; vec4 g; vec4 b; };
 
@@ -22,12 +26,9 @@ Light12 intensity(bool with_objects, int size, vec3 q, vec3 p, vec3 n, bool fron
         vec3 fraction = mix(1.0 - f, f, vec3(o));
         float w = fraction.x * fraction.y * fraction.z * (front_only ? max(dot(vec3(cell) + 0.5 - p, n), 0.0) : 1.0);
         if (w <= 0.0 || !in_grid(cell, size)) continue;
-        uint at = cell_index(cell, size), channel = uint(size * size * size);
-        if (with_objects) {
-            sum.r += w * light_rho[at]; sum.g += w * light_rho[at + channel]; sum.b += w * light_rho[at + 2u * channel];
-        } else {
-            sum.r += w * light_mu[at]; sum.g += w * light_mu[at + channel]; sum.b += w * light_mu[at + 2u * channel];
-        }
+        sum.r += w * light_of(with_objects, in_channel(cell, 0, size));
+        sum.g += w * light_of(with_objects, in_channel(cell, 1, size));
+        sum.b += w * light_of(with_objects, in_channel(cell, 2, size));
         total += w;
     }
     float scale = total > 0.0 ? 1.0 / total : 0.0;
