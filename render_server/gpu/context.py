@@ -114,6 +114,8 @@ class GpuContext:
     programs: SharedPrograms = field(default_factory=SharedPrograms)
     reset_status: Callable[[], int] = lambda: 0
     """Asks the driver whether the context was lost (lost_context.py); 0 = it was not."""
+    most_images: int = NEEDED["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]
+    """Images of a kernel."""
     errors: Counter[str] = field(default_factory=Counter)
     """Errors of OpenGL that `check` found, by name; each is a fault of this program or of the driver."""
 
@@ -158,22 +160,22 @@ class GpuContext:
         return {}
 
     @cached_property
-    def _empty_textures(self) -> dict[tuple[type, str], Any]:
+    def _empty_textures(self) -> dict[tuple[type, str, int], Any]:
         return {}
 
-    def empty_texture(self, kind: type, texels: str) -> Any:  # noqa: ANN401 (as the kind says)
-        """A texture of zeros (`texels`: f, i or u) that stands where a kernel is given none."""
-        if (kind, texels) not in self._empty_textures:
+    def empty_texture(self, kind: type, dtype: str, components: int) -> Any:  # noqa: ANN401 (as the kind says)
+        """A texture of zeros that stands where a kernel is given none."""
+        if (kind, dtype, components) not in self._empty_textures:
             makers: dict[type, tuple[Any, tuple[int, ...]]] = {
                 moderngl.Texture: (self.ctx.texture, (1, 1)),
                 moderngl.Texture3D: (self.ctx.texture3d, (1, 1, 1)),
                 moderngl.TextureArray: (self.ctx.texture_array, (1, 1, 1)),
             }
             make, size = makers[kind]
-            texture = make(size, 4, bytes(4), dtype=f"{texels}1")
+            texture = make(size, components, bytes(components * int(dtype[1])), dtype=dtype, alignment=1)
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-            self._empty_textures[kind, texels] = texture
-        return self._empty_textures[kind, texels]
+            self._empty_textures[kind, dtype, components] = texture
+        return self._empty_textures[kind, dtype, components]
 
     @cached_property
     def empty_buffer(self) -> moderngl.Buffer:
@@ -320,9 +322,11 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
             "install a GPU driver, or add --allow-software to accept slow frames."
         )
     try:
-        check_limits(name, limits_of(ctx))
+        limits = limits_of(ctx)
+        check_limits(name, limits)
     except DeltalightError:
         ctx.release()
         raise
     ask = reset_status(ctx, context.load)
-    return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software, reset_status=ask)
+    images = limits["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]
+    return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software, reset_status=ask, most_images=images)

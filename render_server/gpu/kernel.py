@@ -19,7 +19,8 @@ import numpy as np
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
-from deltalight.render_server.gpu.textures import image_format
+from deltalight.render_server.gpu.texel_images import texels_as_images
+from deltalight.render_server.gpu.textures import image_format, texels_of
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 
 GL_INT = 0x1404
@@ -204,7 +205,8 @@ class _Program:
         return BindingError(f"Kernel {self.label}: `{slot.name}` is {wanted}, not a {type(value).__name__}.")
 
     def _bind_sampler(self, slot: _Slot, value: Binding) -> None:
-        texture: Any = self._gpu.empty_texture(*SAMPLERS[slot.kind]) if value is None else value
+        kind, texels = SAMPLERS[slot.kind]
+        texture: Any = self._gpu.empty_texture(kind, f"{texels}1", 4) if value is None else value
         if slot.checked() is not texture and not slot.is_known(texture):
             self._check_sampled(slot, texture)
         texture.use(location=slot.place)
@@ -223,7 +225,10 @@ class _Program:
 
     def _bind_image(self, slot: _Slot, value: Binding) -> None:
         texture: Any = value
-        if value is None or (slot.checked() is not value and not slot.is_known(value)):
+        if value is None and slot.name not in self._declared.written:
+            (texels,) = self._declared.formats[slot.name]
+            texture = self._gpu.empty_texture(IMAGES[slot.kind], *texels_of(texels))
+        elif value is None or (slot.checked() is not value and not slot.is_known(value)):
             self._check_image(slot, value)
         texture.bind_to_image(slot.place)
 
@@ -380,6 +385,8 @@ class Kernel(_Shader):
         source = shader_source(SHADERS / f"{self._name}.comp.glsl", {**self._gpu.defines, **defines})
         label = _label(self._name, defines)
         self._gpu.compiled(label, {"comp": source})
+        if self._gpu.is_software:
+            source = texels_as_images(source, self._gpu.most_images)
 
         def link() -> _Program:
             return _Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))

@@ -68,6 +68,12 @@ def image_format(texture: moderngl.Texture | moderngl.Texture3D | moderngl.Textu
     return IMAGE_FORMATS.get(texture.dtype, {}).get(texture.components, "no image format")
 
 
+def texels_of(image_format: str) -> tuple[str, int]:
+    """Returns type and number of components of texels that have a format layout qualifier."""
+    places = ((dtype, count, name) for dtype, names in IMAGE_FORMATS.items() for count, name in names.items())
+    return next((dtype, count) for dtype, count, name in places if name == image_format)
+
+
 def read_texel(texture: moderngl.Texture, place: tuple[int, int]) -> Float32[np.ndarray, " c"]:
     """Returns the components of the texel at `place` (column, row); waits until the GPU has written it."""
     target = texture.ctx.framebuffer([texture])

@@ -6,9 +6,11 @@
 
 #include "common/pixel_group.glsl"
 uniform sampler2D traced_rho;
+#pragma texels rgba16f traced_rho
 layout(rgba16f) writeonly uniform image2D irradiance_rho;
 #ifdef REAL
 uniform sampler2D traced_mu;                        // a: 1 where traced
+#pragma texels rgba16f traced_mu
 layout(rgba16f) writeonly uniform image2D irradiance_mu;
 #endif
 #ifdef REUSES

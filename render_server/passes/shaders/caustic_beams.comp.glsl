@@ -18,6 +18,8 @@
 #include "common/pixel_group.glsl"
 uniform sampler2D virtual_light_uv;
 uniform sampler2D virtual_light_normal;
+#pragma texels rgba32f virtual_light_uv
+#pragma texels rgba16f virtual_light_normal
 uniform int view_index;
 uniform int block_edge;        // texels
 uniform float least_alpha;     // for materials with lobes of at least this width,

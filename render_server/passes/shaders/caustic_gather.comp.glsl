@@ -10,6 +10,7 @@
 layout(local_size_x = 8, local_size_y = GROUP_ROWS) in;
 const int THREADS = 64 / ROWS;
 uniform isampler2D sample_pixels;
+#pragma texels rgba16i sample_pixels
 uniform ivec2 picture_pixels;
 #ifdef REUSES
 uniform usampler2D stale_texels;   // REAL and OBJECT where light must be computed

@@ -8,6 +8,7 @@
 
 #include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
+#pragma texels rgba16i sample_pixels
 #ifdef RATIO
 layout(rgba16f) writeonly uniform image2D change_ratio_out;
 uniform sampler2D direct_mu;
@@ -17,6 +18,7 @@ uniform sampler2D cone_rho;
 uniform sampler2D cone_specular_mu;
 uniform sampler2D cone_specular_rho;
 uniform sampler2D reflection;   // a: fraction of a smooth surface's lobe that objects fill
+#pragma texels rgba16f direct_mu direct_rho cone_mu cone_rho cone_specular_mu cone_specular_rho reflection
 #pragma switch bool has_reflection
 uniform int scale;
 
@@ -46,6 +48,7 @@ vec4 value(ivec2 texel) {
 }
 #else
 uniform sampler2D change_ratio;
+#pragma texels rgba16f change_ratio
 
 bool near_change(ivec2 texel) {
     ivec2 last = textureSize(change_ratio, 0) - 1;

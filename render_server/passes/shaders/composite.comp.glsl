@@ -27,6 +27,9 @@ uniform sampler2D cone_specular_rho;
 uniform sampler2D change_ratio;
 uniform sampler2D reflection;         // of objects in smooth surfaces, by rays; a: fraction of the lobe
 uniform sampler2D edge_correction;    // common/edge_sides.glsl
+#pragma texels rgba8ui picture
+#pragma texels rgba16f linear_picture direct_mu direct_rho cone_mu cone_rho cone_specular_mu cone_specular_rho change_ratio reflection edge_correction
+#pragma texels r16f object_coverage
 #pragma switch bool has_reflection
 uniform float exposure_scale;
 #include "common/camera.glsl"

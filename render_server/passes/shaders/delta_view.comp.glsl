@@ -7,6 +7,8 @@ layout(rgba8ui) writeonly uniform uimage2D code_out;
 uniform sampler2D linear_picture;
 uniform sampler2D relit;
 uniform sampler2D object_coverage;
+#pragma texels rgba16f linear_picture
+#pragma texels r16f object_coverage
 
 const float MID_GREY = 0.2140;   // linear value of sRGB code 127
 const float ENLARGED = 4.0;

@@ -5,6 +5,8 @@ uniform usampler2D picture;             // the camera's
 uniform usampler2D small_picture;       // the same, smaller
 uniform usampler2D small_composite;
 uniform sampler2D object_coverage;      // of the small picture
+#pragma texels rgba8ui picture
+#pragma texels r16f object_coverage
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 
 const float GREATEST_RATIO = 4.0;       // of codes: noise of dark pixels must not be amplified further

@@ -7,6 +7,7 @@
 layout(local_size_x = 64) in;
 uniform sampler2D object_coverage;
 uniform sampler2D traced;
+#pragma texels rgba16f traced
 uniform float pixel_size;   // m at 1 m depth
 layout(rgba16f) writeonly uniform image2D reflected;
 #include "common/quads.glsl"

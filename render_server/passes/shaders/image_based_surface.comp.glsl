@@ -20,6 +20,7 @@
 #include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform sampler2D virtual_raster_tint;
+#pragma texels rgba8 virtual_raster_tint
 #ifdef PRECOMPUTED
 uniform sampler2D transferred_light;      // at the object's raster: irradiance, open fraction of what is mirrored
 uniform sampler2D transferred_position;   // world m; w: 0 nothing

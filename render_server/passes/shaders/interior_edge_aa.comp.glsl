@@ -7,6 +7,8 @@ uniform sampler2D sample_coverage;
 uniform sampler2D second_surface;
 uniform sampler2D virtual_raster_position;
 uniform sampler2D virtual_raster_normal;
+#pragma texels rgba16f sample_coverage virtual_raster_normal
+#pragma texels rgba32f virtual_raster_position
 uniform ivec4 rectangle;       // first pixel and size of the part of the picture that may show an object
 
 const float NEARNESS = 0.1;    // weight of the distance beside the distance from a neighbour's plane: it breaks ties

@@ -9,6 +9,7 @@
 #include "common/pixel_group.glsl"
 layout(rgba16i) writeonly uniform iimage2D sample_pixels_out;
 uniform sampler2D object_coverage;
+#pragma texels r16f object_coverage
 uniform ivec2 picture_pixels;
 uniform int scale;
 

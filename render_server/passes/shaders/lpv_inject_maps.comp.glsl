@@ -15,6 +15,8 @@ uniform sampler2D real_albedo;
 uniform sampler2D real_light_normal;
 uniform sampler2D virtual_light_uv;
 uniform sampler2D virtual_light_normal;
+#pragma texels rgba16f real_albedo real_light_normal virtual_light_normal
+#pragma texels rgba32f virtual_light_uv
 uniform int view_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 uniform bool has_caustics; // beams carry the lights' reflections in smooth virtual surfaces

@@ -9,6 +9,7 @@ layout(rgba32f) readonly uniform image3D state;
 layout(rgba32f) writeonly uniform image3D next_state;
 layout(rgba32f) uniform image3D total;
 uniform usampler3D transmitted;
+#pragma texels rg32ui transmitted
 uniform int cells;
 uniform bool has_geometry;
 

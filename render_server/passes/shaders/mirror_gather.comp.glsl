@@ -14,6 +14,9 @@ layout(rgba16f) writeonly uniform image2D specular_out;     // rgb mean radiance
 uniform isampler2D sample_pixels;
 uniform sampler2D hit_position;
 uniform sampler2D hit_normal;
+#pragma texels rgba16i sample_pixels
+#pragma texels rgba32f hit_position
+#pragma texels rgba16f hit_normal
 
 const ConeSet WHOLE = ConeSet(1, 0, 1.0, 0.0);   // cones as wide as their fractions
 const float OWN = 1.5;     // voxels from a surface that may be its own

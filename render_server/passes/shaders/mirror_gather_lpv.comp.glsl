@@ -15,6 +15,9 @@ layout(rgba16f) writeonly uniform image2D specular_out;     // rgb mean radiance
 uniform isampler2D sample_pixels;
 uniform sampler2D hit_position;
 uniform sampler2D hit_normal;
+#pragma texels rgba16i sample_pixels
+#pragma texels rgba32f hit_position
+#pragma texels rgba16f hit_normal
 
 const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its own surface, and of its end from the hit
 

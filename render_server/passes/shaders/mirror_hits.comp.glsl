@@ -8,6 +8,7 @@
 layout(rgba32f) writeonly uniform image2D position_out;   // world m; w: 1 if there is one
 layout(rgba16f) writeonly uniform image2D normal_out;     // world; w: material
 uniform isampler2D sample_pixels;
+#pragma texels rgba16i sample_pixels
 uniform int scale;
 
 void main() {

@@ -17,6 +17,8 @@ uniform sampler2D hit_position;
 uniform sampler2D hit_normal;
 uniform sampler2D hit_irradiance;
 uniform sampler2D hit_specular;
+#pragma texels rgba32f hit_position
+#pragma texels rgba16f hit_normal hit_irradiance hit_specular
 
 shared vec4 of_ray[64];
 shared float counted[64];    // 1: the ray leaves the surface

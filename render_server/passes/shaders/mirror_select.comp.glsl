@@ -8,8 +8,10 @@ layout(rgba16f) writeonly uniform image2D reflection;
 layout(rgba16f) writeonly uniform image2D traced;
 layout(r16f) writeonly uniform image2D hit_distance;
 uniform sampler2D object_coverage;
+#pragma texels r16f object_coverage
 #ifdef OF_OBJECTS
 uniform sampler2D hit_position;
+#pragma texels rgba32f hit_position
 uniform int scale;
 
 // Whether rays of the texels around met any object. A mirror stands among the objects, so their bounds say nothing.

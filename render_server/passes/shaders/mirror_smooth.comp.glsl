@@ -8,6 +8,8 @@ layout(rgba16f) writeonly uniform image2D reflection;
 uniform sampler2D object_coverage;
 uniform sampler2D traced;
 uniform sampler2D hit_distance;   // m from the surface to the objects, 0 none
+#pragma texels r16f object_coverage hit_distance
+#pragma texels rgba16f traced
 
 // Radius in the picture of half of the lobe's energy, pixels; `d`: m to the hit.
 float lobe_pixels(Mirror m, float d) { return 2.0 * m.alpha * d / (m.depth + d) * camera_pinhole.x; }

@@ -8,6 +8,7 @@
 #include "common/pixel_group.glsl"
 layout(r16f) writeonly uniform image2D object_coverage_out;
 uniform sampler2D linear_picture;
+#pragma texels rgba16f linear_picture
 uniform ivec2 first_pixel;     // of the rectangle that may show an object; the rest was cleared
 
 const int WINDOW = 5;   // pixels

@@ -8,9 +8,11 @@
 #include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
 uniform sampler2D linear_picture;
+#pragma texels rgba16i sample_pixels
 layout(std430) buffer ProbeSums { int sums[]; };   // 4 per texel: radiance x solid angle, solid angle
 #ifdef CHANGED
 uniform sampler2D changes;   // light_change.comp.glsl
+#pragma texels rgba16f changes
 #endif
 #include "common/camera.glsl"
 uniform int scale;

@@ -9,6 +9,7 @@
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D albedo_out;
 uniform sampler2D real_light_normal;
+#pragma texels rgba16f real_light_normal
 uniform int view_index;
 uniform float bias_real;   // m
 

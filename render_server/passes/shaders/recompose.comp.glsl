@@ -10,6 +10,8 @@ layout(rgba16f) readonly uniform image2D virtual_radiance;
 uniform sampler2D object_coverage;
 uniform sampler2D edge_correction;   // common/edge_sides.glsl
 uniform isampler2D sample_pixels;
+#pragma texels r16f object_coverage
+#pragma texels rgba16f edge_correction
 uniform int scale;
 uniform float exposure_scale;
 

@@ -7,6 +7,7 @@
 #include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
 uniform usampler2D stale_texels;
+#pragma texels rgba16i sample_pixels
 #ifdef CAUSTICS
 #define ADDS_CAUSTICS
 #include "common/caustic_sums.glsl"

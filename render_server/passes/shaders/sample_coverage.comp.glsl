@@ -18,6 +18,8 @@ layout(rgba32f) writeonly uniform image2D second_surface;   // as in edge_sample
 layout(std430) buffer Tiles { Tile tiles[]; };
 uniform sampler2D virtual_raster_uv;
 uniform sampler2D virtual_raster_tint;
+#pragma texels rg32f virtual_raster_uv
+#pragma texels rgba8 virtual_raster_tint
 uniform vec2 offset;           // pixels
 uniform float weight;          // of a sample
 uniform ivec4 rectangle;       // first pixel and size of the part of the picture that may show an object, or did before

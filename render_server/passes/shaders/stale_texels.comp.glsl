@@ -7,6 +7,7 @@
 
 #include "common/pixel_group.glsl"
 uniform isampler2D sample_pixels;
+#pragma texels rgba16i sample_pixels
 layout(r8ui) writeonly uniform uimage2D stale_out;
 layout(rgba32f) writeonly uniform image2D real_texels_out;
 layout(rgba32f) writeonly uniform image2D object_texels_out;

@@ -12,6 +12,7 @@ layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_mu + E of C
 layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mirrored radiance that objects hide
 layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb C_delta of the specular cone
 uniform sampler2D linear_picture;
+#pragma texels rgba16f linear_picture
 uniform vec3 object_low;    // voxels that hold the objects
 uniform vec3 object_high;
 #else

@@ -17,6 +17,8 @@ uniform sampler2D cone_irradiance;
 uniform sampler2D cone_specular;
 uniform sampler2D virtual_raster_tint;
 uniform sampler2D screen_reflection;   // rgb radiance times fraction; a: fraction of the specular lobe
+#pragma texels rgba16f cone_irradiance cone_specular screen_reflection
+#pragma texels rgba8 virtual_raster_tint
 uniform bool has_screen_reflection;
 #include "common/camera.glsl"
 

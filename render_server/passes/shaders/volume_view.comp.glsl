@@ -8,6 +8,8 @@ layout(rgba8ui) writeonly uniform uimage2D code_out;
 uniform usampler2D picture;
 uniform sampler2D picture_rays;
 uniform sampler3D voxels;
+#pragma texels rgba8ui picture
+#pragma texels rg32f picture_rays
 #include "common/camera.glsl"
 
 const float VISIBLE_COVERAGE = 0.05;

@@ -1,5 +1,6 @@
 // Codes of the camera for linear values.
 uniform sampler2D inverse_response;   // uniform in the square root, where codes are about evenly spaced
+#pragma texels rgba32f inverse_response
 
 // Camera code of each channel of a linear value times exposure.
 uvec3 encode(vec3 x) {

@@ -5,6 +5,7 @@ layout(r16f) uniform image2D object_coverage;
 // rgb: to be added to the colour; a: code of the nearest pixel of the thing (composite.comp.glsl), 0 the pixel itself
 layout(rgba16f) writeonly uniform image2D edge_correction;
 uniform sampler2D linear_picture;          // with linear sampling
+#pragma texels rgba16f linear_picture
 #include "common/camera.glsl"
 
 const int LEAST_SAMPLES = 3;   // least number for a spread

@@ -1,6 +1,7 @@
 // Normal of the depth map at a pixel, in the optical frame and towards the camera; zero where unknown. FITS_DEPTH: from
 // the plane that depth_columns fitted to its window; else `fitted_normals` holds it.
 uniform sampler2D picture_rays;    // (x/z, y/z)
+#pragma texels rg32f picture_rays
 #ifdef FITS_DEPTH
 uniform sampler2D inverse_depth;
 uniform sampler2D window_fits;

@@ -5,6 +5,9 @@ uniform sampler2D real_surface_normal;     // world; w: entry of the surface tab
 uniform sampler2D virtual_raster_position; // world m; w: depth along the optical axis, 0 nothing
 uniform sampler2D virtual_raster_normal;   // world; w: material index
 uniform sampler2D picture_rays;           // (x/z, y/z) of each pixel
+#pragma texels rgba32f real_surface_position virtual_raster_position
+#pragma texels rgba16f real_surface_normal virtual_raster_normal
+#pragma texels rg32f picture_rays
 #include "common/camera.glsl"
 #pragma switch bool lens_distortion   // the raster is sampled through the lens model
 

@@ -1,6 +1,7 @@
 // What enters a cell from its six neighbours through the faces between them, times the transmittance of the geometry volume. No
 // light enters from outside the volume. Needs light_cells.glsl, light_step.glsl and light_of(texel), a neighbour's light.
 uniform usampler3D transmitted;
+#pragma texels rg32ui transmitted
 uniform int cells;
 uniform bool has_geometry;
 

@@ -24,6 +24,7 @@ uniform sampler2D real_light_depth;
 uniform sampler2D virtual_light_depth;
 uniform sampler2D caster_distance;   // of virtual_light_depth: squared, in cells of CASTER_CELL x CASTER_CELL texels
 uniform sampler2DArray mirror_visibility;   // r, g: fraction of an image that a plane shows without and with objects
+#pragma texels r32f caster_distance
 #include "common/lighting.glsl"
 uniform int shadow_samples;
 
@@ -357,6 +358,7 @@ vec2 visible_fraction(Light light, Occluder real, Occluder object, vec3 p, vec3 
 #ifdef TINTED_SHADOWS
 layout(std430) readonly buffer Transmittances { vec4 transmittances[]; };   // of materials: rgb; alpha
 uniform sampler2D virtual_light_normal;   // w: material
+#pragma texels rgba16f virtual_light_normal
 
 // Sum of what the objects' first surfaces around a receiver let through, and how many block it. What beams carry counts as blocked.
 vec4 let_through(Light light, LightView view, vec3 p, float beam_alpha) {

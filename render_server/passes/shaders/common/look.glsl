@@ -11,6 +11,7 @@ uniform sampler2D direct_mu;
 uniform sampler2D direct_rho;
 uniform sampler2D cone_mu;
 uniform sampler2D cone_rho;
+#pragma texels rgba16f direct_mu direct_rho cone_mu cone_rho
 
 const float LEAST_IRRADIANCE = 1e-4;
 

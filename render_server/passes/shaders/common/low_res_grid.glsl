@@ -2,6 +2,7 @@
 #include "common/geometry.glsl"
 
 uniform isampler2D sample_pixels;   // real x, y; virtual x, y; -1: none; below: hidden by objects
+#pragma texels rgba16i sample_pixels
 uniform ivec2 low_resolution_size;
 
 struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness; };

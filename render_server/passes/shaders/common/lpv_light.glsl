@@ -4,6 +4,7 @@
 
 uniform sampler3D light_mu;    // or the direct change
 uniform sampler3D light_rho;   // or the change itself, indirect
+#pragma texels rgba32f light_mu light_rho
 uniform bool has_geometry;   // cells behind the surface are dark and must not be read
 uniform float damping;
 

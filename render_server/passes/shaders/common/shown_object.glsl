@@ -1,6 +1,7 @@
 // The objects in a pixel before comparison with real things: their depth and fraction of the pixel.
 #include "common/in_front.glsl"
 uniform sampler2D sample_coverage;   // of samples; r: in front of the real surface, g: behind it, b: g times mean depth
+#pragma texels rgba16f sample_coverage
 uniform bool antialiased;
 #include "common/camera.glsl"
 

@@ -1,5 +1,6 @@
 // How an object's surface goes on beside a pixel. Needs geometry.glsl.
 uniform sampler2D object_coverage;
+#pragma texels r16f object_coverage
 
 // Change of position and normal from a pixel to the next along an axis; the smaller change of both sides, so that
 // edges do not count.
