@@ -12,6 +12,7 @@ import glcontext
 import moderngl
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu.buffer_images import TextureCalls
 from deltalight.render_server.gpu.lost_context import check_reset, reporting, reset_status
 
 SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
@@ -176,6 +177,11 @@ class GpuContext:
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
             self._empty_textures[kind, dtype, components] = texture
         return self._empty_textures[kind, dtype, components]
+
+    @cached_property
+    def texture_calls(self) -> TextureCalls:
+        """OpenGL's functions for what moderngl does not know."""
+        return TextureCalls(self.ctx)
 
     @cached_property
     def empty_buffer(self) -> moderngl.Buffer:

@@ -17,10 +17,11 @@ from weakref import ref
 import moderngl
 import numpy as np
 
+from deltalight.render_server.gpu.buffer_images import BUFFER_IMAGES, BufferImage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
-from deltalight.render_server.gpu.texel_images import texels_as_images
-from deltalight.render_server.gpu.textures import image_format, texels_of
+from deltalight.render_server.gpu.texel_images import with_images
+from deltalight.render_server.gpu.textures import image_format, release_all, texels_of
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 
 GL_INT = 0x1404
@@ -125,15 +126,20 @@ class _Program:
         self.users: set[int] = set()  # ids of the kernels that have not been released
         self._samplers: list[_Slot] = []
         self._images: list[_Slot] = []
+        self._arrays: list[_Slot] = []  # storage buffers that are read as images
         self._storage: list[_Slot] = []
         self._blocks: list[_Slot] = []
         self._uniforms: list[_Slot] = []
         for name in program:
             self._adopt(name, program[name])
         self._assign()
+        self._shown = {
+            slot.name: BufferImage(gpu.texture_calls, *declared.formats[slot.name]) for slot in self._arrays
+        }
         binders: Sequence[tuple[list[_Slot], Callable[[_Slot, Binding], None]]] = (
             (self._samplers, self._bind_sampler),
             (self._images, self._bind_image),
+            (self._arrays, self._bind_array),
             (self._storage, self._bind_storage),
             (self._blocks, self._bind_block),
             (self._uniforms, self._write),
@@ -148,15 +154,15 @@ class _Program:
         elif isinstance(member, moderngl.UniformBlock):
             self._blocks.append(slot)
         elif isinstance(member, moderngl.Uniform):
-            is_texture = slot.kind in SAMPLERS or slot.kind in IMAGES
-            slots = self._samplers if slot.kind in SAMPLERS else self._images
-            (slots if is_texture else self._uniforms).append(slot)
-            if is_texture:
+            kinds = (SAMPLERS, self._samplers), (IMAGES, self._images), (BUFFER_IMAGES, self._arrays)
+            slots = next((slots for kinds, slots in kinds if slot.kind in kinds), self._uniforms)
+            slots.append(slot)
+            if slots is not self._uniforms:
                 slot.member.gl_type = GL_INT  # as units are; moderngl 5.13 leaves that of an image3D unset
 
     def _assign(self) -> None:
         """Assigns units and binding points, each kind from 0 on."""
-        for slots in (self._samplers, self._images):
+        for slots in (self._samplers, [*self._images, *self._arrays]):
             for slot in slots:
                 slot.place = slots.index(slot)
                 slot.member.value = slot.place
@@ -232,6 +238,12 @@ class _Program:
             self._check_image(slot, value)
         texture.bind_to_image(slot.place)
 
+    def _bind_array(self, slot: _Slot, value: Binding) -> None:
+        buffer = self._gpu.empty_buffer if value is None else value
+        if not isinstance(buffer, moderngl.Buffer):
+            raise self._wrong(slot, value, "a storage buffer")
+        self._shown[slot.name].bind(slot.place, buffer)
+
     def _check_image(self, slot: _Slot, texture: object) -> None:
         kind = IMAGES[slot.kind]
         if not isinstance(texture, Texture) or not isinstance(texture, kind):
@@ -304,13 +316,13 @@ class _Program:
         return {
             "samplers": [slot.name for slot in self._samplers],
             "images": [slot.name for slot in self._images],
-            "storage blocks": [slot.name for slot in self._storage],
+            "storage blocks": [slot.name for slot in (*self._arrays, *self._storage)],
             "uniform blocks": [slot.name for slot in self._blocks],
         }
 
     def release(self) -> None:
-        """Frees the GL object."""
-        self.program.release()
+        """Frees the GL objects."""
+        release_all(self.program, *self._shown.values())
 
     def written(self, known: Bindings) -> dict[str, object]:
         """Images and buffers that it may write, of what its names were bound to."""
@@ -386,7 +398,7 @@ class Kernel(_Shader):
         label = _label(self._name, defines)
         self._gpu.compiled(label, {"comp": source})
         if self._gpu.is_software:
-            source = texels_as_images(source, self._gpu.most_images)
+            source = with_images(source, self._gpu.most_images)
 
         def link() -> _Program:
             return _Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))

@@ -99,10 +99,9 @@ def declarations(source: str) -> Declarations:
     Raises:
         ValueError: conditions that are not computed leave several workgroup sizes.
     """
-    text = _COMMENT.sub(" ", source)
-    whole = _declaring(text)
+    whole = _declaring(without_comments(source))
     names = {name for _, _, _, name in _variables(whole)} | {name for _, _, name in _BLOCK.findall(whole)}
-    kept, macros = _kept(text)
+    kept, macros = live(source)
     text = _expanded(_declaring(kept), macros)
     switches = tuple(dict.fromkeys(_SWITCH.findall(kept)))
     names |= set(switches)
@@ -115,6 +114,18 @@ def declarations(source: str) -> Declarations:
     for access, kind, name in _BLOCK.findall(text):
         written |= {name} if kind == "buffer" and "readonly" not in access else set()
     return Declarations(frozenset(names), formats, frozenset(written), switches, _local_size(text))
+
+
+@lru_cache(maxsize=512)
+def without_comments(source: str) -> str:
+    """Returns a shader's text with blanks in place of comments."""
+    return _COMMENT.sub(" ", source)
+
+
+@lru_cache(maxsize=512)
+def live(source: str) -> tuple[str, Mapping[str, str]]:
+    """Returns what conditions leave of a shader's text, without comments, and its macros without parameters."""
+    return _kept(without_comments(source))
 
 
 def _local_size(text: str) -> tuple[int, int, int]:

@@ -1,65 +1,180 @@
-"""Texels that software renderers load from images where shaders fetch them from samplers.
+"""What software renderers read from images where shaders name samplers and storage buffers.
 
-Mesa's llvmpipe loads a texel of an image in half of the time that `texelFetch` takes, which heeds levels and limits of the
-sampler (2 and 4 ns of a core). `#pragma texels FORMAT NAME ...` beside the declarations says that the textures of these
-samplers have that format, as images must know.
+For a vector, Mesa's llvmpipe takes 2 ns of a core to load it from an image, 4 to fetch it by `texelFetch`, which
+heeds the sampler's levels and limits, and 30 to read it from a storage buffer, lane by lane and number by number. So
+sources are rewritten for it:
+
+* `#pragma texels FORMAT NAME ...` beside the declarations says that the textures of these samplers have that format,
+  as images must know. Samplers that are only fetched from become images;
+* arrays of read-only storage buffers become images of the same name, to which gpu/buffer_images.py binds the buffers.
 """
 
 import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final
 
-_PRAGMA = re.compile(r"^#pragma texels (\w+) (.+)$", re.MULTILINE)
-_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
-_IMAGES = re.compile(r"\b[iu]?image(?:2D|3D|2DArray) \w+")
+from deltalight.render_server.gpu.shader_source import live, without_comments
+
+_PRAGMA = re.compile(r"#pragma texels (\w+) (.+)")
+_IMAGES = re.compile(r"image(?:2D|3D|2DArray) \w")
+_BLOCK = re.compile(r"buffer (\w+) \{([^}]*?)(\w+) (\w+)\[\]; \}")
+_STRUCT = re.compile(r"struct (\w+) \{([^}]*)\}")
+_MEMBER = re.compile(r"(\w+) \w+(?:\[(\d+)\])?;")
+_SAMPLERS = [f"{kind}sampler{shape}" for kind in ("", "i", "u") for shape in ("2D", "3D", "2DArray")]
+_ELEMENTS: Final = {  # of an array: format and type of the image, components that hold one
+    "uint": ("r32ui", "uimageBuffer", "r"),
+    "int": ("r32i", "iimageBuffer", "r"),
+    "float": ("r32f", "imageBuffer", "r"),
+    "vec2": ("rg32f", "imageBuffer", "rg"),
+    "uvec2": ("rg32ui", "uimageBuffer", "rg"),
+    "vec4": ("rgba32f", "imageBuffer", "rgba"),
+}
 
 
 @lru_cache(maxsize=512)  # as of declarations(): renderers are made again and again
-def texels_as_images(source: str, most_images: int) -> str:
-    """Returns the source with loads from images for every sampler of a `texels` pragma that is only fetched from.
-
-    Samplers beyond `most_images` of a shader stay.
+def with_images(source: str, most_images: int) -> str:
+    """Returns the source with images in place of samplers and storage buffers; those beyond `most_images` stay.
 
     Raises:
-        ValueError: another level than 0 is fetched.
+        ValueError: another level than 0 is fetched from a sampler of a `texels` pragma.
     """
-    formats = {name: texels for texels, names in _PRAGMA.findall(source) for name in names.split()}
-    if not formats:
-        return source
-    code = _PRAGMA.sub("", _COMMENT.sub(" ", source))
+    code = _PRAGMA.sub("", without_comments(source))
     room = max(most_images - len(_IMAGES.findall(code)), 0)
-    for name in [name for name in formats if _is_only_fetched(code, name)][:room]:
-        declared = rf"\buniform ([iu]?)sampler(2D|3D|2DArray) {name};"
-        image = rf"layout({formats[name]}) readonly uniform \1image\2 {name};"
-        source = re.sub(declared, image, source).replace(f"textureSize({name}, 0)", f"imageSize({name})")
-        source = _with_loads(source, name)
+    formats = {name: texels for texels, names in _PRAGMA.findall(source) for name in names.split()}
+    samplers = [name for name in formats if _is_only_fetched(code, name)][:room]
+    for name in samplers:
+        source = _without_sampler(source, name, formats[name])
+    for array in list(_arrays(source))[: room - len(samplers)]:
+        source = array.replaced(source)
     return source
 
 
 def _is_only_fetched(code: str, name: str) -> bool:
     fetches = code.count(f"texelFetch({name}, ")
-    declared = len(re.findall(rf"\buniform [iu]?sampler(?:2D|3D|2DArray) {name};", code))
+    declared = sum(code.count(f"uniform {sampler} {name};") for sampler in _SAMPLERS) if fetches else 0
     known = fetches + declared + code.count(f"textureSize({name}, 0)")
-    return fetches > 0 and declared > 0 and known == len(re.findall(rf"\b{name}\b", code))
+    return declared > 0 and known == len(list(_places(code, name)))
 
 
-def _with_loads(source: str, name: str) -> str:
-    """Replaces `texelFetch(name, place, 0)` by `imageLoad(name, place)`."""
+def _places(text: str, word: str) -> Iterator[int]:
+    """Where a word stands in a text; for so long texts, far faster than a regular expression."""
+    at = text.find(word)
+    while at >= 0:
+        before, after = text[at - 1], text[at + len(word)]
+        if not (before.isalnum() or after.isalnum() or before in "_." or after == "_"):
+            yield at
+        at = text.find(word, at + len(word))
+
+
+def _without_sampler(source: str, name: str, texels: str) -> str:
+    for sampler in _SAMPLERS:
+        image = f"layout({texels}) restrict readonly uniform {sampler.replace('sampler', 'image')} {name};"
+        source = source.replace(f"uniform {sampler} {name};", image)
+    source = source.replace(f"textureSize({name}, 0)", f"imageSize({name})")
     head = f"texelFetch({name}, "
     while (
         at := source.rfind(head)
     ) >= 0:  # from the last one on, so that those in arguments are replaced before
-        source = f"{source[:at]}imageLoad({name}, {_without_level(source[at + len(head) :], name)}"
+        arguments, rest = _until(source, at + len(head), "(", ")")
+        place, comma, level = arguments.rpartition(", ")
+        if not comma or level != "0":
+            raise ValueError(f"`{name}` has `#pragma texels`, but {arguments} is not of level 0.")
+        source = f"{source[:at]}imageLoad({name}, {place}){rest}"
     return source
 
 
-def _without_level(fetch: str, name: str) -> str:
-    """Removes the level, 0, from what follows the beginning of a fetch."""
-    depth, end = 1, 0
-    while depth > 0:
-        depth += {"(": 1, ")": -1}.get(fetch[end], 0)
-        end += 1
-    arguments = fetch[: end - 1]
-    place, comma, level = arguments.rpartition(", ")
-    if not comma or level != "0":
-        raise ValueError(f"`{name}` has `#pragma texels`, but {arguments} is not of level 0.")
-    return place + fetch[end - 1 :]
+def _until(text: str, start: int, opening: str, closing: str) -> tuple[str, str]:
+    """Splits a text, from `start` on, at the bracket that closes the one before."""
+    end = text.index(closing, start)
+    while text.count(opening, start, end) > text.count(closing, start, end):
+        end = text.index(closing, end + 1)
+    return text[start:end], text[end + 1 :]
+
+
+@dataclass(frozen=True)
+class _Array:
+    """An array without end, of vectors or structs of them, in a block, after unsigned integers, the header."""
+
+    block: str
+    header: tuple[str, ...]
+    element: str
+    name: str
+    structs: Mapping[str, str]
+
+    @property
+    def _texel(self) -> tuple[str, str, str]:
+        return _ELEMENTS.get(self.element, _ELEMENTS["vec4"])
+
+    @property
+    def size(self) -> int:
+        """Texels of an element, 0 if it is a struct that holds anything else than vectors of four numbers."""
+        return 1 if self.element in _ELEMENTS else self._vectors(self.element)
+
+    def _vectors(self, kind: str) -> int:
+        if kind == "vec4":
+            return 1
+        members = [(self._vectors(member), int(times or 1)) for member, times in self._members(kind)]
+        return sum(count * times for count, times in members) if all(count for count, _ in members) else 0
+
+    def _members(self, kind: str) -> list[tuple[str, str]]:
+        return _MEMBER.findall(self.structs.get(kind, ""))
+
+    def replaced(self, source: str) -> str:
+        """Returns the source with an image for the block, which a function reads."""
+        texels, image, components = self._texel
+        first, read = -(-len(self.header) // len(components)), f"{self.name}_read"
+        places = iter(range(self.size))
+        body = f"int at = {first} + {self.size} * int(i); return {self._read(self.element, places)};"
+        declared = f"layout({texels}) restrict readonly uniform {image} {self.block};"
+        source = self._without_block(source, f"{declared} {self.element} {read}(uint i) {{ {body} }}")
+        length = f"((imageSize({self.block}) - {first}) / {self.size})"
+        source = source.replace(f"{self.name}.length()", length)
+        for index, number in enumerate(self.header):
+            source = self._with_number(source, index, number)
+        for at in reversed([at for at in _places(source, self.name) if source[at + len(self.name)] == "["]):
+            index_text, rest = _until(source, at + len(self.name) + 1, "[", "]")
+            source = f"{source[:at]}{read}(uint({index_text})){rest}"
+        return source
+
+    def _read(self, kind: str, places: Iterator[int]) -> str:
+        if kind == self.element in _ELEMENTS or kind == "vec4":
+            return f"imageLoad({self.block}, at + {next(places)}).{self._texel[2]}"
+        parts = [self._member(member, times, places) for member, times in self._members(kind)]
+        return f"{kind}({', '.join(parts)})"
+
+    def _member(self, kind: str, times: str, places: Iterator[int]) -> str:
+        if not times:
+            return self._read(kind, places)
+        return f"{kind}[{times}]({', '.join(self._read(kind, places) for _ in range(int(times)))})"
+
+    def _without_block(self, source: str, image: str) -> str:
+        head = f"buffer {self.block} {{"
+        while (at := source.find(head)) >= 0:  # more than one where branches declare it in other ways
+            start, end = source.rindex("layout(std430)", 0, at), source.index("};", at) + 2
+            source = source[:start] + image + source[end:]
+        return source
+
+    def _with_number(self, source: str, index: int, number: str) -> str:
+        """Replaces a number of the header."""
+        texels, _, components = self._texel
+        read = f"imageLoad({self.block}, {index // len(components)}).{components[index % len(components)]}"
+        read = read if "ui" in texels else f"floatBitsToUint({read})" if "f" in texels else f"uint({read})"
+        for at in reversed(list(_places(source, number))):
+            source = source[:at] + read + source[at + len(number) :]
+        return source
+
+
+def _arrays(source: str) -> Iterator[_Array]:
+    """Arrays of read-only storage buffers whose elements are vectors of one kind."""
+    kept, macros = live(source)
+    structs = dict(_STRUCT.findall(kept))
+    for found in _BLOCK.finditer(kept):
+        block, before, element, name = found.groups()
+        access = kept[: found.start()].rsplit(None, 1)[-1]
+        header = [words.split() for words in before.split(";") if words.strip()]
+        array = _Array(block, tuple(number for _, number in header), element, name, structs)
+        is_read_only = macros.get(access, access) == "readonly"
+        if is_read_only and array.size and all(kind == "uint" for kind, _ in header):
+            yield array
