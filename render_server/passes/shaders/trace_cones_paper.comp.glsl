@@ -4,6 +4,7 @@
 #include "common/paper_cones.glsl"
 #include "common/brdf.glsl"
 #include "common/low_res_grid.glsl"
+#include "common/walk.glsl"
 
 #include "common/pixel_group.glsl"
 #ifdef REAL
@@ -78,7 +79,7 @@ void shade(ivec2 texel, SurfacePoint s) {
 #endif
 
 void main() {
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 texel = ivec2(spread_place() * gl_WorkGroupSize.xy + gl_LocalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
     shade(texel, surface_point(texel));
 }

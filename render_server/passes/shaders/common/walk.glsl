@@ -1,17 +1,25 @@
-// A list that all threads, 64 a workgroup, walk together: for (uint i = first_item(); i < count; i += items_apart()).
-// Mesa's software renderer gives each core one run of consecutive workgroups, and many lists are shorter than there are
-// threads: so CORES groups in a row, one of each run, begin with items in a row. On a GPU CORES is 1, and item i goes to
-// thread i.
+// Work spread over a processor's cores. Mesa's software renderer gives each core one run of consecutive workgroups, and work
+// lies close together: many lists are shorter than there are threads, many pictures are busy in one half. So CORES groups
+// in a row, one of each run, take places in a row. On a GPU CORES is 1, and each group takes its own.
 #ifndef CORES
 #define CORES 1u
 #endif
 
+uint spread(uint group, uint count) {
+    uint run = count / CORES;
+    return run > 0u && group < run * CORES ? group % run * CORES + group / run : group;
+}
+
+// A list that all threads, 64 a workgroup, walk together: for (uint i = first_item(); i < count; i += items_apart()).
 // Where a step is costly the loop tests at its end, do .. while: software renderers run the step of a loop that tests at
 // its beginning once more, for no lane.
-uint first_item() {
-    uint run = gl_NumWorkGroups.x / CORES, group = gl_WorkGroupID.x;
-    if (run > 0u && group < run * CORES) group = group % run * CORES + group / run;
-    return group * 64u + gl_LocalInvocationID.x;
+uint first_item() { return spread(gl_WorkGroupID.x, gl_NumWorkGroups.x) * 64u + gl_LocalInvocationID.x; }
+
+// Place of a workgroup over a picture.
+uvec2 spread_place() {
+    uvec2 groups = gl_NumWorkGroups.xy;
+    uint group = spread(gl_WorkGroupID.y * groups.x + gl_WorkGroupID.x, groups.x * groups.y);
+    return uvec2(group % groups.x, group / groups.x);
 }
 
 uint items_apart() { return gl_NumWorkGroups.x * 64u; }
