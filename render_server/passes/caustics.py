@@ -25,7 +25,8 @@ GREATEST_ALPHA = 0.174
 ROUNDED = 1.001  # of a square, as shaders may compute it
 SENT_BEAM_BYTES = 112
 BEAMS_A_ROW, BEAM_TEXELS, PLACE_TEXELS = 256, 4, 2  # of the images that hold them (shaders/common/beams.glsl)
-TILE = 8  # texels an edge, of what caustic_gather fills at once
+TILE = 8  # texels an edge (shaders/common/beam_tiles.glsl)
+WORD_BITS = 32
 HEADER_BYTES = 16
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
@@ -123,8 +124,12 @@ class Caustics:
         self._places: moderngl.Texture | None = None
         self._end = Kernel(gpu, "caustic_ends")
         self._find_places = Kernel(gpu, "caustic_places")
-        # Software renderers pass barriers slowly, and read a beam once for each of few threads.
-        rows = 8 if gpu.is_software else 2
+        self._tiles = tuple(-(-edge // TILE) for edge in grid.size)
+        self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
+        self._tile_beams = gpu.ctx.buffer(reserve=4)
+        self._find_balls = Kernel(gpu, "caustic_balls", **reuse_define(reuses))
+        self._find_tiles = Kernel(gpu, "caustic_tiles", **reuse_define(reuses))
+        rows = 8 if gpu.is_software else 2  # software renderers read a beam once for each of few threads
         self._gather = Kernel(
             gpu, "caustic_gather", ROWS=rows, GROUP_ROWS=TILE // rows, **reuse_define(reuses)
         )
@@ -154,6 +159,9 @@ class Caustics:
             release_all(self._beams, self._places)
             self._beams = texture_2d(self._gpu, (BEAM_TEXELS * BEAMS_A_ROW, rows), 4, "f4")
             self._places = texture_2d(self._gpu, (PLACE_TEXELS * BEAMS_A_ROW, rows), 4, "i2")
+            words = 2 * math.prod(self._tiles) * rows * BEAMS_A_ROW // WORD_BITS
+            self._tile_beams.release()
+            self._tile_beams = self._gpu.storage_buffer(4 * words, "output.width and output.height")
 
     def run(self, scene: Bindings) -> None:
         """Fills the sums with the light of the beams where they end."""
@@ -173,9 +181,23 @@ class Caustics:
             "scale": grid.scale,
         }
         self._find_places.run((self._threads,), shared, scene)
-        tiles = tuple(-(-edge // TILE) for edge in grid.size)
-        self._gather.run((TILE * tiles[0], self._gather.local_size[1] * tiles[1]), shared, scene)
+        self._gather_wide(shared, scene)
         self._splat.run((self._threads,), shared, scene)
+
+    def _gather_wide(self, shared: Bindings, scene: Bindings) -> None:
+        """Adds the wide beams, in each tile of the reduced grid those that may reach what it samples."""
+        assert self._places is not None
+        most, (across, down) = self._places.height * BEAMS_A_ROW, self._tiles
+        clear_buffer(self._gpu, self._tile_beams)
+        own: Bindings = {
+            "tiles": self._tiles,
+            "beam_words": most // WORD_BITS,
+            "tile_balls": self._balls,
+            "TileBeams": self._tile_beams,
+        }
+        self._find_balls.run((across, 2 * down), own, shared, scene)
+        self._find_tiles.run((list_threads(self._gpu, most), down), own, shared, scene)
+        self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -188,6 +210,10 @@ class Caustics:
             self._places,
             self._end,
             self._find_places,
+            self._balls,
+            self._tile_beams,
+            self._find_balls,
+            self._find_tiles,
             self._gather,
             self._splat,
         )

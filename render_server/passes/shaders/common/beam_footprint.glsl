@@ -36,6 +36,16 @@ vec3 position_on(int layer, ivec2 pixel, out vec3 normal) {
     return (layer == REAL_LAYER ? real.w > 0.0 : object.w > 0.0) ? (layer == REAL_LAYER ? real.xyz : object.xyz) : vec3(1e9);
 }
 
+const float ROUNDING = 1e-4;   // m, and of a ball's radius
+
+// Whether a beam may light any surface in a ball (middle, radius; world m): caustic_part leaves out the rest.
+bool may_light(Beam beam, vec4 ball) {
+    vec3 to = ball.xyz - beam.from.xyz;
+    float along = dot(to, beam.direction.xyz), radius = ball.w * (1.0 + ROUNDING) + ROUNDING;
+    float aside = length(to - along * beam.direction.xyz);
+    return aside <= beam.direction.w + radius && abs(along - beam.from.w) <= LONGEST * beam.direction.w + radius;
+}
+
 // Irradiance at (p, normal) in CAUSTIC_STEPS.
 ivec3 caustic_part(Beam beam, mat3 basis, vec3 p, vec3 normal) {
     vec3 away = (p - beam.from.xyz) * basis;
