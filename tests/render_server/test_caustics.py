@@ -1,6 +1,7 @@
 """Light that smooth objects throw on others: where optics says, as much as they reflect, nothing through walls."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import trimesh
 
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.passes.caustics import GREATEST_ALPHA
+from deltalight.render_server.gpu.kernel import Bindings
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
@@ -170,6 +172,42 @@ def test_objects_are_lit_by_each_other(gpu: GpuContext, stage: Stage) -> None:
     off = fields(gpu, document.replaced(method=document.method.replaced(caustics=False)))
     gained = (on.virtual_radiance - off.virtual_radiance)[..., :3].mean(axis=2)
     assert gained.max() > 0.5 * 0.5 / np.pi * SILVER * IRRADIANCE
+
+
+def test_tiles_leave_out_only_beams_that_light_nothing_there(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sums are the same to the bit if every tile takes every beam whose bounds it meets."""
+    other = stage.virtual(shifted(cube(0.05), -0.08, 0.05, 0.03))
+    shining = stage.virtual(shifted(ball(), 0.02, 0.0, 0.06), material={**DOWN, "roughness": 0.3})
+    document = stage.document([shining, other], [directional()], floor())
+    marked = sums_and_beams_of_tiles(gpu, document)
+
+    def endless_balls(self: Caustics, shared: Bindings, scene: Bindings) -> None:
+        self._find_balls.release()
+        balls = np.tile(np.array([0, 0, 0, 1e6], np.float32), self._balls.width * self._balls.height)
+        self._find_balls = SimpleNamespace(
+            run=lambda *_, **__: self._balls.write(balls.tobytes()), release=int
+        )
+        gather(self, shared, scene)
+
+    gather = Caustics._gather_wide
+    monkeypatch.setattr(Caustics, "_gather_wide", endless_balls)
+    everywhere = sums_and_beams_of_tiles(gpu, document)
+    assert marked[0] == everywhere[0] != bytes(len(marked[0]))
+    assert 0 < marked[1] < 0.8 * everywhere[1]
+
+
+def sums_and_beams_of_tiles(gpu: GpuContext, document: SceneDocument) -> tuple[bytes, int]:
+    """The light of beams, and how many beams all tiles together look at."""
+    renderer = SceneRenderer(gpu, document)
+    renderer.render(frame())
+    assert renderer.graph is not None
+    caustics = renderer.graph["caustics"]
+    bits = np.unpackbits(np.frombuffer(caustics._tile_beams.read(), np.uint8))
+    found = caustics.bindings["CausticSums"].read(), int(bits.sum())
+    renderer.release()
+    return found
 
 
 def test_nothing_is_thrown_by_rough_or_interfaceless_objects(gpu: GpuContext, stage: Stage) -> None:
