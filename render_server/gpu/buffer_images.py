@@ -1,4 +1,4 @@
-"""Storage buffers that a kernel reads as images (gpu/texel_images.py): moderngl does not know buffer textures."""
+"""Storage buffers that a kernel takes as images (gpu/texel_images.py): moderngl does not know buffer textures."""
 
 import ctypes
 from collections.abc import Callable, Mapping
@@ -8,7 +8,7 @@ from weakref import ref
 
 import moderngl
 
-TEXTURE_BUFFER, READ_ONLY = 0x8C2A, 0x88B8  # OpenGL's numbers, as those below
+TEXTURE_BUFFER, READ_WRITE = 0x8C2A, 0x88BA  # OpenGL's numbers, as those below
 BUFFER_IMAGES: Final = frozenset({0x9051, 0x905C, 0x9067})  # types imageBuffer, iimageBuffer, uimageBuffer
 FORMATS: Final[Mapping[str, int]] = {
     "r32f": 0x822E,
@@ -60,7 +60,7 @@ class BufferImage:
             self._calls.glBindTexture(TEXTURE_BUFFER, self._name)
             self._calls.glTexBuffer(TEXTURE_BUFFER, self._format, buffer.glo)
             self._shown, self._size = ref(buffer), buffer.size
-        self._calls.glBindImageTexture(unit, self._name, 0, 0, 0, READ_ONLY, self._format)
+        self._calls.glBindImageTexture(unit, self._name, 0, 0, 0, READ_WRITE, self._format)
 
     def release(self) -> None:
         """Frees the texture."""

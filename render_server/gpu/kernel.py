@@ -239,10 +239,7 @@ class _Program:
         texture.bind_to_image(slot.place)
 
     def _bind_array(self, slot: _Slot, value: Binding) -> None:
-        buffer = self._gpu.empty_buffer if value is None else value
-        if not isinstance(buffer, moderngl.Buffer):
-            raise self._wrong(slot, value, "a storage buffer")
-        self._shown[slot.name].bind(slot.place, buffer)
+        self._shown[slot.name].bind(slot.place, self._buffer(slot, value))
 
     def _check_image(self, slot: _Slot, texture: object) -> None:
         kind = IMAGES[slot.kind]
@@ -258,12 +255,15 @@ class _Program:
         slot.note_fitting(texture)
 
     def _bind_storage(self, slot: _Slot, value: Binding) -> None:
+        self._buffer(slot, value).bind_to_storage_buffer(slot.place)
+
+    def _buffer(self, slot: _Slot, value: Binding) -> moderngl.Buffer:
         is_written = slot.name in self._declared.written
         nothing = self._gpu.discarded_buffer if is_written else self._gpu.empty_buffer
         buffer = nothing if value is None else value
         if not isinstance(buffer, moderngl.Buffer):
             raise self._wrong(slot, value, "a storage buffer")
-        buffer.bind_to_storage_buffer(slot.place)
+        return buffer
 
     def _bind_block(self, slot: _Slot, value: Binding) -> None:
         if not isinstance(value, UniformBlock):
@@ -326,7 +326,7 @@ class _Program:
 
     def written(self, known: Bindings) -> dict[str, object]:
         """Images and buffers that it may write, of what its names were bound to."""
-        slots = (*self._images, *self._storage)
+        slots = (*self._images, *self._arrays, *self._storage)
         bound = {slot.name: known[slot.name] for slot in slots if slot.name in self._declared.written}
         return {name: item for name, item in bound.items() if item is not None}
 
@@ -394,9 +394,10 @@ class Kernel(_Shader):
         super().__init__(gpu, name, defines)
 
     def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
-        source = shader_source(SHADERS / f"{self._name}.comp.glsl", {**self._gpu.defines, **defines})
-        label = _label(self._name, defines)
-        self._gpu.compiled(label, {"comp": source})
+        path, label = SHADERS / f"{self._name}.comp.glsl", _label(self._name, defines)
+        source = shader_source(path, {**self._gpu.defines, **defines})
+        if self._gpu.compile_watchers:  # they look at what any GPU compiles
+            self._gpu.compiled(label, {"comp": shader_source(path, defines)})
         if self._gpu.is_software:
             source = with_images(source, self._gpu.most_images)
 

@@ -1,5 +1,7 @@
 """Sources for software renderers: samplers and read-only storage buffers become images."""
 
+import gc
+
 import moderngl
 import numpy as np
 import pytest
@@ -139,6 +141,8 @@ def test_programs_free_the_textures_through_which_they_read_buffers(
 ) -> None:
     monkeypatch.setattr(gpu.programs, "_programs", {})
     monkeypatch.setattr(context_module, "SPARE_PROGRAMS", 0)
+    gc.collect()
+    gpu.check()  # frees what earlier tests left
     before = count_gl_objects()["Texture"]
     kernel = make("layout(std430) readonly buffer Reals { float reals[]; };", "values[0] = reals[0];")
     kernel.run((1,), Out=None, Reals=None)

@@ -29,7 +29,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
         atomicAdd(group_sums[at + GROUP_NORMAL + j], fixed_point(weight * n[j]));
         atomicAdd(group_sums[at + GROUP_PLACE + j], fixed_point(weight * place[j]));
     }
-    if (!has_seen || surfel_lights[2u * surfel + uint(side)].radiance.w > 0.5) return;
+    if (!has_seen || surfel_light(2u * surfel + uint(side), RADIANCE_MU).w > 0.5) return;
     atomicAdd(group_sums[at + GROUP_UNSEEN], 1);
 }
 #else

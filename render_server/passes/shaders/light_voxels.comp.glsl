@@ -9,6 +9,7 @@
 // L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
 #define SURFELS_ACCESS readonly
 #define SURFEL_LIGHTS_ACCESS
+#define KEEPS_SURFEL_LIGHTS
 #define GRID_ACCESS readonly
 #ifndef REAL_DELTA
 #define SUMS_ACCESS
@@ -67,8 +68,8 @@ const int GATHERED_RHO = 1;
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     int slot = group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n));
     vec3 ambient = environment_irradiance(n);
-    mu = surfel_lights[own].direct_mu.rgb + (slot < 0 ? ambient : group_light[2 * slot].rgb);
-    rho = surfel_lights[own].direct_rho.rgb + (slot < 0 ? ambient : group_light[2 * slot + GATHERED_RHO].rgb);
+    mu = surfel_light(own, DIRECT_MU).rgb + (slot < 0 ? ambient : group_light[2 * slot].rgb);
+    rho = surfel_light(own, DIRECT_RHO).rgb + (slot < 0 ? ambient : group_light[2 * slot + GATHERED_RHO].rgb);
 }
 #else
 #ifdef VIRTUAL
@@ -99,12 +100,12 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     } while (++i < light_count);
     if (keep_light) {
 #ifndef REAL_RHO
-        surfel_lights[own].direct_mu = vec4(mu, 0.0);
+        keep_surfel_light(own, DIRECT_MU, vec4(mu, 0.0));
 #endif
-        surfel_lights[own].direct_rho = vec4(rho, 0.0);
+        keep_surfel_light(own, DIRECT_RHO, vec4(rho, 0.0));
     }
 #ifdef REAL_RHO
-    mu = surfel_lights[own].direct_mu.rgb;
+    mu = surfel_light(own, DIRECT_MU).rgb;
 #endif
     vec3 ambient = environment_irradiance(n);
     mu += ambient;
@@ -136,11 +137,11 @@ void add(uint voxel, vec3 n, float area, float opaque, vec3 radiance) {
 // What the sums lack: everything at first, then the gain of gathered light. w: 1 where the camera measured it.
 vec3 unsummed(uint own, vec4 radiance) {
 #ifdef GATHERED
-    vec3 summed = surfel_lights[own].radiance.rgb;
+    vec3 summed = surfel_light(own, RADIANCE_MU).rgb;
 #else
     vec3 summed = vec3(0.0);
 #endif
-    if (keep_light) surfel_lights[own].radiance = radiance;
+    if (keep_light) keep_surfel_light(own, RADIANCE_MU, radiance);
     return radiance.rgb - summed;
 }
 #endif
@@ -153,7 +154,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 diffuse = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness);
     vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(WHITEST));
     bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
-    vec3 carried = in_beams ? (albedo - min(diffuse, albedo)) * surfel_lights[own].direct_rho.rgb : vec3(0.0);
+    vec3 carried = in_beams ? (albedo - min(diffuse, albedo)) * surfel_light(own, DIRECT_RHO).rgb : vec3(0.0);
     return unsummed(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
 }
 #endif
@@ -161,7 +162,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 #ifdef REAL
 vec3 outgoing(Surfel s, vec3 n, uint own) {
 #ifdef GATHERED
-    if (surfel_lights[own].radiance.w > 0.5) return vec3(0.0);
+    if (surfel_light(own, RADIANCE_MU).w > 0.5) return vec3(0.0);
 #else
     vec3 p = s.position_area.xyz;
     if (camera_sees(p, n)) return unsummed(own, vec4(measured_radiance(p), 1.0));
@@ -219,11 +220,11 @@ const float LEAST_CHANGE = 1.0 / 512.0;
 vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
-    add_to_group(s, n, mu, surfel_lights[own].radiance.rgb);
+    add_to_group(s, n, mu, surfel_light(own, RADIANCE_MU).rgb);
 #ifdef GATHERED
     if (all(lessThanEqual(abs(rho - mu), LEAST_CHANGE * max(mu, rho)))) return vec3(0.0);
 #endif
-    return change_of(surfel_lights[own].radiance.rgb / (mu + 1e-6), mu, rho);
+    return change_of(surfel_light(own, RADIANCE_MU).rgb / (mu + 1e-6), mu, rho);
 }
 #endif
 
