@@ -126,7 +126,7 @@ class _Program:
         self.users: set[int] = set()  # ids of the kernels that have not been released
         self._samplers: list[_Slot] = []
         self._images: list[_Slot] = []
-        self._arrays: list[_Slot] = []  # storage buffers that are read as images
+        self._arrays: list[_Slot] = []  # storage buffers that a shader takes as images
         self._storage: list[_Slot] = []
         self._blocks: list[_Slot] = []
         self._uniforms: list[_Slot] = []
@@ -154,8 +154,8 @@ class _Program:
         elif isinstance(member, moderngl.UniformBlock):
             self._blocks.append(slot)
         elif isinstance(member, moderngl.Uniform):
-            kinds = (SAMPLERS, self._samplers), (IMAGES, self._images), (BUFFER_IMAGES, self._arrays)
-            slots = next((slots for kinds, slots in kinds if slot.kind in kinds), self._uniforms)
+            textures = (SAMPLERS, self._samplers), (IMAGES, self._images), (BUFFER_IMAGES, self._arrays)
+            slots = next((slots for kinds, slots in textures if slot.kind in kinds), self._uniforms)
             slots.append(slot)
             if slots is not self._uniforms:
                 slot.member.gl_type = GL_INT  # as units are; moderngl 5.13 leaves that of an image3D unset
