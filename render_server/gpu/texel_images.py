@@ -19,9 +19,9 @@ from deltalight.render_server.gpu.shader_source import live, without_comments
 
 _PRAGMA = re.compile(r"#pragma texels (\w+) (.+)")
 _IMAGES = re.compile(r"image(?:2D|3D|2DArray) \w")
-_BLOCK = re.compile(r"buffer (\w+) \{([^}]*?)(\w+) (\w+)\[\]; \}")
+_BLOCK = re.compile(r"layout\(std430\) (\w+) buffer (\w+) \{([^}]*?)(\w+) (\w+)\[\]; \}")
 _STRUCT = re.compile(r"struct (\w+) \{([^}]*)\}")
-_MEMBER = re.compile(r"(\w+) \w+(?:\[(\d+)\])?;")
+_MEMBER = re.compile(r"\s*(\w+) \w+(?:\[(\d+)\])?")
 _SAMPLERS = [f"{kind}sampler{shape}" for kind in ("", "i", "u") for shape in ("2D", "3D", "2DArray")]
 _ELEMENTS: Final = {  # of an array: format and type of the image, components that hold one
     "uint": ("r32ui", "uimageBuffer", "r"),
@@ -74,9 +74,8 @@ def _without_sampler(source: str, name: str, texels: str) -> str:
         source = source.replace(f"uniform {sampler} {name};", image)
     source = source.replace(f"textureSize({name}, 0)", f"imageSize({name})")
     head = f"texelFetch({name}, "
-    while (
-        at := source.rfind(head)
-    ) >= 0:  # from the last one on, so that those in arguments are replaced before
+    # From the last one on, so that those in arguments are replaced before.
+    while (at := source.rfind(head)) >= 0:
         arguments, rest = _until(source, at + len(head), "(", ")")
         place, comma, level = arguments.rpartition(", ")
         if not comma or level != "0":
@@ -109,7 +108,7 @@ class _Array:
 
     @property
     def size(self) -> int:
-        """Texels of an element, 0 if it is a struct that holds anything else than vectors of four numbers."""
+        """Texels of an element, 0 if it is a struct of other than vectors of four numbers, one a declaration."""
         return 1 if self.element in _ELEMENTS else self._vectors(self.element)
 
     def _vectors(self, kind: str) -> int:
@@ -119,7 +118,10 @@ class _Array:
         return sum(count * times for count, times in members) if all(count for count, _ in members) else 0
 
     def _members(self, kind: str) -> list[tuple[str, str]]:
-        return _MEMBER.findall(self.structs.get(kind, ""))
+        """Kinds of a struct's members and how many of an array; no kind for what this does not understand."""
+        declared = [text for text in self.structs.get(kind, "").split(";") if text.strip()]
+        found = [_MEMBER.fullmatch(text) for text in declared]
+        return [("", "") if each is None else (each[1], each[2] or "") for each in found]
 
     def replaced(self, source: str) -> str:
         """Returns the source with an image for the block, which a function reads."""
@@ -149,6 +151,11 @@ class _Array:
             return self._read(kind, places)
         return f"{kind}[{times}]({', '.join(self._read(kind, places) for _ in range(int(times)))})"
 
+    def declares_every_block_in(self, source: str) -> bool:
+        """Whether all that is declared under the block's name, in branches too, has the form that is replaced."""
+        form = rf"layout\(std430\) (?:\w+ )?buffer {self.block} \{{"
+        return len(re.findall(form, source)) == source.count(f"buffer {self.block} {{")
+
     def _without_block(self, source: str, image: str) -> str:
         head = f"buffer {self.block} {{"
         while (at := source.find(head)) >= 0:  # more than one where branches declare it in other ways
@@ -170,11 +177,9 @@ def _arrays(source: str) -> Iterator[_Array]:
     """Arrays of read-only storage buffers whose elements are vectors of one kind."""
     kept, macros = live(source)
     structs = dict(_STRUCT.findall(kept))
-    for found in _BLOCK.finditer(kept):
-        block, before, element, name = found.groups()
-        access = kept[: found.start()].rsplit(None, 1)[-1]
+    for access, block, before, element, name in _BLOCK.findall(kept):
         header = [words.split() for words in before.split(";") if words.strip()]
         array = _Array(block, tuple(number for _, number in header), element, name, structs)
-        is_read_only = macros.get(access, access) == "readonly"
+        is_read_only = macros.get(access, access) == "readonly" and array.declares_every_block_in(source)
         if is_read_only and array.size and all(kind == "uint" for kind, _ in header):
             yield array

@@ -55,6 +55,25 @@ def test_buffers_that_are_written_and_structs_of_other_members_stay() -> None:
     assert with_images(source, MANY) == source
 
 
+@pytest.mark.parametrize(
+    ("declared", "layout"),
+    [
+        ("struct Entry { vec4 a, b; };", "std430"),
+        ("const int N = 2;\nstruct Entry { vec4 a[N]; vec4 b; };", "std430"),
+        ("struct Entry { mat4 a; };", "std430"),
+        ("struct Entry { vec4 a; };", "std430, binding = 3"),
+    ],
+    ids=["two names", "named length", "matrix", "another layout"],
+)
+def test_declarations_of_other_forms_stay_whole(declared: str, layout: str) -> None:
+    """A plugin's shader may have them: read in a wrong layout, they would be wrong in silence."""
+    block = f"layout({layout}) readonly buffer Entries {{ Entry entries[]; }};\n"
+    source = (
+        f"layout(std430) buffer Out {{ vec4 result; }};\n{declared}\n{block}void main() {{ entries[0]; }}"
+    )
+    assert with_images(source, MANY) == source
+
+
 def test_every_kind_of_array_is_read_as_from_its_buffer(
     gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer
 ) -> None:
