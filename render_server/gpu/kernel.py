@@ -7,30 +7,28 @@ needs.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
-from weakref import ref
 
 import moderngl
 import numpy as np
 
 from deltalight.render_server.gpu.buffer_images import BUFFER_IMAGES, BufferImage
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.program_slots import Slot, Value
 from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
 from deltalight.render_server.gpu.texel_images import with_images
 from deltalight.render_server.gpu.textures import image_format, release_all, texels_of
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 
 GL_INT = 0x1404
-FITTING_KEPT = 32  # textures of a name that need not be checked again: some for each camera of a room
 CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
 Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
 PLAIN = (float, int, bool, tuple, list)  # values of uniforms that moderngl takes as they are
-Value = float | int | bool | Sequence[float] | Sequence[Sequence[float]] | np.ndarray[Any, Any]
 Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
 Bindings = Mapping[str, Binding]
 """GLSL names and what is bound to them; None stands for nothing: a texture without texels, an empty buffer."""
@@ -80,38 +78,6 @@ class Dispatch:
     written: Mapping[str, object]
 
 
-def _nothing() -> None:
-    """Stands where no texture was checked yet."""
-
-
-@dataclass(eq=False)
-class _Slot:
-    """An active resource of a linked program with its unit or binding point.
-
-    `checked` returns the texture that was bound last, `fitting` those that were found to fit, by their ids, while
-    they live; `last` is what a uniform holds.
-    """
-
-    name: str
-    member: Any
-    kind: int = 0
-    place: int = 0
-    checked: Callable[[], object] = _nothing
-    fitting: dict[int, Callable[[], object]] = field(default_factory=dict)
-    last: bytes | Value | None = None
-
-    def is_known(self, texture: object) -> bool:
-        """Returns whether this very texture was found to fit before: cameras of a room take turns in each frame."""
-        self.checked = self.fitting.get(id(texture), _nothing)
-        return self.checked() is texture
-
-    def note_fitting(self, texture: object) -> None:
-        """Notes that a texture fits."""
-        if len(self.fitting) >= FITTING_KEPT:
-            self.fitting.clear()
-        self.checked = self.fitting[id(texture)] = ref(texture)
-
-
 class _Program:
     """A linked program and its resources by name."""
 
@@ -124,19 +90,19 @@ class _Program:
     ) -> None:
         self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
         self.users: set[int] = set()  # ids of the kernels that have not been released
-        self._samplers: list[_Slot] = []
-        self._images: list[_Slot] = []
-        self._arrays: list[_Slot] = []  # storage buffers that a shader takes as images
-        self._storage: list[_Slot] = []
-        self._blocks: list[_Slot] = []
-        self._uniforms: list[_Slot] = []
+        self._samplers: list[Slot] = []
+        self._images: list[Slot] = []
+        self._arrays: list[Slot] = []  # storage buffers that a shader takes as images
+        self._storage: list[Slot] = []
+        self._blocks: list[Slot] = []
+        self._uniforms: list[Slot] = []
         for name in program:
             self._adopt(name, program[name])
         self._assign()
         self._shown = {
             slot.name: BufferImage(gpu.texture_calls, *declared.formats[slot.name]) for slot in self._arrays
         }
-        binders: Sequence[tuple[list[_Slot], Callable[[_Slot, Binding], None]]] = (
+        binders: Sequence[tuple[list[Slot], Callable[[Slot, Binding], None]]] = (
             (self._samplers, self._bind_sampler),
             (self._images, self._bind_image),
             (self._arrays, self._bind_array),
@@ -148,7 +114,7 @@ class _Program:
         self._switches = frozenset(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:
-        slot = _Slot(name, member, getattr(member, "gl_type", 0))
+        slot = Slot(name, member, getattr(member, "gl_type", 0))
         if isinstance(member, moderngl.StorageBlock):
             self._storage.append(slot)
         elif isinstance(member, moderngl.UniformBlock):
@@ -207,17 +173,17 @@ class _Program:
         close = get_close_matches(name, self._declared.names, 1)
         return f"; the nearest name is `{close[0]}`" if close else ""
 
-    def _wrong(self, slot: _Slot, value: object, wanted: str) -> BindingError:
+    def _wrong(self, slot: Slot, value: object, wanted: str) -> BindingError:
         return BindingError(f"Kernel {self.label}: `{slot.name}` is {wanted}, not a {type(value).__name__}.")
 
-    def _bind_sampler(self, slot: _Slot, value: Binding) -> None:
+    def _bind_sampler(self, slot: Slot, value: Binding) -> None:
         kind, texels = SAMPLERS[slot.kind]
         texture: Any = self._gpu.empty_texture(kind, f"{texels}1", 4) if value is None else value
         if slot.checked() is not texture and not slot.is_known(texture):
             self._check_sampled(slot, texture)
         texture.use(location=slot.place)
 
-    def _check_sampled(self, slot: _Slot, texture: object) -> None:
+    def _check_sampled(self, slot: Slot, texture: object) -> None:
         kind, texels = SAMPLERS[slot.kind]
         if not isinstance(texture, Texture) or not isinstance(texture, kind):
             raise self._wrong(slot, texture, f"a {kind.__name__} that is sampled")
@@ -229,7 +195,7 @@ class _Program:
             )
         slot.note_fitting(texture)
 
-    def _bind_image(self, slot: _Slot, value: Binding) -> None:
+    def _bind_image(self, slot: Slot, value: Binding) -> None:
         texture: Any = value
         if value is None and slot.name not in self._declared.written:
             (texels,) = self._declared.formats[slot.name]
@@ -238,10 +204,10 @@ class _Program:
             self._check_image(slot, value)
         texture.bind_to_image(slot.place)
 
-    def _bind_array(self, slot: _Slot, value: Binding) -> None:
+    def _bind_array(self, slot: Slot, value: Binding) -> None:
         self._shown[slot.name].bind(slot.place, self._buffer(slot, value))
 
-    def _check_image(self, slot: _Slot, texture: object) -> None:
+    def _check_image(self, slot: Slot, texture: object) -> None:
         kind = IMAGES[slot.kind]
         if not isinstance(texture, Texture) or not isinstance(texture, kind):
             raise self._wrong(slot, texture, f"a {kind.__name__} that is written or read texel by texel")
@@ -254,10 +220,10 @@ class _Program:
             )
         slot.note_fitting(texture)
 
-    def _bind_storage(self, slot: _Slot, value: Binding) -> None:
+    def _bind_storage(self, slot: Slot, value: Binding) -> None:
         self._buffer(slot, value).bind_to_storage_buffer(slot.place)
 
-    def _buffer(self, slot: _Slot, value: Binding) -> moderngl.Buffer:
+    def _buffer(self, slot: Slot, value: Binding) -> moderngl.Buffer:
         is_written = slot.name in self._declared.written
         nothing = self._gpu.discarded_buffer if is_written else self._gpu.empty_buffer
         buffer = nothing if value is None else value
@@ -265,7 +231,7 @@ class _Program:
             raise self._wrong(slot, value, "a storage buffer")
         return buffer
 
-    def _bind_block(self, slot: _Slot, value: Binding) -> None:
+    def _bind_block(self, slot: Slot, value: Binding) -> None:
         if not isinstance(value, UniformBlock):
             raise self._wrong(slot, value, "a uniform block")
         if not value.fits(slot.member.size):
@@ -275,7 +241,7 @@ class _Program:
             )
         value.bind(slot.place)
 
-    def _write(self, slot: _Slot, value: Binding) -> None:
+    def _write(self, slot: Slot, value: Binding) -> None:
         """Writes a uniform if its value changed; 4x4 arrays are row-major here."""
         data: bytes | Value
         if isinstance(value, np.ndarray):
