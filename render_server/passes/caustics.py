@@ -128,7 +128,7 @@ class Caustics:
         self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
         self._tile_beams = gpu.ctx.buffer(reserve=4)
         self._find_balls = Kernel(gpu, "caustic_balls", **reuse_define(reuses))
-        self._find_tiles = Kernel(gpu, "caustic_tiles", **reuse_define(reuses))
+        self._find_tiles = Kernel(gpu, "caustic_tiles")
         rows = 8 if gpu.is_software else 2  # software renderers read a beam once for each of few threads
         self._gather = Kernel(
             gpu, "caustic_gather", ROWS=rows, GROUP_ROWS=TILE // rows, **reuse_define(reuses)

@@ -14,7 +14,8 @@ const int TILE = 8;
 const uint REAL_LIGHT = 1u, OBJECT_LIGHT = 2u;
 
 int first_word(ivec2 tile, int layer) {
-    return ((layer == REAL_LAYER ? 0 : tiles.y) + tile.y) * tiles.x * beam_words + tile.x * beam_words;
+    int row = tile.y + (layer == REAL_LAYER ? 0 : tiles.y);
+    return (row * tiles.x + tile.x) * beam_words;
 }
 
 // Surface of a layer that a texel samples, if it needs light.
