@@ -1,12 +1,14 @@
 """Make the demo that the project ships: `python -m deltalight.benchmarks.make_demo --out DIR` (needs Mitsuba).
 
-Writes demo.mcap (the room of `ground_truth/scene_demo.py` as sensors see it), object.glb and scene.json. With
-`--truth DIR` also the first frame without noise, without and with the object, as PNG and linear NPY.
+Writes demo.mcap (the room of `ground_truth/scene_demo.py` as sensors see it), object.glb, facts.json (what the check
+of assets finds in it) and scene.json. With `--truth DIR` also the first frame without noise, without and with the
+object, as PNG and linear NPY.
 """
 
 import json
 import sys
 import tempfile
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +28,8 @@ from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.protocol.pictures import decode_rgb, depth_from_steps
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import load_scene
+from deltalight.services.storage.asset_facts import mesh_facts
+from deltalight.services.storage.asset_kinds import Facts
 
 SEED = 20210
 JPEG_QUALITY = 85
@@ -73,12 +77,13 @@ def sensor_frame(
 
 
 def write_demo(out: Path, spp: int, progress: Progress) -> None:
-    """Write demo.mcap, object.glb and scene.json into `out`, replacing older ones when all are complete."""
+    """Write the demo's files into `out`, replacing older ones when all are complete."""
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out, prefix=".making-") as folder:
         made = Path(folder)
         views = render_views(made, spp, progress)
         write_glb(made / "object.glb")
+        (made / "facts.json").write_text(json.dumps(facts_by_digest(made / "object.glb"), indent=1) + "\n")
         (made / "scene.json").write_text(json.dumps(scene_demo.scene_document(), indent=2) + "\n")
         scene = load_scene(made / "scene.json")
         step_m = StereoDepthSensor().step_m
@@ -87,8 +92,13 @@ def write_demo(out: Path, spp: int, progress: Progress) -> None:
         ) as recording:
             for frame in progress.track(range(scene_demo.FRAME_COUNT), description="writing frames"):
                 recording.add(sensor_frame(frame, *views[_pose_key(frame)]))
-        for name in ("object.glb", "scene.json", "demo.mcap"):
+        for name in ("object.glb", "facts.json", "scene.json", "demo.mcap"):
             (made / name).replace(out / name)
+
+
+def facts_by_digest(mesh: Path) -> dict[str, Facts]:
+    """Return what `storage.assets` need not find out again: the facts of a mesh file, by the hash of its content."""
+    return {sha256(mesh.read_bytes()).hexdigest(): mesh_facts(mesh)}
 
 
 def write_truth(out: Path, spp: int, progress: Progress) -> None:
@@ -104,7 +114,7 @@ def write_truth(out: Path, spp: int, progress: Progress) -> None:
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="Folder for demo.mcap, object.glb and scene.json.")],
+    out: Annotated[Path, typer.Option(help="Folder for demo.mcap, object.glb, facts.json and scene.json.")],
     spp: Annotated[int, typer.Option(min=1, help="Light paths per pixel of the recording.")] = 192,
     truth: Annotated[Path | None, typer.Option(help="Folder for noise-free pictures of frame 0.")] = None,
     truth_spp: Annotated[int, typer.Option(min=1, help="Light paths per pixel of these.")] = 1024,

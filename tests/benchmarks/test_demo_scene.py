@@ -1,5 +1,6 @@
 """The demo: printed board against BoardSpec, sensor models, and the files that the project ships."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from deltalight.benchmarks.ground_truth import scene_demo
 from deltalight.benchmarks.ground_truth.board_texture import INK_ALBEDO, board_texture
 from deltalight.benchmarks.ground_truth.demo_object import BASE_COLOR, ROUGHNESS, object_mesh, write_glb
 from deltalight.benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor, srgb_bytes
+from deltalight.benchmarks.make_demo import facts_by_digest
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import SensorFrame, decode_lut
@@ -134,6 +136,10 @@ def test_shipped_object_is_the_one_that_is_made_here(tmp_path: Path) -> None:
     assert mesh.bounds[0, 2] == 0
     assert len(mesh.faces) < 10_000
     assert all(part.is_watertight and part.volume > 0 for part in mesh.split())
+
+
+def test_shipped_facts_are_what_the_check_of_the_object_finds() -> None:
+    assert json.loads((ASSETS / "facts.json").read_bytes()) == facts_by_digest(ASSETS / "object.glb")
 
 
 def test_shipped_scene_is_valid_and_complete() -> None:

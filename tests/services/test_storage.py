@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from sqlalchemy import create_engine
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.asset_kinds import AssetKind, Facts
 from deltalight.services.storage.documents import (
     add_object,
     merge_patch,
@@ -36,6 +37,7 @@ from deltalight.services.storage.tables import SCHEMA_VERSION, Base
 from deltalight.services.storage.tickets import Ticket
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
 
+DEMO_ASSETS = Path(__file__).parents[2] / "services" / "demo_assets"
 TOKEN_OF_VERSION_2 = "deltalight-fa9ac659b290--Bud0XIv_HpLkQqYnqwjfVqalCQgKxd21A1OS9YWbcU"
 
 
@@ -43,6 +45,18 @@ TOKEN_OF_VERSION_2 = "deltalight-fa9ac659b290--Bud0XIv_HpLkQqYnqwjfVqalCQgKxd21A
 def store(tmp_path: Path, database: str | None) -> Iterator[Store]:
     with Store(tmp_path / "data", database=database, probe=trusting_probe) as store:
         yield store
+
+
+def test_the_demos_object_is_stored_without_a_check_and_an_altered_one_is_checked(tmp_path: Path) -> None:
+    content = (DEMO_ASSETS / "object.glb").read_bytes()
+
+    def refusing(_path: Path, _kind: AssetKind, name: str) -> Facts:
+        raise RejectedAssetError(f"{name} was checked")
+
+    with Store(tmp_path / "data", probe=refusing) as store:
+        assert upload(store, content, "object.glb").facts["triangles"] == 8096
+        with pytest.raises(RejectedAssetError, match=r"object\.glb was checked"):
+            upload(store, content[:-1] + bytes([content[-1] ^ 1]), "object.glb")
 
 
 def test_every_change_is_a_revision_that_can_be_read_later(store: Store) -> None:
