@@ -417,5 +417,5 @@ def frame_graphs(
         graph.release()
         raise
     for each in made:
-        each._all = made
+        each._all = tuple(made)
     return made

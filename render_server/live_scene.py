@@ -1,5 +1,6 @@
 """One scene across frames: geometry, lights and estimates that outlive a frame, and the frame graph."""
 
+import gc
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -216,12 +217,16 @@ class LiveScene:
 
     def _drop_graph(self) -> None:
         self._free(self._graphs, self._best, self._spare)
-        self._graphs, self._best, self._spare = [], [], []
 
     def _free(self, *graphs: list[FrameGraph]) -> None:
-        """Frees the graphs of a room's cameras, whose first one owns what they share."""
+        """Empties the lists, and frees their graphs: of each room's cameras, the first one owns what they share."""
+        is_any = any(graphs)
         release_all(*(each for room in graphs for each in room[:1]))
-        if self._gpu.is_software and any(graphs):
+        for room in graphs:
+            room.clear()
+        if self._gpu.is_software and is_any:
+            # Graphs refer to themselves. Until the next collection, their arrays would lie between those of new ones.
+            gc.collect()
             give_back_freed_memory()
 
     def forget_frames(self) -> None:
@@ -436,7 +441,6 @@ class LiveScene:
         """
         if len(views) != len(self._graphs):
             self._free(self._spare)
-            self._spare = []
         elif self._gpu.is_software and not _fit(self._graphs, views):
             self._graphs, self._spare = self._spare, self._graphs
         before, self._graphs = self._graphs, []

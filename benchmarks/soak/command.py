@@ -163,7 +163,8 @@ def _wait(station: Station, condition: Callable[[], bool], otherwise: str) -> No
 
 def _renderer(station: Station) -> str:
     known = station.client.get("/nodes").raise_for_status().json()
-    return next((each["detail"] for each in known if each["kind"] == "render_server"), "")
+    detail = next((each["detail"] for each in known if each["kind"] == "render_server"), "")
+    return str(detail).partition("; ")[0]  # remarks about faults and cameras follow
 
 
 def _orphans(ids: set[int]) -> int:

@@ -1,8 +1,9 @@
 """The cameras of a room: each node's streams are paired for themselves, their newest frames are rendered together.
 
 A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: it is
-silent, sees another board than the first one, or its frames are of another time. What a silent one saw last lights
-the room for half a minute.
+silent, sees another board than the first one, or its frames are of another time. What one that is silent or late saw
+last lights the room for half a minute: renderers build what they need for so many cameras, which takes seconds in
+software, and a network that stutters is no reason for it.
 """
 
 from collections import Counter, deque
@@ -19,7 +20,7 @@ from deltalight.render_server.started_frame import CameraFrame
 
 SILENT_NS = 2 * 10**9  # without a frame; or this many of the camera's periods, if they are longer
 SILENT_PERIODS = 5
-REMEMBERED_NS = 30 * 10**9  # how long a silent camera's last frame lights the room
+REMEMBERED_NS = 30 * 10**9  # how long the last frame that counted lights the room
 GATHER_NS = 300 * 10**6  # how long the first frames, and those after a pause, wait for all cameras
 KEPT_ARRIVALS = 5
 MAX_NODES = 2 * MAX_CAMERAS  # those that send light without frames included
@@ -41,12 +42,16 @@ class Taken(NamedTuple):
 
 @dataclass(eq=False)
 class _Place:
-    """A camera and its newest frame, which is `new` since `ready_ns` or has been rendered."""
+    """A camera and its newest frame, which is `new` since `ready_ns` or has been rendered.
+
+    `counted`: the newest one while the camera was live.
+    """
 
     name: str
     newest: AssembledFrame
     ready_ns: int
     is_new: bool = True
+    counted: AssembledFrame | None = None
     status: CameraStatus = "live"
     remark: str = ""
     arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT_ARRIVALS))
@@ -153,8 +158,9 @@ class RoomCameras:
     def take(self, now_ns: int) -> tuple[Taken, ...]:
         """Returns the newest frame of each camera that counts, if any of them is new, else none.
 
-        Silent ones come last. A new frame waits for those of other cameras that are due, for `together_ms` at most;
-        after a pause of all of them, for those of all nodes: the GPU holds what so many cameras need.
+        They are in the order of their first frames, but the first one is live. A new frame waits for those of other
+        cameras that are due, for `together_ms` at most; after a pause of all of them, for those of all nodes: the GPU
+        holds what so many cameras need.
         """
         self._gathers |= self._are_paused(now_ns)
         for name, assembler in list(self._assemblers.items()):
@@ -173,8 +179,7 @@ class RoomCameras:
         if self.is_waiting or not any(place.is_new for place in members):
             return ()
         self._taken_ns, self._gathers = now_ns, False
-        room = [*members, *self._remembered(members)]
-        taken = tuple(Taken(place.name, place.newest, place.is_new) for place in room)
+        taken = self._room(members)
         for place in self._places.values():
             place.is_new = False
         return taken
@@ -230,19 +235,34 @@ class RoomCameras:
             self._judge(place, first, is_silent=place not in live)
         return [place for place in live if place.status == "live"]
 
-    def _remembered(self, members: Sequence[_Place]) -> list[_Place]:
-        """Returns silent cameras that may be back soon: the others' light stays, and nothing is made for fewer."""
+    def _room(self, members: Sequence[_Place]) -> tuple[Taken, ...]:
+        """Returns the frames of these and of the remembered cameras, each in its place as far as possible.
+
+        What a renderer has learnt by a camera's frames belongs to the place.
+        """
+        newest = {place.name: Taken(place.name, place.newest, place.is_new) for place in members}
+        known = self._remembered(members) | newest
+        names = [name for name in self._places if name in known]
+        first = names.index(members[0].name)
+        names[0], names[first] = names[first], names[0]
+        return tuple(known[name] for name in names)
+
+    def _remembered(self, members: Sequence[_Place]) -> dict[str, Taken]:
+        """Returns what cameras saw last that may be back soon: light stays, and nothing is made for fewer."""
         newest_ns = max(place.newest.received_ns for place in members)
-        return [
-            place
+        return {
+            place.name: Taken(place.name, place.counted, is_new=False)
             for place in self._places.values()
-            if place.status == "silent"
-            and newest_ns - place.newest.received_ns <= REMEMBERED_NS
-            and _status(place, members[0], is_silent=False)[0] != "other_board"
-        ]
+            if place.counted is not None
+            and place.status in ("silent", "other_time")
+            and newest_ns - place.counted.received_ns <= REMEMBERED_NS
+            and not _sees_another_board(place, members[0])
+        }
 
     def _judge(self, place: _Place, first: _Place, *, is_silent: bool) -> None:
         status, remark = _status(place, first, is_silent=is_silent)
+        if status == "live":
+            place.counted = place.newest
         if status == place.status:
             return
         if status == "live":
@@ -256,8 +276,7 @@ def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraSta
     """Returns whether a camera is rendered with the first one, and the sentence that says why not."""
     if is_silent:
         return "silent", f"The camera {place.name} sends no frames; the others continue without it."
-    board, wanted = place.newest.view.board, first.newest.view.board
-    if board is not None and wanted is not None and board != wanted:
+    if _sees_another_board(place, first):
         return (
             "other_board",
             f"The camera {place.name} is left out: give its node the board that {first.name} sees.",
@@ -268,6 +287,11 @@ def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraSta
             f"The camera {place.name} is left out: its frames are from a different time than those of {first.name}.",
         )
     return "live", ""
+
+
+def _sees_another_board(place: _Place, first: _Place) -> bool:
+    board, wanted = place.newest.view.board, first.newest.view.board
+    return board is not None and wanted is not None and board != wanted
 
 
 def _apart_ns(some: _Place, other: _Place) -> int:

@@ -1,9 +1,11 @@
 """A render server whose method changes again and again does not keep the holes that each leaves in the heap."""
 
+import gc
 import platform
 import subprocess
 import sys
 from pathlib import Path
+from weakref import ref
 
 import pytest
 
@@ -59,4 +61,24 @@ def test_they_are_when_the_method_changes_and_only_then(
         renderer.set_scene(document.replaced(method={"name": "differential", "volume_size": 32}))
         assert len(given) == gpu.is_software
     finally:
+        renderer.release()
+
+
+def test_nothing_of_the_graphs_is_left_when_another_camera_comes(
+    gpu: GpuContext, document: SceneDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the memory of a room grows with each camera that comes or goes: new graphs lie behind what is left."""
+    if not gpu.is_software:
+        pytest.skip("only a software renderer's textures lie in the heap")
+    left: list[object] = []
+    renderer = SceneRenderer(gpu, document)
+    try:
+        renderer.render(frame())
+        old = ref(renderer.graph)
+        monkeypatch.setattr(live_scene, "give_back_freed_memory", lambda: left.append(old()))
+        gc.disable()  # it would depend on chance
+        renderer.render_views([frame(), frame()])
+        assert left == [None]
+    finally:
+        gc.enable()
         renderer.release()

@@ -201,6 +201,37 @@ def test_a_silent_camera_drops_out_with_one_notice_and_has_its_place_again(
     assert "left" not in room.session.stats().detail
 
 
+def test_cameras_keep_their_places_in_the_renderer_but_the_first_is_live(room: Room) -> None:
+    room.begin("left", "right", "above")
+    for number in range(30):
+        for name in ("left", "above") if number < 15 else ("above", "right"):
+            room.send(name, number)
+        room.pass_ms(20)
+        room.pictures()
+        room.pass_ms(180)
+        if number == 14:
+            assert room.renderer.rooms[-1] == [("left", 14, True), ("right", 1, False), ("above", 14, True)]
+    assert room.statuses() == {"left": "silent", "right": "live", "above": "live"}
+    assert room.renderer.rooms[-1] == [("right", 29, True), ("left", 14, False), ("above", 29, True)]
+
+
+def test_a_camera_whose_frames_come_late_lights_the_room_by_what_it_saw_in_time(room: Room) -> None:
+    room.begin("left", "right", behind_ms=0)
+    for number in range(5, 105):  # a link that stuttered hands over what it had queued
+        room.send("left", number, behind_ms=0)
+        room.send("right", number, behind_ms=4000)
+        assert room.shown() == [("left", number)]
+        is_remembered = number < 65
+        room.pass_ms(500)
+        assert len(room.renderer.rooms[-1]) == (2 if is_remembered else 1)
+        if is_remembered:
+            assert room.renderer.rooms[-1][1] == ("right", 1, False)
+    assert room.statuses() == {"left": "live", "right": "other_time"}
+    room.send("left", 200, behind_ms=0)
+    room.send("right", 200, behind_ms=0)
+    assert room.shown() == [("left", 200), ("right", 200)]
+
+
 def test_a_camera_that_takes_a_picture_every_three_seconds_is_not_silent(room: Room) -> None:
     for number in range(3):
         room.send("slow", number)
