@@ -177,24 +177,28 @@ class Ahead:
             attempts += 1
             taken = self._listen(cameras)
             if taken:
-                room = [each.shown(is_shown=each.is_new) for each in taken]
-                for pending in renderer.submit_cameras(room):
+                for pending in renderer.submit_cameras([each.shown(is_shown=True) for each in taken]):
                     pending.finish()
                 rendered += 1
                 # The last pictures are finished: that takes less than new ones.
                 pace.may_end = rendered < PICTURES - 1
 
     def _listen(self, cameras: RoomCameras) -> tuple[Taken, ...]:
-        """Receives a frame of each camera, none if it takes too long, and leaves the nodes alone again."""
+        """Receives a frame of each camera, or of those that send any in time, and leaves the nodes alone again.
+
+        On a busy host, a server's patience would miss some, and a renderer for fewer cameras has to be built again.
+        """
         ends_s = time.monotonic() + LISTEN_S
+        taken: tuple[Taken, ...] = ()
         with closing(FrameSource(self._settings.subscribe, self._keys)) as source:
-            while time.monotonic() < ends_s and not self._is_called(0.0):
+            while len(taken) < len(self._settings.subscribe) and time.monotonic() < ends_s:
+                if self._is_called(0.0):
+                    break
                 for multipart in (source.latest(RECEIVE_TIMEOUT_S) or {}).values():
                     with suppress(DeltalightError):  # the other server counts what is malformed
                         cameras.add(*decode(multipart), multipart)
-                if taken := cameras.take(time.time_ns()):
-                    return taken
-        return ()
+                taken = cameras.take(time.time_ns()) or taken
+        return taken
 
     def _release(self) -> None:
         self._release_renderer()

@@ -127,10 +127,14 @@ def received(multipart: list[bytes], received_ns: int) -> ReceivedMultipart:
 
 
 def color(
-    frame_id: int, capture_ns: int, received_ns: int = 0, described: dict[str, object] | None = None
+    frame_id: int,
+    capture_ns: int,
+    received_ns: int = 0,
+    described: dict[str, object] | None = None,
+    node: str = "cam",
 ) -> ReceivedMultipart:
     message = ColorMessage(
-        node="cam",
+        node=node,
         frame_id=frame_id,
         capture_ns=capture_ns,
         encoding="raw",
@@ -141,10 +145,14 @@ def color(
 
 
 def depth(
-    frame_id: int, capture_ns: int, metres: float = 1.0, described: dict[str, object] | None = None
+    frame_id: int,
+    capture_ns: int,
+    metres: float = 1.0,
+    described: dict[str, object] | None = None,
+    node: str = "cam",
 ) -> ReceivedMultipart:
     message = DepthMessage(
-        node="cam",
+        node=node,
         stream="clean_depth",
         frame_id=frame_id,
         capture_ns=capture_ns,
@@ -157,9 +165,9 @@ def depth(
     return received(encode(message, [encode_depth(image, image > 0, "raw", 0.001)]), 0)
 
 
-def pose(frame_id: int, capture_ns: int, status: str = "ok") -> ReceivedMultipart:
+def pose(frame_id: int, capture_ns: int, status: str = "ok", node: str = "cam") -> ReceivedMultipart:
     matrix = IDENTITY if status == "ok" else None
     message = PoseMessage(
-        node="cam", frame_id=frame_id, capture_ns=capture_ns, status=status, world_from_camera=matrix
+        node=node, frame_id=frame_id, capture_ns=capture_ns, status=status, world_from_camera=matrix
     )
     return received(encode(message), 0)

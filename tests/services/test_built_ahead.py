@@ -2,6 +2,7 @@
 
 import os
 import select
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -15,6 +16,9 @@ from deltalight.protocol.messages import CompositeMessage, ControlReply, Control
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.server.ahead import Ahead
+from deltalight.render_server.server.cameras import RoomCameras
+from deltalight.render_server.server.process import ServerSettings
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.supervisor import Supervisor
@@ -130,6 +134,22 @@ def station_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
     for each in opened:
         with closing(each):
             pass
+
+
+def test_a_spare_waits_for_a_frame_of_each_camera_longer_than_a_server_would() -> None:
+    one, other, published, control = map(ports.endpoint, ports.private_ports(4))
+    settings = ServerSettings(subscribe=(one, other), publish=published, control=control)
+    cameras = RoomCameras(None, pytest.fail, needs_depth=False, endpoints=2)
+    nodes = [Node(one, name="left")]
+    late = threading.Timer(1.0, lambda: nodes.append(Node(other, name="right")))
+    late.start()
+    try:
+        taken = Ahead(settings, None, lambda _timeout_s: False)._listen(cameras)
+    finally:
+        late.join()
+        for node in nodes:
+            node.close()
+    assert [each.camera for each in taken] == ["left", "right"]
 
 
 def test_a_killed_server_comes_back_with_what_its_spare_has_built(

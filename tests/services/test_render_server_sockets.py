@@ -41,10 +41,10 @@ PATIENCE_S = 60.0
 
 
 class Node:
-    """Publishes numbered frames until it is closed; `newest` is the last number sent."""
+    """Publishes numbered frames as `name` until it is closed; `newest` is the last number sent."""
 
-    def __init__(self, endpoint: str, first: int = 0) -> None:
-        self.newest = first
+    def __init__(self, endpoint: str, first: int = 0, name: str = "cam") -> None:
+        self.newest, self._name = first, name
         self._publisher = Publisher(endpoint)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(first,), daemon=True)
@@ -55,8 +55,8 @@ class Node:
             if self._closed.wait(1 / FRAMES_PER_S):
                 return
             self.newest = number
-            for message in (color(number, number), depth(number, number), pose(number, number)):
-                self._publisher.send(message)
+            for message in (color, depth, pose):
+                self._publisher.send(message(number, number, node=self._name))
 
     def close(self) -> None:
         self._closed.set()
