@@ -1,6 +1,7 @@
 """Memory that nothing uses any more goes back to the kernel: what a method's passes, or many viewers, have left."""
 
 import ctypes
+import gc
 import sys
 
 
@@ -13,3 +14,12 @@ def give_back_freed_memory() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform.startswith("linux") else None
     if trim is not None:
         trim(0)
+
+
+def give_back_garbage() -> None:
+    """Collects what only refers to itself, as graphs do, and has its memory given back too.
+
+    Until Python's next full collection, which may take hours, new arrays and textures would lie around it.
+    """
+    gc.collect()
+    give_back_freed_memory()

@@ -1,6 +1,5 @@
 """One scene across frames: geometry, lights and estimates that outlive a frame, and the frame graph."""
 
-import gc
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from deltalight.render_server.frame_graph import (
     ShownBuffers,
     frame_graphs,
 )
-from deltalight.render_server.freed_memory import give_back_freed_memory
+from deltalight.render_server.freed_memory import give_back_garbage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
@@ -225,9 +224,7 @@ class LiveScene:
         for room in graphs:
             room.clear()
         if self._gpu.is_software and is_any:
-            # Graphs refer to themselves. Until the next collection, their arrays would lie between those of new ones.
-            gc.collect()
-            give_back_freed_memory()
+            give_back_garbage()
 
     def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""

@@ -20,7 +20,7 @@ from deltalight.protocol.messages import ControlRequest, StatsMessage
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import AroofMethod
-from deltalight.render_server.freed_memory import give_back_freed_memory
+from deltalight.render_server.freed_memory import give_back_garbage
 from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.gpu.device_memory import device_memory, free_host_memory, gl_integers
 from deltalight.render_server.renderer import SceneRenderer
@@ -210,7 +210,7 @@ class Ahead:
         if self._built is not None:
             self._built.renderer.release()
             self._built = None
-            give_back_freed_memory()
+            give_back_garbage()
 
 
 def _require_memory(gpu: GpuContext) -> None:

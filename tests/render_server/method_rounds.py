@@ -14,7 +14,7 @@ from unittest import mock
 
 import psutil
 
-from deltalight.render_server import live_scene
+from deltalight.render_server import freed_memory
 from deltalight.render_server.gpu.context import GpuContext, count_gl_objects, create_context
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import METHODS
@@ -54,7 +54,7 @@ def main() -> None:
     options = parser.parse_args()
     with ExitStack() as stack:
         if options.keep:
-            stack.enter_context(mock.patch.object(live_scene, "give_back_freed_memory"))
+            stack.enter_context(mock.patch.object(freed_memory, "give_back_freed_memory"))
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         rounds(Path(folder), create_context(), options.rounds)
 

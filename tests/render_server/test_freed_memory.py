@@ -10,7 +10,7 @@ from weakref import ref
 import pytest
 
 from deltalight.protocol.scene import SceneDocument
-from deltalight.render_server import live_scene
+from deltalight.render_server import freed_memory
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import Stage, everyday, frame
@@ -51,7 +51,7 @@ def test_they_are_when_the_method_changes_and_only_then(
     gpu: GpuContext, document: SceneDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[None] = []
-    monkeypatch.setattr(live_scene, "give_back_freed_memory", lambda: given.append(None))
+    monkeypatch.setattr(freed_memory, "give_back_freed_memory", lambda: given.append(None))
     renderer = SceneRenderer(gpu, document)
     try:
         renderer.render(frame())
@@ -75,7 +75,7 @@ def test_nothing_of_the_graphs_is_left_when_another_camera_comes(
     try:
         renderer.render(frame())
         old = ref(renderer.graph)
-        monkeypatch.setattr(live_scene, "give_back_freed_memory", lambda: left.append(old()))
+        monkeypatch.setattr(freed_memory, "give_back_freed_memory", lambda: left.append(old()))
         gc.disable()  # it would depend on chance
         renderer.render_views([frame(), frame()])
         assert left == [None]
