@@ -8,6 +8,7 @@ from deltalight.benchmarks.soak.profiles import Profile
 from deltalight.protocol.documents import StrictModel
 
 REPORT: Final = "deltalight bench soak"
+LARGE = 1000.0  # without digits after the point
 
 
 class Figure(StrictModel):
@@ -82,7 +83,7 @@ def worst(
     if not values:
         return None
     low, high = min(values), max(values)
-    shown = f"{low:.3g}" if f"{low:.3g}" == f"{high:.3g}" else f"{low:.3g} to {high:.3g}"
+    shown = " to ".join(dict.fromkeys((_number(low), _number(high))))
     return Figure(
         what=what,
         how=f"{how} ({len(values)})",
@@ -119,13 +120,18 @@ def _row(figure: Figure) -> str:
     return f"| {figure.what} | {figure.how} | {figure.result} | {figure.bar} | {met} |"
 
 
+def _number(value: float) -> str:
+    """Return three significant digits, or all before the point."""
+    return f"{value:.0f}" if abs(value) >= LARGE else f"{value:.3g}"
+
+
 def _outcome(values: Mapping[str, Any]) -> str:
     shown = []
     for name, value in values.items():
         if isinstance(value, dict):
             shown.append(f"{name}: {_outcome(value)}")
         else:
-            shown.append(f"{name.replace('_', ' ')} {f'{value:.3g}' if isinstance(value, float) else value}")
+            shown.append(f"{name.replace('_', ' ')} {_number(value) if isinstance(value, float) else value}")
     return "; ".join(shown)
 
 

@@ -21,7 +21,7 @@ from deltalight.benchmarks.soak.link import SHAPES, Link, LoopThread, Schedule, 
 from deltalight.benchmarks.soak.nonsense import known_messages, mutated
 from deltalight.benchmarks.soak.plots import known_runs, nice_ceiling
 from deltalight.benchmarks.soak.profiles import PROFILES
-from deltalight.benchmarks.soak.report import FaultRecord, SoakReport
+from deltalight.benchmarks.soak.report import Bar, FaultRecord, SoakReport, worst
 from deltalight.benchmarks.soak.samples import ProcessSample, Sample, parse_drops
 from deltalight.protocol.envelope import decode, encode
 from deltalight.protocol.errors import DeltalightError
@@ -31,6 +31,20 @@ from deltalight.services.demo import RECORDING, SCENE
 
 KILLS = 20  # of each process
 SLOW_LINK = Shape(bits_per_s=8e6, delay_s=0.05, jitter_s=0.0, loss=0.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "shown"),
+    [
+        ([2071.4, 18034.2], "2071 to 18034 ms"),
+        ([0.02571, 18.83], "0.0257 to 18.8 ms"),
+        ([61.6, 61.61], "61.6 ms"),
+    ],
+)
+def test_a_range_is_shown_to_three_digits_but_never_by_powers_of_ten(values: list[float], shown: str) -> None:
+    figure = worst("age", "while nothing fails", values, Bar("shown", lambda _value: True), "ms")
+    assert figure is not None
+    assert figure.result == shown
 
 
 def test_a_link_delays_by_its_band_and_its_way() -> None:
