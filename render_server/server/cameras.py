@@ -230,9 +230,10 @@ class RoomCameras:
             return []
         newest_ns = max(place.newest.received_ns for place in places)
         live = [place for place in places if newest_ns - place.newest.received_ns <= place.patience_ns]
-        first = live[0]
+        newest = max(live, key=_captured_ns)
+        first = next(place for place in live if _is_of_the_time_of(place, newest))
         for place in places:
-            self._judge(place, first, is_silent=place not in live)
+            self._judge(place, first, newest, is_silent=place not in live)
         return [place for place in live if place.status == "live"]
 
     def _room(self, members: Sequence[_Place]) -> tuple[Taken, ...]:
@@ -259,8 +260,8 @@ class RoomCameras:
             and not _sees_another_board(place, members[0])
         }
 
-    def _judge(self, place: _Place, first: _Place, *, is_silent: bool) -> None:
-        status, remark = _status(place, first, is_silent=is_silent)
+    def _judge(self, place: _Place, first: _Place, newest: _Place, *, is_silent: bool) -> None:
+        status, remark = _status(place, first, newest, is_silent=is_silent)
         if status == "live":
             place.counted = place.newest
         if status == place.status:
@@ -272,19 +273,22 @@ class RoomCameras:
         place.status, place.remark = status, remark
 
 
-def _status(place: _Place, first: _Place, *, is_silent: bool) -> tuple[CameraStatus, str]:
-    """Returns whether a camera is rendered with the first one, and the sentence that says why not."""
+def _status(place: _Place, first: _Place, newest: _Place, *, is_silent: bool) -> tuple[CameraStatus, str]:
+    """Returns whether a camera is rendered with the first one, and the sentence that says why not.
+
+    `newest`: whose frame was taken last.
+    """
     if is_silent:
         return "silent", f"The camera {place.name} sends no frames; the others continue without it."
+    if not _is_of_the_time_of(place, newest):
+        return (
+            "other_time",
+            f"The camera {place.name} is left out: its frames are from a different time than those of {newest.name}.",
+        )
     if _sees_another_board(place, first):
         return (
             "other_board",
             f"The camera {place.name} is left out: give its node the board that {first.name} sees.",
-        )
-    if _apart_ns(place, first) > max(place.patience_ns, first.patience_ns):
-        return (
-            "other_time",
-            f"The camera {place.name} is left out: its frames are from a different time than those of {first.name}.",
         )
     return "live", ""
 
@@ -294,10 +298,23 @@ def _sees_another_board(place: _Place, first: _Place) -> bool:
     return board is not None and wanted is not None and board != wanted
 
 
-def _apart_ns(some: _Place, other: _Place) -> int:
-    """Returns how far apart two cameras' frames were taken at least; 0 where clocks were never compared."""
-    one, two = some.newest.color, other.newest.color
-    if one.clock_bound_ns is None or two.clock_bound_ns is None:
+def _captured_ns(place: _Place) -> int:
+    """Returns when a camera's newest frame was taken; 0 where clocks were never compared, or one must be wrong.
+
+    No frame arrives before it was taken.
+    """
+    header = place.newest.color
+    if header.clock_bound_ns is None:
         return 0
+    captured_ns = header.capture_ns + header.clock_offset_ns
+    is_possible = captured_ns - header.clock_bound_ns <= place.newest.received_ns
+    return captured_ns if is_possible else 0
+
+
+def _is_of_the_time_of(place: _Place, newest: _Place) -> bool:
+    """Whether a frame was taken about when the other one was; also where clocks were never compared."""
+    one, two = place.newest.color, newest.newest.color
+    if one.clock_bound_ns is None or two.clock_bound_ns is None:
+        return True
     apart_ns = abs(one.capture_ns + one.clock_offset_ns - two.capture_ns - two.clock_offset_ns)
-    return apart_ns - one.clock_bound_ns - two.clock_bound_ns
+    return apart_ns - one.clock_bound_ns - two.clock_bound_ns <= max(place.patience_ns, newest.patience_ns)

@@ -232,6 +232,25 @@ def test_a_camera_whose_frames_come_late_lights_the_room_by_what_it_saw_in_time(
     assert room.shown() == [("left", 200), ("right", 200)]
 
 
+def test_the_first_camera_is_left_out_too_if_its_frames_come_late(room: Room) -> None:
+    room.begin("left", "right", "above", behind_ms=0)
+    for name, behind_ms in (("left", 4000), ("right", 0), ("above", 30)):
+        room.send(name, 5, behind_ms=behind_ms)
+    assert room.shown() == [("right", 5), ("above", 5)]
+    assert room.statuses() == {"left": "other_time", "right": "live", "above": "live"}
+    assert room.renderer.rooms[-1] == [("right", 5, True), ("left", 1, False), ("above", 5, True)]
+    assert (
+        "left out: its frames are from a different time than those of right." in room.session.stats().detail
+    )
+
+
+def test_a_clock_that_goes_ahead_excludes_its_own_camera_alone(room: Room) -> None:
+    for name, behind_ms in (("left", 0), ("ahead", -3_600_000), ("right", 0)):
+        room.send(name, 1, behind_ms=behind_ms)
+    assert room.shown() == [("left", 1), ("right", 1)]
+    assert room.statuses() == {"left": "live", "ahead": "other_time", "right": "live"}
+
+
 def test_a_camera_that_takes_a_picture_every_three_seconds_is_not_silent(room: Room) -> None:
     for number in range(3):
         room.send("slow", number)
