@@ -173,6 +173,8 @@ class Ahead:
         rendered = attempts = 0
         while rendered < PICTURES and attempts < ATTEMPTS:
             if self._is_called(0.0):
+                if rendered:  # one of each camera is enough
+                    return
                 raise CalledError
             attempts += 1
             taken = self._listen(cameras)
@@ -193,7 +195,7 @@ class Ahead:
         with closing(FrameSource(self._settings.subscribe, self._keys)) as source:
             while len(taken) < len(self._settings.subscribe) and time.monotonic() < ends_s:
                 if self._is_called(0.0):
-                    break
+                    return ()
                 for multipart in (source.latest(RECEIVE_TIMEOUT_S) or {}).values():
                     with suppress(DeltalightError):  # the other server counts what is malformed
                         cameras.add(*decode(multipart), multipart)

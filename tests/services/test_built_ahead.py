@@ -5,8 +5,9 @@ import select
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import psutil
 import pytest
@@ -18,6 +19,7 @@ from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.server.ahead import Ahead
 from deltalight.render_server.server.cameras import RoomCameras
+from deltalight.render_server.server.pace import CalledError
 from deltalight.render_server.server.process import ServerSettings
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
@@ -150,6 +152,22 @@ def test_a_spare_waits_for_a_frame_of_each_camera_longer_than_a_server_would() -
         for node in nodes:
             node.close()
     assert [each.camera for each in taken] == ["left", "right"]
+
+
+@pytest.mark.parametrize("is_late", [True, False])
+def test_a_spare_that_is_called_after_a_picture_of_each_camera_keeps_its_renderer(is_late: bool) -> None:
+    node_port, published, control = map(ports.endpoint, ports.private_ports(3))
+    settings = ServerSettings(subscribe=(node_port,), publish=published, control=control)
+    renderer, pace = Mock(), Mock()
+    renderer.submit_cameras.return_value = []
+    ahead = Ahead(settings, None, lambda _timeout_s: renderer.submit_cameras.called or not is_late)
+    node = Node(node_port)
+    try:
+        with nullcontext() if is_late else pytest.raises(CalledError):
+            ahead._render(renderer, SceneDocument(), pace)
+    finally:
+        node.close()
+    assert renderer.submit_cameras.call_count == is_late
 
 
 def test_a_killed_server_comes_back_with_what_its_spare_has_built(
