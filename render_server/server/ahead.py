@@ -6,6 +6,7 @@ pictures of each camera, so that programs, passes and what is measured first are
 
 import time
 import uuid
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ from deltalight.render_server.server.session import needs_depth
 LOOK_INTERVAL_S = 2.0  # between looks at the document and at the other server's health
 CALM_NS = 3 * 10**9  # how long a document must be unchanged
 ANSWER_TIMEOUT_S = 2.0
+ANSWER_POLL_S = 0.05
 LISTEN_S = 3.0  # at most, to nodes, for a frame of each
 PICTURES = 2  # of each camera: light from out of sight comes with the second
 ATTEMPTS = 2 * PICTURES  # to get them
@@ -117,8 +119,8 @@ class Ahead:
     def _look(self) -> None:
         paths = self._settings.session, self._settings.scene
         document = _stamp([path for path in paths if path is not None])
-        if document != self._document:
-            self._document, self._is_done = document, False
+        if document != self._document:  # perhaps the same scene was sent again, as to each new server
+            self._document, self._is_done = document, self._is_done and self._shows_document()
         written_ns = max((each.written_ns for each in document), default=0)
         is_due = not self._is_done and time.time_ns() - written_ns >= CALM_NS
         if not is_due and self._built is None:
@@ -130,12 +132,23 @@ class Ahead:
             self._is_done = True
             self._build()
 
+    def _shows_document(self) -> bool:
+        """Returns whether what was built last is the document as it is now."""
+        built = self._built
+        return built is not None and self._is_current(built, self._settings, self._settings.initial_scene())
+
     def _state_of_server(self) -> str | None:
-        """Returns the state that the other server reports; None if it does not answer."""
+        """Returns the state that the other server reports; None if it does not answer before this one is called."""
         request = ControlRequest(node=self._settings.name, id=uuid.uuid4().hex, op="stats")
+        client = RequestClient(self._settings.control, keys=self._keys)
         try:
-            with closing(RequestClient(self._settings.control, keys=self._keys)) as client:
-                reply = client.request(request, ANSWER_TIMEOUT_S)
+            with closing(client), ThreadPoolExecutor(1) as asking:
+                answer = asking.submit(client.request, request, ANSWER_TIMEOUT_S)
+                while not answer.done():
+                    if self._is_called(ANSWER_POLL_S):
+                        client.abandon()  # it is dead
+                        break
+                reply = answer.result()
             return StatsMessage.model_validate(reply.payload["stats"]).state
         except (DeltalightError, KeyError, ValueError):
             return None

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, nullcontext
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import psutil
 import pytest
@@ -17,7 +17,7 @@ from deltalight.protocol.messages import CompositeMessage, ControlReply, Control
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
-from deltalight.render_server.server.ahead import Ahead
+from deltalight.render_server.server.ahead import ANSWER_TIMEOUT_S, Ahead, _assets, _Built, _stamp
 from deltalight.render_server.server.cameras import RoomCameras
 from deltalight.render_server.server.pace import CalledError
 from deltalight.render_server.server.process import ServerSettings
@@ -152,6 +152,38 @@ def test_a_spare_waits_for_a_frame_of_each_camera_longer_than_a_server_would() -
         for node in nodes:
             node.close()
     assert [each.camera for each in taken] == ["left", "right"]
+
+
+def test_a_spare_that_is_called_waits_for_no_answer_of_the_dead_server() -> None:
+    node, published, control = map(ports.endpoint, ports.private_ports(3))
+    settings = ServerSettings(subscribe=(node,), publish=published, control=control)
+    began_s = time.monotonic()
+    ahead = Ahead(settings, None, lambda _timeout_s: time.monotonic() - began_s > 0.1)
+    assert ahead._state_of_server() is None
+    assert time.monotonic() - began_s < ANSWER_TIMEOUT_S / 2
+
+
+def test_the_same_scene_sent_again_is_not_built_again(tmp_path: Path) -> None:
+    session = tmp_path / "session.json"
+    document = scene(tmp_path)
+    node, published, control = map(ports.endpoint, ports.private_ports(3))
+    settings = ServerSettings(session=session, subscribe=(node,), publish=published, control=control)
+    ahead, built = Ahead(settings, None, lambda _timeout_s: False), list[SceneDocument]()
+
+    def build() -> None:
+        built.append(settings.initial_scene())
+        ahead._built = _Built(Mock(), built[-1], _stamp(_assets(built[-1])))
+
+    for shown, count in ((document, 1), (document, 1), (document.replaced(revision=8), 2)):
+        session.write_text(shown.model_dump_json())
+        written_s = time.time() - 10 + count + len(built)
+        os.utime(session, (written_s, written_s))
+        with (
+            patch.object(ahead, "_build", build),
+            patch.object(ahead, "_state_of_server", return_value="running"),
+        ):
+            ahead._look()
+        assert len(built) == count
 
 
 @pytest.mark.parametrize("is_late", [True, False])
