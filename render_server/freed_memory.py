@@ -19,7 +19,7 @@ def give_back_freed_memory() -> None:
 def give_back_garbage() -> None:
     """Collects what only refers to itself, as graphs do, and has its memory given back too.
 
-    Until Python's next full collection, which may take hours, new arrays and textures would lie around it.
+    Python's next full collection may be hours away; until then, new arrays and textures would be placed around it.
     """
     gc.collect()
     give_back_freed_memory()

@@ -2,8 +2,8 @@
 
 A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: it is
 silent, sees another board than the first one, or its frames are of another time. What one that is silent or late saw
-last lights the room for half a minute: renderers build what they need for so many cameras, which takes seconds in
-software, and a network that stutters is no reason for it.
+last lights the room for half a minute: without it the renderer would build everything for fewer cameras, which takes
+seconds in software, and soon for all again.
 """
 
 from collections import Counter, deque
@@ -241,8 +241,8 @@ class RoomCameras:
 
         What a renderer has learnt by a camera's frames belongs to the place.
         """
-        newest = {place.name: Taken(place.name, place.newest, place.is_new) for place in members}
-        known = self._remembered(members) | newest
+        counting = {place.name: Taken(place.name, place.newest, place.is_new) for place in members}
+        known = self._remembered(members) | counting
         names = [name for name in self._places if name in known]
         first = names.index(members[0].name)
         names[0], names[first] = names[first], names[0]

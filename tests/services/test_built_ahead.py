@@ -186,20 +186,20 @@ def test_the_same_scene_sent_again_is_not_built_again(tmp_path: Path) -> None:
         assert len(built) == count
 
 
-@pytest.mark.parametrize("is_late", [True, False])
-def test_a_spare_that_is_called_after_a_picture_of_each_camera_keeps_its_renderer(is_late: bool) -> None:
+@pytest.mark.parametrize("has_picture", [True, False])
+def test_a_spare_that_is_called_after_a_picture_of_each_camera_keeps_its_renderer(has_picture: bool) -> None:
     node_port, published, control = map(ports.endpoint, ports.private_ports(3))
     settings = ServerSettings(subscribe=(node_port,), publish=published, control=control)
     renderer, pace = Mock(), Mock()
     renderer.submit_cameras.return_value = []
-    ahead = Ahead(settings, None, lambda _timeout_s: renderer.submit_cameras.called or not is_late)
+    ahead = Ahead(settings, None, lambda _timeout_s: renderer.submit_cameras.called or not has_picture)
     node = Node(node_port)
     try:
-        with nullcontext() if is_late else pytest.raises(CalledError):
+        with nullcontext() if has_picture else pytest.raises(CalledError):
             ahead._render(renderer, SceneDocument(), pace)
     finally:
         node.close()
-    assert renderer.submit_cameras.call_count == is_late
+    assert renderer.submit_cameras.call_count == has_picture
 
 
 def test_a_killed_server_comes_back_with_what_its_spare_has_built(
