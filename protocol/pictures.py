@@ -111,7 +111,7 @@ def depth_from_steps(
     steps: UInt16[np.ndarray, "h w"], scale: float, camera: CameraModel, noise_sigma_m: float | None
 ) -> DepthImage:
     """Return the depth image of stored steps of `scale` metres; 0 and 65535 are unknown."""
-    valid = ~np.isin(steps, INVALID_CODES)
+    valid = (steps != INVALID_CODES[0]) & (steps != INVALID_CODES[1])
     depth_m = np.where(valid, steps.astype(np.float32) * np.float32(scale), np.float32(0))
     return DepthImage(depth_m, valid, camera, noise_sigma_m)
 

@@ -318,12 +318,16 @@ class FrameGraph:
         return Fields(layers.direct.value, cones, layers.grid.value)
 
     def gather(self, lights: LightSet, area: Rectangle) -> ConeFields:
-        """Gathers the light that cones find under other lights, in a part of the picture; else as `evaluate`."""
+        """Gathers the light without objects that cones find under other lights, in a part of the picture.
+
+        Else as `evaluate`. Only E_mu is sure to be that of these lights.
+        """
         s, layers = self.resources, self.layers
         s.lights.write(lights, is_)
         s.lit_area.write(area, eq)
-        self._run(layers.cones)
-        return layers.cones.value
+        cones = layers.unchanged or layers.cones
+        self._run(cones)
+        return cones.value
 
     def advance(self, options: CompositeOptions, until_s: float) -> bool:
         """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""

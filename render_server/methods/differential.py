@@ -17,6 +17,7 @@ from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
@@ -45,7 +46,7 @@ from deltalight.render_server.methods.voxel_volumes import (
     placed_volume,
 )
 from deltalight.render_server.passes.caustics import Caustics
-from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceCones
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.passes.shading import DirectLightPair
@@ -225,8 +226,9 @@ class SolutionCones:
         self, gpu: GpuContext, settings: DifferentialMethod, voxels: SolutionVoxels, fields: ConeFields
     ) -> None:
         self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
-        self._tracing = TraceCones(gpu, fields.mu.size, march_defines(settings))
-        self._unused = ConeFields(gpu, fields.mu.size)
+        size, defines = fields.mu.size, march_defines(settings)
+        self._real, self._virtual = TraceRealCones(gpu, size, defines), TraceVirtualCones(gpu, size, defines)
+        self._unused = ConeFields(gpu, size)
 
     def marching(self, voxels: SolutionVoxels) -> dict[str, Binding]:
         """Bindings of what cones march through: one solution's voxels, the same twice."""
@@ -239,15 +241,14 @@ class SolutionCones:
         mu, rho, own = copy(fields), copy(fields), {**scene, **marching}
         mu.rho, mu.specular_rho = self._unused.rho, self._unused.specular_rho
         rho.mu, rho.specular_mu = self._unused.mu, self._unused.specular_mu
-        self._tracing.trace_real(mu, grid, voxels.mu, voxels.mu, own)
-        self._tracing.trace_real(rho, grid, voxels.rho, voxels.rho, own)
-        self._tracing.trace_virtual(fields, grid, voxels.rho, voxels.rho, own)
+        self._real.run(mu, grid, voxels.mu, voxels.mu, own)
+        self._real.run(rho, grid, voxels.rho, voxels.rho, own)
+        self._virtual.run(fields, grid, voxels.rho, voxels.rho, own)
         return fields
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self._tracing.release()
-        self._unused.release()
+        release_all(self._real, self._virtual, self._unused)
 
 
 def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) -> Layers:

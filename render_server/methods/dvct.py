@@ -45,7 +45,13 @@ from deltalight.render_server.methods.voxel_volumes import (
     placed_volume,
     sets_memory_mb,
 )
-from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
+from deltalight.render_server.passes.cones import (
+    ConeFields,
+    LowResGrid,
+    TraceConesPaper,
+    TraceRealCones,
+    TraceVirtualCones,
+)
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.split_injection import (
@@ -56,7 +62,7 @@ from deltalight.render_server.passes.split_injection import (
     SplitInjection,
 )
 from deltalight.render_server.passes.volumes import MOST_VOLUMES, VolumePlacement
-from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.passes.voxel_light import NO_SUPPORT, AlbedoTexture
 from deltalight.render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
@@ -176,9 +182,10 @@ class ExactCones:
     def __init__(
         self, gpu: GpuContext, settings: DvctMethod, voxels: DeltaVoxels, fields: ConeFields
     ) -> None:
-        size = fields.mu.size
+        size, defines, reuses = fields.mu.size, march_defines(settings), settings.tier.refresh_tiles > 0
         self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
-        self._tracing = TraceCones(gpu, size, march_defines(settings), reuses=settings.tier.refresh_tiles > 0)
+        self._real = TraceRealCones(gpu, size, defines, reuses=reuses)
+        self._virtual = TraceVirtualCones(gpu, size, defines, reuses=reuses)
 
     def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
         """Returns the bindings that cones march with."""
@@ -187,7 +194,7 @@ class ExactCones:
     def trace_real(self, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
         """Traces the cones at real surfaces: E_mu, E_rho, and the specular cones."""
         voxels = self._voxels
-        self._tracing.trace_real(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
+        self._real.run(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return self._fields
 
     def trace_objects(
@@ -195,12 +202,43 @@ class ExactCones:
     ) -> ConeFields:
         """Traces the cones at the objects: E_rho and the specular cone."""
         voxels = self._voxels
-        self._tracing.trace_virtual(fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
+        self._virtual.run(fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return fields
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self._tracing.release()
+        release_all(self._real, self._virtual)
+
+
+class UnchangedCones:
+    """Marches the cones at real surfaces through mu alone: E_mu without a light of the objects' own voxels.
+
+    Estimates of light read it, under trial lights, so nothing is made before the first of them.
+    """
+
+    def __init__(
+        self, gpu: GpuContext, settings: DvctMethod, voxels: DeltaVoxels, size: tuple[int, int]
+    ) -> None:
+        self._gpu, self._voxels, self._cone_count = gpu, voxels, settings.cone_count
+        self._size, self._defines = size, march_defines(settings)
+        self._made: tuple[TraceRealCones, ConeFields, moderngl.Buffer] | None = None
+
+    def trace(self, scene: Bindings, grid: LowResGrid, mu: VoxelMipmap) -> ConeFields:
+        """Traces E_mu and the specular cones; those of rho are the same."""
+        if self._made is None:
+            self._made = (
+                TraceRealCones(self._gpu, self._size, self._defines),
+                ConeFields(self._gpu, self._size),
+                self._gpu.ctx.buffer(NO_SUPPORT),
+            )
+        tracing, fields, support = self._made
+        marching = {**self._voxels.march_bindings(self._cone_count), "Support": support}
+        tracing.run(fields, grid, mu, mu, {**scene, **marching})
+        return fields
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(*(self._made or ()))
 
 
 def _may_divide(settings: DvctMethod) -> bool:
@@ -254,7 +292,9 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
 
     volume = g.value("volume", placed_volume, "voxelize real")
-    return shading_stages(g, s, shading, lit, volume, trace, voxels=rho, marching=marching)
+    layers = shading_stages(g, s, shading, lit, volume, trace, voxels=rho, marching=marching)
+    unchanged = UnchangedCones(g.gpu, settings, voxels, shading.cones.mu.size)
+    return replace(layers, unchanged=g.stage("cones mu", unchanged.trace, "shading scene", layers.grid, mu))
 
 
 class PaperCones:

@@ -114,7 +114,10 @@ class ShadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers that a method hands to composition; `voxels`, `volume`, `lights` and `error` are for debug views."""
+    """The layers that a method hands to composition; `voxels`, `volume`, `lights` and `error` are for debug views.
+
+    `unchanged`: what cones gather at real surfaces without the objects, where that takes less than `cones`.
+    """
 
     direct: Resource[DirectLight]
     cones: Resource[ConeFields]
@@ -126,6 +129,7 @@ class Layers:
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
     error: Resource[Callable[[], moderngl.Texture]] | None = None
+    unchanged: Resource[ConeFields] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,67 +108,27 @@ def reuse_define(reuses: bool) -> dict[str, int]:
     return {"REUSES": 1} if reuses else {}
 
 
-class BilateralConeFilter:
-    """Averages neighbouring texels, whose cones point in different directions: a joint bilateral tent over 3 x 3."""
+class TraceRealCones:
+    """Traces the cones of the exact operator at real surfaces, through mu and rho (docs/method.md 3 and 4.5).
 
-    def __init__(self, gpu: GpuContext, *, reuses: bool = False) -> None:
-        self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
-        self._virtual = Kernel(gpu, "bilateral_cone_filter", **reuse_define(reuses))
-
-    def filter_real(
-        self,
-        traced: tuple[moderngl.Texture, moderngl.Texture],
-        filtered: tuple[moderngl.Texture, moderngl.Texture],
-        grid: LowResGrid,
-        scene: Bindings,
-    ) -> None:
-        """Filters E_mu and E_rho of real surfaces; where both are equal they stay equal, bit for bit."""
-        self._real.run(
-            grid.size,
-            grid.bindings,
-            scene,
-            traced_mu=traced[0],
-            traced_rho=traced[1],
-            irradiance_mu=filtered[0],
-            irradiance_rho=filtered[1],
-        )
-
-    def filter_virtual(
-        self, traced: moderngl.Texture, filtered: moderngl.Texture, grid: LowResGrid, scene: Bindings
-    ) -> None:
-        """Filters E_rho of virtual surfaces."""
-        self._virtual.run(grid.size, grid.bindings, scene, traced_rho=traced, irradiance_rho=filtered)
-
-    def release(self) -> None:
-        """Frees the programs."""
-        self._real.release()
-        self._virtual.release()
-
-
-class TraceCones:
-    """Traces the cones of the exact operator: both marches at real surfaces, rho's at virtual ones.
-
-    See docs/method.md 3 and 4.5. `size` is that of the reduced grid, `defines` are those of march.glsl. With
-    `reuses`, only where the scene's `stale_texels` say so, or the last frame saw other surfaces.
+    `size` is that of the reduced grid, `defines` are those of march.glsl. With `reuses`, only where the scene's
+    `stale_texels` say so.
     """
 
     def __init__(
         self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
     ) -> None:
         self._gpu = gpu
-        self._mu, self._rho, self._irradiance = (texture_2d(gpu, size, 4, "f2") for _ in range(3))
-        self._target = gpu.ctx.framebuffer([self._irradiance])
-        self._filter = BilateralConeFilter(gpu, reuses=reuses)
-        self._real = Kernel(gpu, "trace_cones", REAL=1, **defines)
-        self._virtual = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
-        self._reuse = Kernel(gpu, "reuse_light") if reuses else None
+        self._mu, self._rho = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
+        self._trace = Kernel(gpu, "trace_cones", REAL=1, **defines)
+        self._filter = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
         self._texels = gpu.ctx.buffer(reserve=4)
 
-    def trace_real(
+    def run(
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """Traces E_mu, E_rho and the specular cones of real surfaces."""
+        """Traces E_mu, E_rho and the specular cones; filters E so that where both are equal they stay equal."""
         grid.empty_list(self._texels)
         traced: Bindings = {
             "irradiance_mu": self._mu,
@@ -179,27 +139,56 @@ class TraceCones:
             **grid.bindings,
         }
         self._select.run(grid.size, traced, scene)
-        self._real.run(
-            self._threads(grid),
+        self._trace.run(
+            (list_threads(self._gpu, grid.texel_count),),
             traced,
             scene,
             mipmap_mu=mu.texture,
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
-        self._filter.filter_real((self._mu, self._rho), (fields.mu, fields.rho), grid, scene)
+        self._filter.run(
+            grid.size,
+            grid.bindings,
+            scene,
+            traced_mu=self._mu,
+            traced_rho=self._rho,
+            irradiance_mu=fields.mu,
+            irradiance_rho=fields.rho,
+        )
 
-    def trace_virtual(
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._mu, self._rho, self._select, self._trace, self._filter, self._texels)
+
+
+class TraceVirtualCones:
+    """Traces the cones of the exact operator at virtual surfaces, through rho; `size` and `defines` as at real ones.
+
+    With `reuses`, only where the last frame saw other surfaces.
+    """
+
+    def __init__(
+        self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
+    ) -> None:
+        self._gpu = gpu
+        self._irradiance = texture_2d(gpu, size, 4, "f2")
+        self._target = gpu.ctx.framebuffer([self._irradiance])
+        self._reuse = Kernel(gpu, "reuse_light") if reuses else None
+        self._trace = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
+        self._filter = Kernel(gpu, "bilateral_cone_filter", **reuse_define(reuses))
+
+    def run(
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """Traces E_rho and the specular cone of virtual surfaces."""
+        """Traces E_rho, filters it, and traces the specular cone."""
         self._target.use()
         self._target.clear()
         listed: Bindings = {**grid.bindings, "Texels": grid.virtual_texels}
         if self._reuse is not None:
             self._reuse.run(grid.size, listed, scene, irradiance=self._irradiance)
-        self._virtual.run(
-            self._threads(grid),
+        self._trace.run(
+            (list_threads(self._gpu, grid.texel_count),),
             listed,
             scene,
             irradiance_rho=self._irradiance,
@@ -208,16 +197,14 @@ class TraceCones:
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
-        self._filter.filter_virtual(self._irradiance, fields.virtual, grid, scene)
-
-    def _threads(self, grid: LowResGrid) -> tuple[int]:
-        return (list_threads(self._gpu, grid.texel_count),)
+        self._filter.run(
+            grid.size, grid.bindings, scene, traced_rho=self._irradiance, irradiance_rho=fields.virtual
+        )
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self._target)
-        release_all(self._mu, self._rho, self._irradiance, self._filter, self._texels)
-        release_all(self._real, self._virtual, self._reuse, self._select)
+        release_all(self._irradiance, self._reuse, self._trace, self._filter)
 
 
 class TraceConesPaper:

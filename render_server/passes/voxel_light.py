@@ -29,6 +29,8 @@ from deltalight.render_server.passes.voxels import (
 from deltalight.render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
 
 SUPPORT_BYTES = 24 * MOST_VOLUMES
+_FAR_AWAY = 1 << 20  # voxels
+NO_SUPPORT: Final = np.full(6 * MOST_VOLUMES, _FAR_AWAY, np.int32).tobytes()  # mu and rho differ nowhere
 
 SURFEL_LIGHT_BYTES = 2 * 48  # front and back
 GROUP_SUMS_BYTES = 40
