@@ -309,23 +309,22 @@ class FrameGraph:
         return read_texture(self._radiance.value)[..., :3]
 
     def evaluate(self, lights: LightSet) -> Fields:
-        """Evaluates the frame's light under other lights, at every pixel and not only near the objects.
+        """Evaluates the light without objects under other lights, at every pixel and not only near the objects.
 
-        The sources keep these lights until they are set again.
+        Of what is returned, only mu is sure to be that of these lights, which the sources keep until they are set
+        again.
         """
         cones, layers = self.gather(lights, (0, 0, *self.resources.view.value.size)), self.layers
-        self._run(layers.direct, layers.grid)
-        return Fields(layers.direct.value, cones, layers.grid.value)
+        direct = layers.direct_mu or layers.direct
+        self._run(direct, layers.grid)
+        return Fields(direct.value, cones, layers.grid.value)
 
     def gather(self, lights: LightSet, area: Rectangle) -> ConeFields:
-        """Gathers the light without objects that cones find under other lights, in a part of the picture.
-
-        Else as `evaluate`. Only E_mu is sure to be that of these lights.
-        """
+        """Gathers the light that cones find under other lights, in a part of the picture; else as `evaluate`."""
         s, layers = self.resources, self.layers
         s.lights.write(lights, is_)
         s.lit_area.write(area, eq)
-        cones = layers.unchanged or layers.cones
+        cones = layers.cones_mu or layers.cones
         self._run(cones)
         return cones.value
 

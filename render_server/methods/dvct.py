@@ -294,7 +294,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     volume = g.value("volume", placed_volume, "voxelize real")
     layers = shading_stages(g, s, shading, lit, volume, trace, voxels=rho, marching=marching)
     unchanged = UnchangedCones(g.gpu, settings, voxels, shading.cones.mu.size)
-    return replace(layers, unchanged=g.stage("cones mu", unchanged.trace, "shading scene", layers.grid, mu))
+    return replace(layers, cones_mu=g.stage("cones mu", unchanged.trace, "shading scene", layers.grid, mu))
 
 
 class PaperCones:

@@ -116,7 +116,7 @@ class ShadingOptions:
 class Layers:
     """The layers that a method hands to composition; `voxels`, `volume`, `lights` and `error` are for debug views.
 
-    `unchanged`: what cones gather at real surfaces without the objects, where that takes less than `cones`.
+    `direct_mu` and `cones_mu` are the same at real surfaces without the objects, where that takes less.
     """
 
     direct: Resource[DirectLight]
@@ -129,7 +129,8 @@ class Layers:
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
     error: Resource[Callable[[], moderngl.Texture]] | None = None
-    unchanged: Resource[ConeFields] | None = None
+    direct_mu: Resource[DirectLight] | None = None
+    cones_mu: Resource[ConeFields] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +211,7 @@ class Shading:
         if options.screen_space:
             self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
         self._transmitted: TransmittedLight | None = None
+        self._unchanged: DirectLight | None = None
         self._rays: MirrorRays | None = None
         self._object_rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
@@ -289,6 +291,13 @@ class Shading:
         joint = None if voxels is None else voxels.texture
         self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
+
+    def light_unchanged(self, scene: Bindings, grid: LowResGrid) -> DirectLight:
+        """Computes the direct light on the real surfaces without the objects, which estimates of light read."""
+        if self._unchanged is None:
+            self._unchanged = DirectLight(self._gpu, self.size, objects_shadow=False)
+        self._unchanged.run(grid, scene)
+        return self._unchanged
 
     def reflect_objects(
         self, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
@@ -389,6 +398,7 @@ class Shading:
             self._history,
             self.cones,
             self._direct,
+            self._unchanged,
             self._surface,
             self._change,
             self._caustics,
@@ -421,7 +431,7 @@ def shading_stages(
     shown: Resource[Any] = voxels or g.value("voxels", no_voxels, volume)
     marching = marching or g.value("marching", no_bindings, volume)
     g.section("shading")
-    scene = g.value(
+    scene = plain = g.value(
         "shading scene",
         shading.scene,
         s.geometry,
@@ -457,6 +467,7 @@ def shading_stages(
             s.view,
             outputs=("reusing scene", "kept light"),
         )
+    own_light = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     light = light_directly or shading.light_directly
@@ -468,7 +479,9 @@ def shading_stages(
     screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
     reflected = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
     radiance = g.stage("transmitted light", shading.add_transmitted, reflected, *behind)
-    return Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
+    return Layers(
+        direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps, direct_mu=own_light
+    )
 
 
 def _new_object(*_: object) -> object:
