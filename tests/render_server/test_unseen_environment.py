@@ -10,9 +10,25 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
+from deltalight.render_server.frame_graph import Fields, FrameGraph
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Dispatch
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.passes.cones import ConeFields
+from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.scenes import COARSE, Stage, ambient, cube, directional, floor, frame, look_at, plain
+from tests.render_server.scenes import (
+    COARSE,
+    Stage,
+    ambient,
+    array_of,
+    cube,
+    directional,
+    floor,
+    frame,
+    look_at,
+    plain,
+)
 
 ALBEDO = 0.7
 KNOWN, OUT_OF_SIGHT, SUN = 0.05, 0.12, 0.9
@@ -157,3 +173,36 @@ def test_a_servers_first_picture_does_not_wait_for_the_search(gpu: GpuContext, t
     assert server.render(replace(view, frame_id=2, timestamp_ns=2 * 10**9)).lights == expected.lights
     waiting.release()
     server.release()
+
+
+def both_mu(cones: ConeFields, direct: DirectLight) -> tuple[np.ndarray, np.ndarray]:
+    return array_of(cones.mu), array_of(direct.light.mu)
+
+
+@pytest.mark.usefixtures("clean_gl")
+@pytest.mark.parametrize("quality", ["best", "live"])
+def test_the_search_lights_no_objects(
+    gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quality: str
+) -> None:
+    """It evaluates the light without objects alone, which is to the bit that of the whole method."""
+    evaluate, ran = FrameGraph.evaluate, list[Dispatch]()
+    found, expected = list[np.ndarray](), list[np.ndarray]()
+
+    def watched(graph: FrameGraph, lights: LightSet) -> Fields:
+        gpu.watchers.append(ran.append)
+        fields = evaluate(graph, lights)
+        gpu.watchers.pop()
+        found.extend(both_mu(fields.cones, fields.direct))
+        expected.extend(graph.kept(both_mu, graph.layers.cones, graph.layers.direct))
+        return fields
+
+    monkeypatch.setattr(FrameGraph, "evaluate", watched)
+    made = document(Stage(tmp_path, COARSE))
+    renderer = SceneRenderer(gpu, made.replaced(method=made.method.replaced(quality=quality)))
+    renderer.render(frame(picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT)), board=BOARD))
+    renderer.release()
+    names = {each.kernel for each in ran}
+    assert any(name.startswith("light_voxels REAL ") for name in names)
+    assert not any("VIRTUAL" in name or "REAL_DELTA" in name for name in names)
+    assert all(each.any() for each in found)
+    assert [np.array_equal(*pair) for pair in zip(found, expected, strict=True)] == [True, True]
