@@ -1,10 +1,17 @@
 """What a moving frame gives up so that it is finished in the time that the scene document grants."""
 
+import hashlib
+import json
+import os
 import statistics
 from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import get_args
 
+from deltalight.protocol.cached_files import cache_folder, read_cached, write_cached
+from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.quality import Quality
 
 WARM_UP = 2  # frames after a change of level: they compile, allocate and build
@@ -13,6 +20,7 @@ URGENT, URGENTLY = 2, 2.0  # frames in a row, each so many times as long as the 
 TOLERANCE = 1.1  # of the budget: what a level may take before a lower one is chosen
 ROOM = 0.8  # of the budget: what the level above must be expected to take before it is chosen
 PATIENCE = 30  # frames with that much room; twice as many after each try that failed
+MOST_HELD = 64  # levels that are kept for the next start
 
 
 @dataclass(frozen=True)
@@ -33,17 +41,58 @@ LEVELS = {
 }
 
 
+class HeldLevels:
+    """The levels that held budgets when this machine last rendered the same: a file of the user's cache.
+
+    A start that begins there need not be too slow first, and then build everything for smaller pictures. `of`: what
+    they depend on besides the scene document, such as the number of cameras.
+    """
+
+    def __init__(self, of: str) -> None:
+        self._of = f"{os.cpu_count()} cores; {of}"
+        self._file = cache_folder("levels") / "levels.json"
+
+    def find(self, rendered: str) -> Level | None:
+        """Returns the level that held before; None if it is not known."""
+        found = self._read().get(self._name(rendered))
+        return next((level for level in LEVELS if [level.quality, level.scale] == found), None)
+
+    def keep(self, rendered: str, level: Level) -> None:
+        """Keeps a level, and forgets the oldest of too many; does without where the disk refuses."""
+        held, name = self._read(), self._name(rendered)
+        held.pop(name, None)
+        held[name] = [level.quality, level.scale]
+        newest = dict(list(held.items())[-MOST_HELD:])
+        with suppress(DeltalightError):
+            write_cached(self._file, json.dumps(newest).encode())
+
+    def _name(self, rendered: str) -> str:
+        return hashlib.sha256(f"{self._of}; {rendered}".encode()).hexdigest()
+
+    def _read(self) -> dict[str, list[object]]:
+        content = read_cached(self._file)
+        return {} if content is None else json.loads(content)
+
+
 class FrameBudget:
     """Chooses the level of frames in which something moves, from how long earlier ones took.
 
-    `best` is the highest quality that it may choose; without a budget (ms), it chooses that and nothing else.
+    `best` is the highest quality that it may choose; without a budget (ms), it chooses that and nothing else. It
+    begins at the level `begins`, if it may choose that, and tells `note` each level that it changes to.
     """
 
-    def __init__(self, budget_ms: float | None, best: Quality) -> None:
+    def __init__(
+        self,
+        budget_ms: float | None,
+        best: Quality,
+        begins: Level | None = None,
+        note: Callable[[Level], None] = lambda _level: None,
+    ) -> None:
         allowed = get_args(Quality)[: get_args(Quality).index(best) + 1]
-        self._budget_ms = budget_ms
+        self._budget_ms, self._note = budget_ms, note
         self._levels = [level for level in LEVELS if level.quality in allowed]
-        self._at = 0
+        is_known = budget_ms is not None and begins in self._levels
+        self._at = self._levels.index(begins) if is_known and begins is not None else 0
         self._times_ms: deque[float] = deque(maxlen=WINDOW)
         self._ignored = WARM_UP
         self._frames_with_room = 0
@@ -94,5 +143,6 @@ class FrameBudget:
     def _change_to(self, at: int, *, is_trying: bool) -> None:
         if at != self._at:
             self._at, self._ignored, self._is_trying = at, WARM_UP, is_trying
+            self._note(self.level)
         self._times_ms.clear()
         self._frames_with_room = 0

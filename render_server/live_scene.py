@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from deltalight.protocol.scene_fields import View
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
 from deltalight.render_server.estimation.lighting import LightEstimator
-from deltalight.render_server.frame_budget import FrameBudget, Level
+from deltalight.render_server.frame_budget import FrameBudget, HeldLevels, Level
 from deltalight.render_server.frame_graph import (
     CompositeOptions,
     FrameGraph,
@@ -110,7 +111,7 @@ class _Plan:
 class LiveScene:
     """Holds everything that lives longer than a frame. `checks` is `Graph`'s.
 
-    `is_paced`: frames in which something moves heed the document's budget (FrameBudget).
+    `is_paced`: frames in which something moves heed the document's budget (FrameBudget), from the `held` level on.
     """
 
     def __init__(
@@ -122,9 +123,10 @@ class LiveScene:
         waits: bool = True,
         is_paced: bool = True,
         checks: bool = False,
+        held: HeldLevels | None = None,
     ) -> None:
         self._gpu = gpu
-        self._is_paced = is_paced
+        self._is_paced, self._held = is_paced, held
         self._checks = checks
         self._notices = notices
         self.timers = PassTimers(gpu)
@@ -183,8 +185,13 @@ class LiveScene:
         self._precomputed.stop_waiting()
 
     def _new_budget(self, scene: SceneDocument) -> FrameBudget:
-        budget_ms = scene.output.frame_budget_ms if self._is_paced else None
-        return FrameBudget(budget_ms, scene.method.quality)
+        output, method, held = scene.output, scene.method, self._held
+        budget_ms = output.frame_budget_ms if self._is_paced else None
+        if held is None or budget_ms is None:
+            return FrameBudget(budget_ms, method.quality)
+        size = f"{output.width} x {output.height} in {budget_ms} ms"
+        rendered = f"{self._gpu.renderer_name}; {method.model_dump_json()}; {size}"
+        return FrameBudget(budget_ms, method.quality, held.find(rendered), partial(held.keep, rendered))
 
     def account(self, relit: RelitFrame, frame_ms: float) -> None:
         """Takes how long a frame took; the next ones may be rendered at another level."""

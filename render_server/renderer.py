@@ -18,7 +18,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView, View
-from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.frame_budget import HeldLevels, Level
 from deltalight.render_server.gpu.context import GpuContext, GpuMemoryError
 from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
@@ -105,9 +105,10 @@ class SceneRenderer:
 
     `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
     should read (registration, memory, errors of OpenGL), each once. `waits`: the first picture waits for what a
-    method precomputes of objects (pictures after `set_scene` never do), and for the search for light out of sight.
-    `checks` is `Graph`'s. `with_linear` leaves the document's budget aside. Where the GPU's memory is full, frames
-    are refused; what the scene holds is made anew from time to time, and with the next scene.
+    method precomputes of objects (pictures after `set_scene` never do), and for the search for light out of
+    sight. `checks` is `Graph`'s. `with_linear` leaves the document's budget aside; others begin at the `held`
+    level. Where the GPU's memory is full, frames are refused; what the scene holds is made anew from time to
+    time, and with the next scene.
     """
 
     def __init__(
@@ -118,8 +119,10 @@ class SceneRenderer:
         with_linear: bool = False,
         waits: bool = True,
         checks: bool = False,
+        held: HeldLevels | None = None,
     ) -> None:
         self._gpu = gpu
+        self._held = held
         self.notices: list[str] = []
         self._with_linear = with_linear
         self._checks = checks
@@ -131,8 +134,15 @@ class SceneRenderer:
         self.scene = scene
 
     def _build(self, scene: SceneDocument, *, waits: bool) -> LiveScene:
-        paced = not self._with_linear
-        return LiveScene(self._gpu, scene, self.notices, waits=waits, is_paced=paced, checks=self._checks)
+        return LiveScene(
+            self._gpu,
+            scene,
+            self.notices,
+            waits=waits,
+            is_paced=not self._with_linear,
+            checks=self._checks,
+            held=self._held,
+        )
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Switches to another scene from the next frame on; keeps the old one on error.

@@ -164,7 +164,7 @@ class Ahead:
         files = _stamp(_assets(scene))
         pace = Pace(self._gpu, self._is_called)
         with pace.kept():
-            renderer = SceneRenderer(self._gpu, scene, waits=False)
+            renderer = SceneRenderer(self._gpu, scene, waits=False, held=self._settings.held_levels())
             self._built = _Built(renderer, scene, files)
             self._render(renderer, scene, pace)
         log.info("scene built ahead", revision=scene.revision, seconds=round(time.monotonic() - began_s, 1))

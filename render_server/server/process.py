@@ -32,6 +32,7 @@ from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument, load_scene
+from deltalight.render_server.frame_budget import HeldLevels
 from deltalight.render_server.gpu.context import (
     CompileWatcher,
     GpuContext,
@@ -93,6 +94,10 @@ class ServerSettings(StrictModel):
         if self.session is not None and self.session.is_file():
             return load_scene(self.session)
         return SceneDocument() if self.scene is None else load_scene(self.scene)
+
+    def held_levels(self) -> HeldLevels:
+        """Returns the levels that held budgets when as many cameras were rendered before."""
+        return HeldLevels(f"{len(self.subscribe)} cameras")
 
 
 class CommandQueue:
@@ -239,7 +244,8 @@ def run_server(settings: ServerSettings, keys: Keys | None = None, ahead: BuiltA
         if gpu.is_software:
             log.warning("no GPU found, rendering slowly in software", renderer=gpu.renderer_name)
         if renderer is None:
-            renderer = SceneRenderer(gpu, scene, waits=False)  # commands are answered meanwhile
+            # Commands are answered meanwhile.
+            renderer = SceneRenderer(gpu, scene, waits=False, held=settings.held_levels())
         else:
             log.info("goes on with the scene that was built ahead", revision=scene.revision)
         stack.callback(renderer.release)

@@ -1,6 +1,7 @@
 """A budget for frames in which something moves: what gives way, what comes back, and what smaller pictures show."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,15 @@ import pytest
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument, parse_scene
-from deltalight.render_server.frame_budget import PATIENCE, WARM_UP, WINDOW, FrameBudget, Level
+from deltalight.render_server.frame_budget import (
+    MOST_HELD,
+    PATIENCE,
+    WARM_UP,
+    WINDOW,
+    FrameBudget,
+    HeldLevels,
+    Level,
+)
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
@@ -94,6 +103,67 @@ def test_a_budget_that_cannot_be_held_is_said_once() -> None:
     assert budget.remark == said
 
 
+def test_a_budget_begins_where_it_was_held_and_tells_each_change() -> None:
+    changes: list[Level] = []
+    budget = FrameBudget(100, "live", HALF, changes.append)
+    assert budget.level == HALF
+    spend(budget, 20, 4 * PATIENCE)
+    assert changes == [Level("live", 0.75), LIVE]
+    assert FrameBudget(100, "live", Level("balanced")).level == LIVE  # above what the document allows now
+    assert FrameBudget(None, "live", HALF).level == LIVE
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.mark.usefixtures("cache")
+def test_levels_are_held_for_the_next_start() -> None:
+    HeldLevels("1 camera").keep("room", HALF)
+    assert HeldLevels("1 camera").find("room") == HALF
+    assert HeldLevels("2 cameras").find("room") is None
+    assert HeldLevels("1 camera").find("another room") is None
+    HeldLevels("1 camera").keep("room", LIVE)
+    assert HeldLevels("1 camera").find("room") == LIVE
+
+
+@pytest.mark.usefixtures("cache")
+def test_the_oldest_levels_are_forgotten() -> None:
+    held = HeldLevels("1 camera")
+    for number in range(MOST_HELD + 1):
+        held.keep(str(number), HALF)
+    assert [held.find(str(number)) for number in (0, 1, MOST_HELD)] == [None, HALF, HALF]
+
+
+def test_damaged_and_unwritable_levels_are_as_good_as_none(cache: Path) -> None:
+    held = HeldLevels("1 camera")
+    held.keep("room", HALF)
+    (file,) = cache.glob("levels/*.json")
+    file.write_bytes(b"[")
+    assert held.find("room") is None
+    held.keep("room", HALF)
+    assert held.find("room") == HALF
+    cache.rename(cache.with_name("away"))
+    cache.write_text("no folder")
+    held.keep("room", LIVE)
+    assert held.find("room") is None
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_start_begins_at_the_level_that_was_held(gpu: GpuContext, scene: SceneDocument) -> None:
+    paced = scene.replaced(output=scene.output.replaced(frame_budget_ms=50))
+    levels = []
+    for document in (paced, paced, scene):
+        walker = Walker(gpu, document, HeldLevels("1 camera"))
+        levels.append(walker.show().level)
+        if len(levels) == 1:
+            hurry(walker)
+        walker.renderer.release()
+    assert levels == [LIVE, HALF, LIVE]
+
+
 @pytest.mark.parametrize("budget_ms", [0, 4, 5001, "fast"])
 def test_impossible_budgets_are_refused(tmp_path: Path, budget_ms: object) -> None:
     document = scene_of(Case("exact", "depth", "plain"), Stage(tmp_path)).model_dump(mode="json")
@@ -111,8 +181,8 @@ def scene(tmp_path: Path) -> SceneDocument:
 class Walker:
     """Shows frames by a camera that moves to and fro, or stands."""
 
-    def __init__(self, gpu: GpuContext, scene: SceneDocument) -> None:
-        self.renderer = SceneRenderer(gpu, scene)
+    def __init__(self, gpu: GpuContext, scene: SceneDocument, held: HeldLevels | None = None) -> None:
+        self.renderer = SceneRenderer(gpu, scene, held=held)
         self.count = 0
 
     def show(self, aside: float | None = None) -> CompositeFrame:
@@ -121,16 +191,29 @@ class Walker:
         return self.renderer.render(seen(moving if aside is None else aside, self.count))
 
 
-@pytest.fixture
-def hurried(gpu: GpuContext, scene: SceneDocument, monkeypatch: pytest.MonkeyPatch) -> Iterator[Walker]:
-    """A renderer that was always too slow: at its smallest pictures."""
+@contextmanager
+def too_slow() -> Iterator[None]:
     add = FrameBudget.add
-    monkeypatch.setattr(FrameBudget, "add", lambda self, _ms: add(self, 1e4))
-    walker = Walker(gpu, scene.replaced(output=scene.output.replaced(frame_budget_ms=50)))
-    assert walker.show().level == LIVE
-    levels = [walker.show().level for _ in range(2 * (WARM_UP + WINDOW))]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FrameBudget, "add", lambda self, _ms: add(self, 1e4))
+        yield
+
+
+def hurry(walker: Walker) -> None:
+    """Shows frames that take too long, until pictures are at their smallest."""
+    with too_slow():
+        levels = [walker.show().level for _ in range(2 * (WARM_UP + WINDOW))]
     assert levels[-1] == HALF
-    yield walker
+
+
+@pytest.fixture
+def hurried(gpu: GpuContext, scene: SceneDocument) -> Iterator[Walker]:
+    """A renderer that was always too slow: at its smallest pictures."""
+    walker = Walker(gpu, scene.replaced(output=scene.output.replaced(frame_budget_ms=50)))
+    with too_slow():
+        assert walker.show().level == LIVE
+        hurry(walker)
+        yield walker
     walker.renderer.release()
 
 
