@@ -7,10 +7,11 @@ import statistics
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import get_args
 
-from deltalight.protocol.cached_files import cache_folder, read_cached, write_cached
+from deltalight.protocol.cached_files import cache_folder, mark_used, prune, read_cached, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.quality import Quality
 
@@ -20,7 +21,7 @@ URGENT, URGENTLY = 2, 2.0  # frames in a row, each so many times as long as the 
 TOLERANCE = 1.1  # of the budget: what a level may take before a lower one is chosen
 ROOM = 0.8  # of the budget: what the level above must be expected to take before it is chosen
 PATIENCE = 30  # frames with that much room; twice as many after each try that failed
-MOST_HELD = 64  # levels that are kept for the next start
+HELD_BYTES = 4096  # of levels that are kept for the next start: a hundred
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ LEVELS = {
 
 
 class HeldLevels:
-    """The levels that held budgets when this machine last rendered the same: a file of the user's cache.
+    """The levels that held budgets when this machine last rendered the same, in the user's cache.
 
     A start that begins there need not be too slow first, and then build everything for smaller pictures. `of`: what
     they depend on besides the scene document, such as the number of cameras.
@@ -50,28 +51,31 @@ class HeldLevels:
 
     def __init__(self, of: str) -> None:
         self._of = f"{os.cpu_count()} cores; {of}"
-        self._file = cache_folder("levels") / "levels.json"
+        try:
+            self._folder = cache_folder("levels")
+        except RuntimeError:  # a user without a home
+            self._folder = Path(os.devnull)  # finds and keeps nothing
 
     def find(self, rendered: str) -> Level | None:
         """Returns the level that held before; None if it is not known."""
-        found = self._read().get(self._name(rendered))
-        return next((level for level in LEVELS if [level.quality, level.scale] == found), None)
+        file = self._file(rendered)
+        content = read_cached(file)
+        mark_used(file)
+        try:
+            return None if content is None else Level(**json.loads(content))
+        except (TypeError, ValueError):  # another version's
+            return None
 
     def keep(self, rendered: str, level: Level) -> None:
-        """Keeps a level, and forgets the oldest of too many; does without where the disk refuses."""
-        held, name = self._read(), self._name(rendered)
-        held.pop(name, None)
-        held[name] = [level.quality, level.scale]
-        newest = dict(list(held.items())[-MOST_HELD:])
+        """Keeps a level, and forgets those that were not used for longest; does without where the disk refuses."""
+        file = self._file(rendered)
         with suppress(DeltalightError):
-            write_cached(self._file, json.dumps(newest).encode())
+            write_cached(file, json.dumps(asdict(level)).encode())
+            prune(self._folder, HELD_BYTES, keep=file)
 
-    def _name(self, rendered: str) -> str:
-        return hashlib.sha256(f"{self._of}; {rendered}".encode()).hexdigest()
-
-    def _read(self) -> dict[str, list[object]]:
-        content = read_cached(self._file)
-        return {} if content is None else json.loads(content)
+    def _file(self, rendered: str) -> Path:
+        name = hashlib.sha256(f"{self._of}; {rendered}".encode()).hexdigest()
+        return self._folder / f"{name}.json"
 
 
 class FrameBudget:
