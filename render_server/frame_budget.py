@@ -95,8 +95,7 @@ class FrameBudget:
         allowed = get_args(Quality)[: get_args(Quality).index(best) + 1]
         self._budget_ms, self._note = budget_ms, note
         self._levels = [level for level in LEVELS if level.quality in allowed]
-        is_known = budget_ms is not None and begins in self._levels
-        self._at = self._levels.index(begins) if is_known and begins is not None else 0
+        self._at = next((at for at, level in enumerate(self._levels) if level == begins), 0)
         self._times_ms: deque[float] = deque(maxlen=WINDOW)
         self._ignored = WARM_UP
         self._frames_with_room = 0

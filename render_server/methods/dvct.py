@@ -211,9 +211,9 @@ class ExactCones:
 
 
 class UnchangedCones:
-    """Marches the cones at real surfaces through mu alone: E_mu without a light of the objects' own voxels.
+    """Marches the cones at real surfaces through mu alone, so that no voxels of the objects need light.
 
-    Estimates of light read it, under trial lights, so nothing is made before the first of them.
+    Estimates of light read E_mu under trial lights; nothing is made before the first of them.
     """
 
     def __init__(

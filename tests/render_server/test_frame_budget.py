@@ -112,7 +112,6 @@ def test_a_budget_begins_where_it_was_held_and_tells_each_change() -> None:
     spend(budget, 20, 4 * PATIENCE)
     assert changes == [Level("live", 0.75), LIVE]
     assert FrameBudget(100, "live", Level("balanced")).level == LIVE  # above what the document allows now
-    assert FrameBudget(None, "live", HALF).level == LIVE
 
 
 @pytest.fixture
