@@ -450,10 +450,17 @@ class Graph:
         self._begun = dict(seen), {item: item.version for item in self._resources.values()}
 
     def reused_times_ms(self, ran: Container[str]) -> dict[str, float]:
-        """Times of the stages whose values a frame uses again, when they last ran; `ran` names the others."""
+        """Times of the stages whose values a frame uses again, when they last ran; `ran` names the others.
+
+        What no stage reads was made for estimates of light.
+        """
         last_ms = {} if self.timers is None else self.timers.last_ms
-        kept = (stage.name for stage in self._stages if stage.seen is not None and stage.name not in ran)
-        return {name: last_ms[name] for name in kept if name in last_ms}
+        read = {item for stage in self._stages for item in stage.inputs}
+        kept = (
+            stage for stage in self._stages if stage.seen is not None and not read.isdisjoint(stage.outputs)
+        )
+        names = [stage.name for stage in kept if stage.name not in ran]
+        return {name: last_ms[name] for name in names if name in last_ms}
 
     def invalidate(self) -> None:
         """Makes every stage run again with the next run that needs it."""

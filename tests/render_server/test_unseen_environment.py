@@ -199,8 +199,12 @@ def test_the_search_lights_no_objects(
     monkeypatch.setattr(FrameGraph, "evaluate", watched)
     made = document(Stage(tmp_path, COARSE))
     renderer = SceneRenderer(gpu, made.replaced(method=made.method.replaced(quality=quality)))
-    renderer.render(frame(picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT)), board=BOARD))
+    view = frame(picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT)), board=BOARD)
+    renderer.render(view)
+    reused = renderer.render(replace(view, frame_id=1, timestamp_ns=10**7)).reused_pass_times_ms
     renderer.release()
+    assert "cones real" in reused
+    assert not {"cones mu", "direct light mu"} & reused.keys()
     names = {each.kernel for each in ran}
     assert any(name.startswith("light_voxels REAL ") for name in names)
     assert not any("VIRTUAL" in name or "REAL_DELTA" in name for name in names)

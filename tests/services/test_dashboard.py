@@ -280,13 +280,13 @@ def test_a_lamp_follows_its_shadow(stack: Stack, page: Desk) -> None:
 def test_another_method_renders_the_next_picture(stack: Stack, page: Desk) -> None:
     page.named("tab", "Performance").click()
     passes = page.page.locator(".legend tbody th")
-    page.until(lambda: "cones real" in passes.all_inner_texts(), "the passes of cone tracing")
+    page.until(lambda: "light real voxels" in passes.all_inner_texts(), "the passes of cone tracing")
     page.photograph("performance")
     page.page.get_by_role("toolbar").get_by_label("Method").select_option("dlpv")
     page.until(lambda: stack.document()["method"]["name"] == "dlpv", "the method")
     page.shows_newest()
     page.until(lambda: "propagate rho" in passes.all_inner_texts(), "the passes of light propagation")
-    of_before = page.page.locator(".legend tbody tr", has_text="cones real").locator("td")
+    of_before = page.page.locator(".legend tbody tr", has_text="light real voxels").locator("td")
     assert of_before.all_inner_texts() in ([], ["–"]), "passes that do not run have no times"
 
 
