@@ -8,12 +8,15 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
 from deltalight.protocol.cached_files import cache_folder, mark_used, prune, read_cached, write_cached
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.methods import Method
 from deltalight.protocol.quality import Quality
+from deltalight.protocol.scene_output import Output
 
 WARM_UP = 2  # frames after a change of level: they compile, allocate and build
 WINDOW = 5  # frames: the median tells
@@ -55,6 +58,16 @@ class HeldLevels:
             self._folder = cache_folder("levels")
         except RuntimeError:  # a user without a home
             self._folder = Path(os.devnull)  # finds and keeps nothing
+
+    def budget(self, method: Method, output: Output, renderer_name: str) -> "FrameBudget":
+        """Returns the budget of a scene document, which begins at the level that held it before."""
+        if output.frame_budget_ms is None:
+            return FrameBudget(None, method.quality)
+        asked = f"{output.width} x {output.height} in {output.frame_budget_ms} ms"
+        rendered = f"{renderer_name}; {method.model_dump_json()}; {asked}"
+        return FrameBudget(
+            output.frame_budget_ms, method.quality, self.find(rendered), partial(self.keep, rendered)
+        )
 
     def find(self, rendered: str) -> Level | None:
         """Returns the level that held before; None if it is not known."""

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -127,8 +126,7 @@ class LiveScene:
     ) -> None:
         self._gpu = gpu
         self._is_paced, self._held = is_paced, held
-        self._checks = checks
-        self._notices = notices
+        self._checks, self._notices = checks, notices
         self.timers = PassTimers(gpu)
         self._objects = VirtualObjects(gpu)
         self._real: RealGeometry | None = None
@@ -185,13 +183,9 @@ class LiveScene:
         self._precomputed.stop_waiting()
 
     def _new_budget(self, scene: SceneDocument) -> FrameBudget:
-        output, method, held = scene.output, scene.method, self._held
-        budget_ms = output.frame_budget_ms if self._is_paced else None
-        if held is None or budget_ms is None:
-            return FrameBudget(budget_ms, method.quality)
-        size = f"{output.width} x {output.height} in {budget_ms} ms"
-        rendered = f"{self._gpu.renderer_name}; {method.model_dump_json()}; {size}"
-        return FrameBudget(budget_ms, method.quality, held.find(rendered), partial(held.keep, rendered))
+        if self._held is not None and self._is_paced:
+            return self._held.budget(scene.method, scene.output, self._gpu.renderer_name)
+        return FrameBudget(scene.output.frame_budget_ms if self._is_paced else None, scene.method.quality)
 
     def account(self, relit: RelitFrame, frame_ms: float) -> None:
         """Takes how long a frame took; the next ones may be rendered at another level."""

@@ -122,27 +122,17 @@ class SceneRenderer:
         held: HeldLevels | None = None,
     ) -> None:
         self._gpu = gpu
-        self._held = held
         self.notices: list[str] = []
         self._with_linear = with_linear
-        self._checks = checks
+        self._build = partial(
+            LiveScene, gpu, notices=self.notices, is_paced=not with_linear, checks=checks, held=held
+        )
         self._live = self._build(scene, waits=waits)
         self._full: tuple[GpuMemoryError, float] | None = None  # and when to try again
         self._readback = AsyncReadback(gpu)
         self._cameras: dict[str, CameraState] = {}
         self._newest: tuple[CameraState, ...] = ()  # the cameras of the newest pictures, in their order
         self.scene = scene
-
-    def _build(self, scene: SceneDocument, *, waits: bool) -> LiveScene:
-        return LiveScene(
-            self._gpu,
-            scene,
-            self.notices,
-            waits=waits,
-            is_paced=not self._with_linear,
-            checks=self._checks,
-            held=self._held,
-        )
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Switches to another scene from the next frame on; keeps the old one on error.
