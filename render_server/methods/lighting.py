@@ -1,5 +1,6 @@
 """Stages that methods share: volumes around the objects, and shading of the visible surfaces (docs/method.md 3)."""
 
+import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeam
 from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.measured_views import SURFEL_PICTURE_LOD
+from deltalight.render_server.passes.measured_views import SURFEL_PIXELS
 from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.reflections import (
     RAY_ROUGHNESS,
@@ -77,7 +78,7 @@ def surfel_scene(
         "bias_real": seen.scan.bias_m,
         "bias_virtual": seen.scan.bias_m,
         "depth_tolerance": DEPTH_TOLERANCE if measured else -1.0,
-        "picture_lod": SURFEL_PICTURE_LOD,
+        "picture_lod": math.log2(SURFEL_PIXELS),
     }
 
 

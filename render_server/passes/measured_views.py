@@ -10,27 +10,26 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.view import CameraView
 
-SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
+SURFEL_PIXELS = 4  # along an axis, of the picture: one sample covers a surfel's
 VIEW_TEXELS = 6  # of a MeasuredView in shaders/common/measured_views.glsl
 
 
 class MeasuredViews:
     """Linear pictures (RGBA16F, camera units) and depth (R32F, m) of all cameras, a layer each.
 
-    Pictures have the mip levels that surfels read. Those smaller than the largest fill the upper left corner of their
-    layer.
+    Pictures are reduced to what surfels read: means of SURFEL_PIXELS x SURFEL_PIXELS pixels. Those smaller than the
+    largest fill the upper left corner of their layer.
     """
 
     def __init__(self, gpu: GpuContext, sizes: Sequence[tuple[int, int]]) -> None:
         width, height = (max(size[axis] for size in sizes) for axis in (0, 1))
-        shape = width, height, len(sizes)
-        self._radiance = gpu.ctx.texture_array(shape, 4, dtype="f2")
-        self._radiance.build_mipmaps(max_level=int(SURFEL_PICTURE_LOD))
-        self._radiance.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        self._depth = gpu.ctx.texture_array(shape, 1, dtype="f4")
+        self._radiance = gpu.ctx.texture_array((*_reduced((width, height)), len(sizes)), 4, dtype="f2")
+        self._radiance.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self._depth = gpu.ctx.texture_array((width, height, len(sizes)), 1, dtype="f4")
         self._depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._cameras = texture_2d(gpu, (VIEW_TEXELS, len(sizes)), 4, "f4")
-        self._copy = Kernel(gpu, "measured_view")
+        self._copy_depth = Kernel(gpu, "measured_view")
+        self._copy_picture = Kernel(gpu, "measured_view", PICTURE=1)
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -46,13 +45,23 @@ class MeasuredViews:
         """Copies the pictures and depths that the `scenes` bind, one for each view."""
         self._cameras.write(b"".join(packed_view(view) for view in views), alignment=1)
         for layer, (view, scene) in enumerate(zip(views, scenes, strict=True)):
-            self._copy.run(view.size, scene, radiance_out=self._radiance, depth_out=self._depth, layer=layer)
-        self._radiance.build_mipmaps(max_level=int(SURFEL_PICTURE_LOD))
-        self._radiance.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+            self._copy_depth.run(view.size, scene, depth_out=self._depth, layer=layer)
+            self._copy_picture.run(
+                _reduced(view.size),
+                scene,
+                radiance_out=self._radiance,
+                block=SURFEL_PIXELS,
+                layer=layer,
+            )
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._radiance, self._depth, self._cameras, self._copy)
+        release_all(self._radiance, self._depth, self._cameras, self._copy_depth, self._copy_picture)
+
+
+def _reduced(size: tuple[int, int]) -> tuple[int, int]:
+    """Returns the size of a picture as surfels read it."""
+    return -(-size[0] // SURFEL_PIXELS), -(-size[1] // SURFEL_PIXELS)
 
 
 def packed_view(view: CameraView, more: Sequence[float] = (0.0, 0.0)) -> bytes:

@@ -15,7 +15,8 @@ layout(rgba16f) writeonly uniform image2D direct_rho;   // rgb E_rho
 layout(rgba16f) writeonly uniform image2D lobe_mu;      // rgb radiance of light lobes
 layout(rgba16f) writeonly uniform image2D lobe_rho;
 #pragma switch bool specular_surfaces
-uniform bool keeps_unblocked;   // direct_mu holds what the last frame found; a = 0: nothing
+// Whether direct_mu holds what the last frame found; a = 0: nothing.
+#pragma switch bool keeps_unblocked
 
 #ifdef SHADOW_CONES
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }

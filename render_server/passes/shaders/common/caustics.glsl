@@ -4,7 +4,8 @@
 #include "common/upsample.glsl"
 #include "common/lit_pixels.glsl"
 
-uniform bool has_caustics;       // the sums are bound
+// Whether the sums are bound: llvmpipe executes what they need for every pixel, so that a scene without does without.
+#pragma switch bool has_caustics
 
 // `p`, `n`, `depth`: the pixel's surface in that layer.
 vec3 caustic_irradiance(ivec2 pixel, ivec2 size, int layer, vec3 p, vec3 n, float depth) {

@@ -7,7 +7,7 @@ struct MeasuredView {
 };
 
 uniform sampler2D view_cameras;         // a row each: matrix by columns, pinhole, extent
-uniform sampler2DArray view_radiance;   // camera units, with mip levels
+uniform sampler2DArray view_radiance;   // camera units, reduced: as mip level `picture_lod`
 uniform sampler2DArray view_depth;      // m along the optical axis, 0 unknown
 
 int seeing_view = -1;   // the one that showed the point largest when `camera_sees` was asked
@@ -51,7 +51,7 @@ bool camera_sees(vec3 p) { return camera_sees(p, vec3(0.0)); }
 // After `camera_sees` found a view. Samples keep clear of what lies beside the picture in its layer.
 vec3 measured_radiance(vec3 p) {
     MeasuredView view = measured_view(seeing_view);
-    vec2 border = vec2(0.5 * exp2(picture_lod));
-    vec2 pixel = clamp(view_pixel(view, (view.view_from_world * vec4(p, 1.0)).xyz), border, view.extent - border);
-    return textureLod(view_radiance, vec3(pixel / vec2(textureSize(view_radiance, 0).xy), float(seeing_view)), picture_lod).rgb;
+    vec2 place = view_pixel(view, (view.view_from_world * vec4(p, 1.0)).xyz) * exp2(-picture_lod);
+    vec2 texel = clamp(place, vec2(0.5), view.extent * exp2(-picture_lod) - 0.5);
+    return textureLod(view_radiance, vec3(texel / vec2(textureSize(view_radiance, 0).xy), float(seeing_view)), 0.0).rgb;
 }
