@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
+from deltalight.services.process import ForkedProcess, Process, fork
 from deltalight.services.warm_spare import PREPARED, rehearse_spare, spare_environment, use_spare
 
 NODE, SERVER, WEB = "sensor node", "render server", "web process"  # names of a host's processes
@@ -66,8 +67,8 @@ class Child:
 
     spec: ChildSpec
     forward: Callable[[str], None]
-    process: subprocess.Popen[str] | None = None
-    spare: subprocess.Popen[str] | None = None
+    process: Process | None = None
+    spare: Process | None = None
     watch: Watch | None = None
     started: int = 0
     started_s: float = 0.0
@@ -75,7 +76,7 @@ class Child:
     last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT_LINES))
     reader: threading.Thread | None = None
 
-    def start(self, spare: subprocess.Popen[str] | None = None) -> None:
+    def start(self, spare: Process | None = None) -> None:
         """Start it, by a process that waits for these arguments if there is one."""
         self.last_lines.clear()
         self.process = spare or self._take_spare() or open_process(self.spec.arguments, subprocess.DEVNULL)
@@ -94,12 +95,12 @@ class Child:
             if self.spec.rehearsed:
                 rehearse_spare(self.spare, self.spec.words)
 
-    def _take_spare(self) -> subprocess.Popen[str] | None:
+    def _take_spare(self) -> Process | None:
         """Return the spare, which starts now, None if there is none."""
         spare, self.spare = self.spare, None
         return spare if spare is not None and use_spare(spare) else None
 
-    def _read(self, process: subprocess.Popen[str]) -> None:
+    def _read(self, process: Process) -> None:
         assert process.stderr is not None
         with process.stderr as lines:
             for line in lines:
@@ -153,24 +154,40 @@ def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subproces
     return open_process(arguments, subprocess.PIPE, spare_environment(prepared))
 
 
-@contextmanager
-def early_spares(commands: Mapping[str, str]) -> Iterator[dict[str, subprocess.Popen[str]]]:
-    """Start a spare of each command, by the name of its process, for a `Supervisor`; end those that nobody took."""
-    spares: dict[str, subprocess.Popen[str]] = {}
-    try:
-        for name, command in commands.items():
+def fork_spares(commands: Mapping[str, str]) -> dict[str, Process]:
+    """Fork a spare of each command, by the name of its process, for a `Supervisor` (`early_spares`).
+
+    They share what this process has imported. Only Linux forks safely; elsewhere they are started.
+
+    Raises:
+        InForkedChild: in each of them.
+    """
+    spares: dict[str, Process] = {}
+    forked: list[ForkedProcess] = []
+    for name, command in commands.items():
+        if sys.platform.startswith("linux"):
+            forked.append(fork((command,), spare_environment(PREPARED[command]), forked))
+            spares[name] = forked[-1]
+        else:
             spares[name] = open_spare(ChildSpec.deltalight(name, command).arguments, PREPARED[command])
+    return spares
+
+
+@contextmanager
+def early_spares(spares: Mapping[str, Process]) -> Iterator[Mapping[str, Process]]:
+    """End those of the spares at the end that nobody took."""
+    try:
         yield spares
     finally:
         end_all([spare for spare in spares.values() if spare.stdin is not None and not spare.stdin.closed])
 
 
-def take_spare(spare: subprocess.Popen[str] | None, spec: ChildSpec) -> subprocess.Popen[str] | None:
+def take_spare(spare: Process | None, spec: ChildSpec) -> Process | None:
     """Tell a spare to go on as a deltalight command; None where there is no spare, or it died."""
     return spare if spare is not None and use_spare(spare, spec.words) else None
 
 
-def end_all(processes: Sequence[subprocess.Popen[str]]) -> None:
+def end_all(processes: Sequence[Process]) -> None:
     """End processes: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
     try:
         for process in processes:
@@ -184,7 +201,7 @@ def end_all(processes: Sequence[subprocess.Popen[str]]) -> None:
             process.wait()
 
 
-def _wait(process: subprocess.Popen[str], timeout_s: float) -> None:
+def _wait(process: Process, timeout_s: float) -> None:
     try:
         process.wait(max(timeout_s, 0.0))
     except subprocess.TimeoutExpired:

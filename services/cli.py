@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -44,11 +45,14 @@ from deltalight.services.commands.virtual_camera import virtual_camera
 from deltalight.services.logs import configure_logging
 from deltalight.services.open_files import allow_many_connections
 from deltalight.services.parent_death_signal import end_with_supervisor
+from deltalight.services.process import InForkedChild
 from deltalight.services.signals import Terminated, raise_signals
 from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
-LIVE_COMMANDS = frozenset({"node", "server", "api"})  # which do the same for each frame
+LIVE_COMMANDS = frozenset(
+    {"node", "server", "api", "demo"}
+)  # which do the same for each frame, and what forks them
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
 
@@ -129,12 +133,20 @@ def _global_options(
 
 def main() -> None:
     """Run the command line of this process and exit with its code."""
+    code = None
+    while code is None:
+        with suppress(InForkedChild):  # this process is the child, with a command line of its own
+            code = _run_as_process()
+    sys.exit(code)
+
+
+def _run_as_process() -> int:
     raise_signals()
     end_with_supervisor()
     allow_many_connections()
     limit_blas_threads(sys.argv[1:])
     wait_if_spare(run)
-    sys.exit(run(sys.argv[1:]))
+    return run(sys.argv[1:])
 
 
 def limit_blas_threads(words: Sequence[str]) -> None:

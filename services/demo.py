@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import subprocess
 import sys
 import webbrowser
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from deltalight.services import ports
 from deltalight.services.files import make_output_folder
 from deltalight.services.host import HostPlan
 from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.process import Process
 from deltalight.services.storage.store import Store
 from deltalight.services.supervisor import Supervisor
 
@@ -42,9 +42,7 @@ def demo_scene(method: str) -> SceneDocument:
     return with_method(scene, method)
 
 
-def run_live(
-    method: str, *, port: int, with_browser: bool, spares: Mapping[str, subprocess.Popen[str]]
-) -> None:
+def run_live(method: str, *, port: int, with_browser: bool, spares: Mapping[str, Process]) -> None:
     """Run the demo with its dashboard until Ctrl-C; changes are not kept. `spares` become its processes, by name.
 
     Raises:

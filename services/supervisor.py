@@ -1,6 +1,5 @@
 """Keeps the processes of one host alive: restarts what dies or hangs, gives up after too many, ends all together."""
 
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -9,6 +8,7 @@ from typing import Self
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.child import Child, ChildSpec, end_all, take_spare
+from deltalight.services.process import Process
 
 POLL_INTERVAL_S = 0.1
 RESTART_DELAY_S = 0.2
@@ -21,7 +21,7 @@ WRONG_INPUT_EXIT_CODE = 2
 class Supervisor:
     """Starts children, restarts those that die and ends all of them; a context manager.
 
-    `spares` (`child.early_spares`) become the first processes of the children of these names.
+    `spares` (`child.fork_spares`) become the first processes of the children of these names.
 
     Raises from `poll`:
         DeltalightError: a child refused its input (exit code 2; its own sentence is quoted), or died more
@@ -34,7 +34,7 @@ class Supervisor:
         *,
         forward: Callable[[str], None] | None = None,
         maximum_restarts: int = MAXIMUM_RESTARTS,
-        spares: Mapping[str, subprocess.Popen[str]] | None = None,
+        spares: Mapping[str, Process] | None = None,
     ) -> None:
         write = forward or (lambda line: print(line, file=sys.stderr, flush=True))
         self._children = [Child(spec, write) for spec in specs]

@@ -4,12 +4,12 @@ import json
 import os
 import pkgutil
 import select
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
+from deltalight.services.process import Process
 from deltalight.services.uncollected import uncollected
 
 SPARE_VARIABLE = "DELTALIGHT_SPARE_PREPARES"
@@ -82,7 +82,7 @@ def spare_environment(prepared: tuple[str, ...]) -> dict[str, str]:
     return {SPARE_VARIABLE: ",".join(prepared)}
 
 
-def rehearse_spare(spare: "subprocess.Popen[str]", arguments: Sequence[str]) -> None:
+def rehearse_spare(spare: Process, arguments: Sequence[str]) -> None:
     """Tell a spare to get ready for a command with these arguments, once it has prepared what it was started for."""
     assert spare.stdin is not None
     with suppress(OSError):  # it died meanwhile
@@ -90,7 +90,7 @@ def rehearse_spare(spare: "subprocess.Popen[str]", arguments: Sequence[str]) -> 
         spare.stdin.flush()
 
 
-def use_spare(spare: "subprocess.Popen[str]", arguments: Sequence[str] = ()) -> bool:
+def use_spare(spare: Process, arguments: Sequence[str] = ()) -> bool:
     """Tell a spare to go on, with other `arguments` than its own if there are any; return whether it does."""
     assert spare.stdin is not None
     if spare.poll() is not None:

@@ -7,9 +7,10 @@ import typer
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.method_names import require_method
-from deltalight.services.child import NODE, SERVER, WEB, early_spares
+from deltalight.services.child import NODE, SERVER, WEB, early_spares, fork_spares
 from deltalight.services.commands.options import MethodName
 from deltalight.services.ports import PAGE_PORT, require_free
+from deltalight.services.uncollected import uncollected
 
 EARLY = {SERVER: "server", NODE: "replay", WEB: "api"}
 
@@ -37,9 +38,10 @@ def demo(
         _write(method, frames, out, as_json=as_json)
         return
     require_free(port, "dashboard", "--port")
-    with early_spares(EARLY) as spares:  # they import what they need while this process does
+    with uncollected():
         from deltalight.services.demo import run_live
 
+    with early_spares(fork_spares(EARLY)) as spares:  # each imports what else it needs while the others do
         run_live(method, port=port, with_browser=not no_browser, spares=spares)
 
 

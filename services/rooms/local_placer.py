@@ -1,6 +1,5 @@
 """Places rooms on this host: each render server is a child process, and one warm spare waits for any of them."""
 
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -9,6 +8,7 @@ from contextlib import suppress
 from deltalight.protocol.keys import Keys
 from deltalight.services import ports
 from deltalight.services.child import SPARE_AFTER_S, ChildSpec, end_all, open_spare, take_spare
+from deltalight.services.process import Process
 from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
 from deltalight.services.rooms.render_process import RenderProcess
 from deltalight.services.warm_spare import rehearse_spare
@@ -37,7 +37,7 @@ class LocalPlacer:
         self._command = command
         self._spare_spec = spare
         self._keys = keys
-        self._spare: subprocess.Popen[str] | None = None
+        self._spare: Process | None = None
         self._spare_due_s = 0.0
         self._forward = forward
         self._placed: dict[str, RenderProcess] = {}  # by slot
@@ -110,7 +110,7 @@ class LocalPlacer:
             del self._placed[slot]
         return found
 
-    def _take_spare(self, spec: ChildSpec) -> subprocess.Popen[str] | None:
+    def _take_spare(self, spec: ChildSpec) -> Process | None:
         spare, self._spare = self._spare, None
         return take_spare(spare, spec)
 

@@ -4,7 +4,6 @@ import ctypes
 import math
 import os
 import shutil
-import subprocess
 import tempfile
 import threading
 import time
@@ -18,6 +17,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec, end_all, open_spare, take_spare
 from deltalight.services.host import HostCommands
+from deltalight.services.process import Process
 from deltalight.services.rooms.capacity import (
     FalseClaimError,
     RoomFigures,
@@ -158,9 +158,7 @@ class RenderActor:
         os._exit(1)
 
 
-def _started(
-    task: RenderTask, forward: Callable[[str], None], spare: "subprocess.Popen[str] | None"
-) -> RenderProcess:
+def _started(task: RenderTask, forward: Callable[[str], None], spare: Process | None) -> RenderProcess:
     placement = task.placement
     endpoints = placement.publish, placement.control
     for endpoint in endpoints:

@@ -1,6 +1,5 @@
 """The render server of a placement, as a child of this process: its reports, its end, and what it said last."""
 
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,6 +7,7 @@ from dataclasses import replace
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import StatsMessage
 from deltalight.services.child import STOP_TIMEOUT_S, Child, ChildSpec
+from deltalight.services.process import Process
 from deltalight.services.rooms.placer import Placement, PlacementEvent
 from deltalight.services.supervisor import WRONG_INPUT_EXIT_CODE
 from deltalight.services.watchdog import Watchdog
@@ -22,7 +22,7 @@ class RenderProcess:
         spec: ChildSpec,
         keys: Keys | None,
         forward: Callable[[str], None],
-        spare: subprocess.Popen[str] | None = None,
+        spare: Process | None = None,
     ) -> None:
         self.placement = placement
         self.is_gone = False
@@ -39,7 +39,7 @@ class RenderProcess:
         return self._child.spec.words
 
     @property
-    def process(self) -> subprocess.Popen[str]:
+    def process(self) -> Process:
         """Its process."""
         assert self._child.process is not None
         return self._child.process

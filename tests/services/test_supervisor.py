@@ -14,7 +14,7 @@ import pytest
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
-from deltalight.services.child import ChildSpec, early_spares
+from deltalight.services.child import ChildSpec
 from deltalight.services.supervisor import Supervisor
 from deltalight.services.warm_spare import PREPARED, SPARE_VARIABLE
 from tests.protocol.raw_peers import PING, RawPeer, multipart
@@ -212,15 +212,56 @@ def test_a_dead_spare_is_nobodys_replacement(monkeypatch: pytest.MonkeyPatch) ->
         assert supervisor.process_ids()["a"] not in {first, spare}
 
 
-def test_early_spares_become_the_first_processes_and_others_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PREPARED, "ping", ())
-    with early_spares({"a": "ping", "b": "ping"}) as spares:
-        spec = ChildSpec.deltalight("a", "ping", "--help")
-        with Supervisor([spec], forward=lambda _line: None, spares=spares) as supervisor:
-            assert supervisor.process_ids() == {"a": spares["a"].pid}
-            assert spares["a"].wait(timeout=60) == 0
-        assert spares["b"].poll() is None
+FORKS = """
+import time
+from deltalight.services import cli
+from deltalight.services.child import ChildSpec, early_spares, fork_spares
+from deltalight.services.supervisor import Supervisor
+from deltalight.services.warm_spare import PREPARED
+
+def with_spares(words):
+    if words != ["demo"]:
+        return run(words)
+    lines = []
+    with early_spares(fork_spares({"a": "ping", "b": "ping", "c": "ping"})) as spares:
+        print(*[each.pid for each in spares.values()], flush=True)
+        SCRIPT
     assert spares["b"].poll() is not None
+    return 0
+
+PREPARED["ping"] = ()
+run, cli.run = cli.run, with_spares
+cli.main()
+"""
+BECOME_CHILDREN = """
+        specs = [ChildSpec.deltalight("a", "ping", "--help"), ChildSpec.deltalight("c", "ping", "--nonsense")]
+        with Supervisor(specs, forward=lines.append, spares=spares) as supervisor:
+            assert supervisor.process_ids() == {"a": spares["a"].pid, "c": spares["c"].pid}
+            assert (spares["a"].wait(timeout=60), spares["c"].wait(timeout=60)) == (0, 2)
+        assert any("--nonsense" in line for line in lines)
+        assert spares["b"].poll() is None
+"""
+
+
+def forking(script: str) -> "subprocess.Popen[str]":
+    """Python that forks three spares, prints their ids, and runs a part of a script while they wait."""
+    code = FORKS.replace("SCRIPT", script.strip())
+    return subprocess.Popen([sys.executable, "-c", code, "demo"], stdout=subprocess.PIPE, text=True)
+
+
+def test_early_spares_become_the_first_processes_and_others_end() -> None:
+    with forking(BECOME_CHILDREN) as process:
+        assert process.wait(timeout=PATIENCE_S) == 0
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems start early spares")
+def test_forked_spares_end_with_their_killed_supervisor() -> None:
+    with forking("time.sleep(60)") as process:
+        assert process.stdout is not None
+        spares = [psutil.Process(int(word)) for word in process.stdout.readline().split()]
+        assert all(psutil.Process(process.pid) == each.parent() for each in spares)
+        process.kill()
+    assert psutil.wait_procs(spares, timeout=PATIENCE_S)[1] == []
 
 
 def test_a_spare_ends_with_its_supervisor() -> None:
