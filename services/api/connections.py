@@ -5,6 +5,7 @@ import logging
 import time
 from typing import Any
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEAD_TIMEOUT_S = 10.0  # from a connection's beginning, or its last response, to a whole head of a request
@@ -37,9 +38,7 @@ class LimitedProtocol(H11Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """End a connection."""
         super().connection_lost(exc)
-        for timer in (self._silence, self._stall, self._body_check):
-            if timer is not None:
-                timer.cancel()
+        self._end_timers()
 
     def data_received(self, data: bytes) -> None:
         """Take what came."""
@@ -61,6 +60,16 @@ class LimitedProtocol(H11Protocol):
         """Wait for the next request."""
         super().on_response_complete()
         self._await_request()
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """Hand the connection to a WebSocket's protocol; a timer would keep this one, 7 kB, for half a minute."""
+        self._end_timers()
+        super().handle_websocket_upgrade(event)
+
+    def _end_timers(self) -> None:
+        for timer in (self._silence, self._stall, self._body_check):
+            if timer is not None:
+                timer.cancel()
 
     def _count_of(self, host: str) -> int:
         clients: list[Any] = [getattr(connection, "client", None) for connection in self.connections]

@@ -1,8 +1,10 @@
 """Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
 
+import gc
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -200,6 +202,20 @@ def test_who_takes_no_answer_takes_nobodys_place(
         time.sleep(1.0)
         assert len(rest_of(deaf)) < 20_000_000
     assert len(open_api.client.get(path.removeprefix("/api/v1")).content) > 20_000_000
+
+
+def http_connections() -> int:
+    """Those that this process, which serves, still holds."""
+    gc.collect()
+    return sum(isinstance(each, connections.LimitedProtocol) for each in gc.get_objects())
+
+
+def test_a_websocket_does_not_keep_the_connection_that_it_began_as(open_api: RunningApi) -> None:
+    before, url = http_connections(), open_api.client.base_url
+    with ExitStack() as stack:
+        for _ in range(10):
+            stack.enter_context(connect(f"ws://{url.host}:{url.port}/api/v1/live"))
+        assert http_connections() < before + 5
 
 
 def test_refused_sockets_and_broken_requests_write_hardly_a_line(
