@@ -70,7 +70,7 @@ class Viewer:
     async def next(self) -> LiveFrame | None:
         """Wait for a frame newer than this viewer's last; None = the stream has ended."""
         while not self.hub.has_ended:
-            arrived = self.hub.arrived
+            arrived = self.hub.arrival(self.camera)
             newest = self._newer()
             if newest is not None:
                 self._take(newest)
@@ -81,7 +81,7 @@ class Viewer:
     async def next_message(self) -> bytes | None:
         """Wait for the next message, in H.264 where that is wanted and there; None = the stream has ended."""
         while not self.hub.has_ended:
-            arrived = self.hub.arrived
+            arrived = self.hub.arrival(self.camera)
             picture = self._next_coded()
             if picture is not None:
                 self._take(picture.frame)
@@ -96,7 +96,7 @@ class Viewer:
     async def next_video(self) -> VideoPicture | None:
         """Wait for the next picture in H.264; None = the stream has ended, or there is no H.264 (any more)."""
         while not self.hub.has_ended and self.hub.video.why_not is None:
-            arrived = self.hub.arrived
+            arrived = self.hub.arrival(self.camera)
             picture = self._next_coded()
             if picture is not None:
                 self._take(picture.frame)
@@ -172,7 +172,7 @@ class LiveHub:
         self._last = CameraFeed()  # of the newest frame of any
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
-        self.arrived = asyncio.Event()  # set, and made anew, when anything came or the stream ended
+        self._arrivals: dict[str | None, asyncio.Event] = {}  # by the camera that viewers wait for
         self.has_ended = False
         self.video = LiveVideo(self._publish_coded, on_failure)
 
@@ -196,7 +196,7 @@ class LiveHub:
             self._last = feed
             self.received += 1
         self.video.offer(frame)
-        self._wake_soon()
+        self._wake_soon(feed)
 
     def note_cameras(self, message: CamerasMessage) -> bool:
         """Take which cameras there are (any thread); return whether that, or which of them live, is another."""
@@ -300,16 +300,20 @@ class LiveHub:
         """Whether a composite of this `node` names a camera."""
         return len(self.cameras) > 1 and any(each.node == node for each in self.cameras)
 
-    def _wake_soon(self) -> None:
+    def _wake_soon(self, feed: CameraFeed | None = None) -> None:
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self.wake)
+            self._loop.call_soon_threadsafe(self.wake, feed)
 
     def _publish_coded(self, note: Callable[[], None]) -> None:
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(note)
         self._wake_soon()
 
-    def wake(self) -> None:
-        """Have all viewers look what they can take (in the event loop)."""
-        arrived, self.arrived = self.arrived, asyncio.Event()
-        arrived.set()
+    def arrival(self, camera: str | None) -> asyncio.Event:
+        """Return what is set as soon as viewers of a camera may have something new to take (in the event loop)."""
+        return self._arrivals.setdefault(camera, asyncio.Event())
+
+    def wake(self, feed: CameraFeed | None = None) -> None:
+        """Have viewers look what they can take: those whom `feed` shows to, None = all (in the event loop)."""
+        for camera in [each for each in self._arrivals if feed is None or self.feed(each) is feed]:
+            self._arrivals.pop(camera).set()

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,15 @@ from tests.services.live_samples import composite, report, wait_for_frames
 
 SHADES = {"left": 60, "right": 180}
 PERIOD_S = 0.02
+
+
+def cameras_message(statuses: Mapping[str, CameraStatus], number: int = 1) -> CamerasMessage:
+    """What a render server says of the cameras of its room."""
+    entries = tuple(
+        CameraEntry(node=name, status=status, frame_id=number, capture_ns=0, received_ns=0)
+        for name, status in statuses.items()
+    )
+    return CamerasMessage(node="render-server", capture_ns=time.time_ns(), cameras=entries)
 
 
 class StandInRoom:
@@ -47,12 +56,7 @@ class StandInRoom:
         while not self._stop.wait(self._period_s):
             number += 1
             statuses = dict(self.statuses)
-            entries = tuple(
-                CameraEntry(node=name, status=status, frame_id=number, capture_ns=0, received_ns=0)
-                for name, status in statuses.items()
-            )
-            told = CamerasMessage(node="render-server", capture_ns=time.time_ns(), cameras=entries)
-            self._publisher.send(encode(told))
+            self._publisher.send(encode(cameras_message(statuses, number)))
             self._publisher.send(encode(report("render-server", "stand-in renderer")))
             if len(statuses) == 1:
                 self._publisher.send(encode(composite(number), [pictures[next(iter(statuses))]]))

@@ -1,5 +1,6 @@
 """Several cameras in one room, by REST: each has its own pictures, and requests name whose they mean."""
 
+import asyncio
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -9,12 +10,13 @@ import pytest
 import websockets
 from websockets.sync.client import ClientConnection
 
+from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.client import ApiError, Client
 from deltalight.services.h264 import why_unavailable
 from deltalight.services.live_message import LiveHeader, unpack
 from tests.services.api_samples import sentence
-from tests.services.camera_samples import SHADES, CameraApi, camera_api, grey
-from tests.services.live_samples import event_socket, live_socket, next_event
+from tests.services.camera_samples import SHADES, CameraApi, camera_api, cameras_message, grey
+from tests.services.live_samples import composite, event_socket, live_socket, next_event
 from tests.services.render_server_samples import NOWHERE
 from tests.services.test_api_live import follow
 from tests.services.test_api_scenes import wait_for
@@ -53,6 +55,24 @@ def next_of(socket: ClientConnection, node: str) -> LiveHeader:
             assert grey(jpeg) == SHADES[node]
             return before
     pytest.fail(f"no picture of {node} came")
+
+
+def test_a_picture_wakes_only_those_who_see_its_camera() -> None:
+    async def woken(hub: LiveHub, node: str) -> set[str | None]:
+        arrivals = {camera: hub.arrival(camera) for camera in ("left", "right", None)}
+        hub.publish(composite(1).model_copy(update={"node": node}), [b""], "")
+        await asyncio.sleep(0.01)
+        return {camera for camera, arrival in arrivals.items() if arrival.is_set()}
+
+    async def wake_all() -> None:
+        hub = LiveHub()
+        hub.note_cameras(cameras_message({"left": "live", "right": "live"}))
+        hub.attach(asyncio.get_running_loop())
+        assert await woken(hub, "right") == {"right", None}, "the first that lives is not there yet"
+        assert await woken(hub, "left") == {"left", None}
+        assert await woken(hub, "right") == {"right"}
+
+    asyncio.run(wake_all())
 
 
 def test_each_camera_has_its_picture_and_the_first_is_the_default(api: CameraApi) -> None:
