@@ -155,7 +155,7 @@ def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subproces
 
 
 def fork_spares(commands: Mapping[str, str]) -> dict[str, Process]:
-    """Fork a spare of each command, by the name of its process, for a `Supervisor` (`early_spares`).
+    """Fork a spare of each command, by the name of its process, for a `Supervisor` (`ending_spares`).
 
     They share what this process has imported. Only Linux forks safely; elsewhere they are started.
 
@@ -174,7 +174,7 @@ def fork_spares(commands: Mapping[str, str]) -> dict[str, Process]:
 
 
 @contextmanager
-def early_spares(spares: Mapping[str, Process]) -> Iterator[Mapping[str, Process]]:
+def ending_spares(spares: Mapping[str, Process]) -> Iterator[Mapping[str, Process]]:
     """End those of the spares at the end that nobody took."""
     try:
         yield spares

@@ -52,7 +52,7 @@ from deltalight.services.warm_spare import wait_if_spare
 DEBUG_FLAG = "--debug"
 LIVE_COMMANDS = frozenset(
     {"node", "server", "api", "demo"}
-)  # which do the same for each frame, and what forks them
+)  # they do the same for each frame, or fork who does
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
 

@@ -137,5 +137,6 @@ def _take_pipes(stdin: int, stderr: int, *parents: int) -> None:
     os.dup2(stdin, 0)
     os.dup2(stderr, 2)
     for each in (stdin, stderr, *parents):
-        os.close(each)
+        if each > 2:  # a process without standard streams gets pipes of these numbers
+            os.close(each)
     sys.stdin = open(0, closefd=False)  # noqa: SIM115 - for the whole process; there may have been none

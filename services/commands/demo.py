@@ -7,7 +7,7 @@ import typer
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.method_names import require_method
-from deltalight.services.child import NODE, SERVER, WEB, early_spares, fork_spares
+from deltalight.services.child import NODE, SERVER, WEB, ending_spares, fork_spares
 from deltalight.services.commands.options import MethodName
 from deltalight.services.ports import PAGE_PORT, require_free
 from deltalight.services.uncollected import uncollected
@@ -41,7 +41,7 @@ def demo(
     with uncollected():
         from deltalight.services.demo import run_live
 
-    with early_spares(fork_spares(EARLY)) as spares:  # each imports what else it needs while the others do
+    with ending_spares(fork_spares(EARLY)) as spares:  # each imports what else it needs while the others do
         run_live(method, port=port, with_browser=not no_browser, spares=spares)
 
 

@@ -153,6 +153,14 @@ def _kept_alive(supervisor: Supervisor) -> Iterator[None]:
         thread.join()
 
 
+def shows_passes_with(name: str, stack: Stack, page: "Desk") -> bool:
+    """Whether the largest passes are shown of a picture that has this one, too small to be among them or not."""
+    header = stack.header()
+    shown = set(page.page.locator(".legend tbody th").all_inner_texts()) - {"others"}
+    current = {*header["pass_times_ms"], *header["reused_pass_times_ms"]}
+    return name in current and bool(shown) and shown <= current
+
+
 def complaints_of(page: Page, *, expected: Sequence[str] = ()) -> list[str]:
     """What the browser will complain of from now on: faults of the page, and errors in its console.
 

@@ -29,6 +29,7 @@ from tests.services.dashboard_samples import (
     recorded_s,
     seen_m,
     shows_knot,
+    shows_passes_with,
     steep_place,
 )
 from tests.services.record_samples import frames, write
@@ -279,20 +280,12 @@ def test_a_lamp_follows_its_shadow(stack: Stack, page: Desk) -> None:
 
 def test_another_method_renders_the_next_picture(stack: Stack, page: Desk) -> None:
     page.named("tab", "Performance").click()
-    passes = page.page.locator(".legend tbody th")
-
-    def shows_passes_with(name: str) -> bool:
-        """Whether the largest passes are shown of a picture that has this one, too small to be among them or not."""
-        header, shown = stack.header(), set(passes.all_inner_texts()) - {"others"}
-        current = {*header["pass_times_ms"], *header["reused_pass_times_ms"]}
-        return name in current and bool(shown) and shown <= current
-
-    page.until(lambda: shows_passes_with("light real voxels"), "the passes of cone tracing")
+    page.until(lambda: shows_passes_with("light real voxels", stack, page), "the passes of cone tracing")
     page.photograph("performance")
     page.page.get_by_role("toolbar").get_by_label("Method").select_option("dlpv")
     page.until(lambda: stack.document()["method"]["name"] == "dlpv", "the method")
     page.shows_newest()
-    page.until(lambda: shows_passes_with("propagate rho"), "the passes of light propagation")
+    page.until(lambda: shows_passes_with("propagate rho", stack, page), "the passes of light propagation")
     of_before = page.page.locator(".legend tbody tr", has_text="light real voxels").locator("td")
     assert of_before.all_inner_texts() in ([], ["–"]), "passes that do not run have no times"
 

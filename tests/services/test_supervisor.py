@@ -215,7 +215,7 @@ def test_a_dead_spare_is_nobodys_replacement(monkeypatch: pytest.MonkeyPatch) ->
 FORKS = """
 import time
 from deltalight.services import cli
-from deltalight.services.child import ChildSpec, early_spares, fork_spares
+from deltalight.services.child import ChildSpec, ending_spares, fork_spares
 from deltalight.services.supervisor import Supervisor
 from deltalight.services.warm_spare import PREPARED
 
@@ -223,7 +223,7 @@ def with_spares(words):
     if words != ["demo"]:
         return run(words)
     lines = []
-    with early_spares(fork_spares({"a": "ping", "b": "ping", "c": "ping"})) as spares:
+    with ending_spares(fork_spares({"a": "ping", "b": "ping", "c": "ping"})) as spares:
         print(*[each.pid for each in spares.values()], flush=True)
         SCRIPT
     assert spares["b"].poll() is not None
