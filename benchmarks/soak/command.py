@@ -17,7 +17,8 @@ from deltalight.benchmarks.soak.plots import draw_soak
 from deltalight.benchmarks.soak.profiles import choose_profile
 from deltalight.benchmarks.soak.report import FaultRecord, Machine, SoakReport, markdown
 from deltalight.benchmarks.soak.samples import Sampler, require_proc
-from deltalight.benchmarks.soak.station import Station, running_station
+from deltalight.benchmarks.soak.spares import wait_for_spare
+from deltalight.benchmarks.soak.station import SERVER, Station, running_station
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_bytes
 from deltalight.services import ports
@@ -80,6 +81,7 @@ def soak(job: SoakJob, say: Say) -> SoakReport:
             station, Crowd(thread, station.places.page, station.cameras), profile, Random(job.seed), thread
         )
         _wait_for_picture(run)
+        wait_for_spare(station, SERVER, profile.spare_s)
         log = _Log(time.monotonic())
         with Sampler(station) as sampler:
             _put_to_faults(job, run, log, say)

@@ -20,6 +20,7 @@ from deltalight.benchmarks.soak.link import SHAPES, LoopThread
 from deltalight.benchmarks.soak.nonsense import send_nonsense
 from deltalight.benchmarks.soak.peers import peers_on
 from deltalight.benchmarks.soak.profiles import Profile
+from deltalight.benchmarks.soak.spares import wait_for_spare
 from deltalight.benchmarks.soak.station import SERVER, WEB, Station, camera_of
 from deltalight.benchmarks.soak.takes_killed import kill_recorder
 from deltalight.protocol.documents import nearest
@@ -65,6 +66,8 @@ class Fault(ABC):
 class Kill(Fault):
     """SIGKILL of a process: when the picture is back, and whether the scene is the same by document and by pixels.
 
+    It ends when the next spare is ready: until then the station has more to do than without a fault.
+
     Of a node its own camera's picture, of another process those of all cameras.
     """
 
@@ -81,12 +84,15 @@ class Kill(Fault):
         _wait(run, lambda: station.restarts()[name] > restarts)
         _wait(run, lambda: _is_back(run, name, killed_ns, killed_s))
         back_s = time.monotonic() - killed_s
+        by_spare = station.process_id(name) == spare
+        same_document, difference = _documents(station) == documents, _settled_difference(run, pictures)
         return {
             "process": name,
             "back_s": back_s,
-            "by_spare": station.process_id(name) == spare,
-            "same_document": _documents(station) == documents,
-            "difference": _settled_difference(run, pictures),
+            "by_spare": by_spare,
+            "same_document": same_document,
+            "difference": difference,
+            **_until_spare(run, name),
         }
 
 
@@ -253,6 +259,16 @@ def _compared(run: Run, *, calm_s: float = 0.0) -> Iterator[Outcome]:
         time.sleep(calm_s)
         spans["after"] = (ended_s, ended_s + calm_s)
     outcome |= {name: vars(run.crowd.flow(*span)) for name, span in spans.items()}
+
+
+def _until_spare(run: Run, name: str) -> Outcome:
+    """Wait until the next spare of a process is ready; return how long that took, and the flow meanwhile."""
+    if not run.profile.spare_s:
+        return {}
+    began_s = time.monotonic()
+    ready_s = wait_for_spare(run.station, name, run.profile.spare_s)
+    ended_s = time.monotonic() if ready_s is None else began_s + ready_s
+    return {"spare_ready_s": ready_s, "meanwhile": vars(run.crowd.flow(began_s, ended_s))}
 
 
 def _chosen(process: str, run: Run) -> str:

@@ -62,6 +62,7 @@ def all_figures(soaked: Soaked) -> list[Figure]:
         _age(soaked),
         _rate(soaked),
         *_kills(outcomes),
+        *_spares(outcomes),
         *_loads(outcomes, soaked.profile),
         *_links(outcomes),
         worst("lost of a recording", "SIGKILL of the recorder", lost_s, LOST, "s"),
@@ -136,6 +137,20 @@ def _kills(outcomes: _Outcomes) -> list[Figure | None]:
     return figures + [
         worst(f"picture back, {who}", "SIGSTOP, from SIGCONT on", outcomes.of(name, "back_s"), BACK, "s")
         for name, who in (("stop-node", "node"), ("stop-server", SERVER), ("stop-web", WEB))
+    ]
+
+
+def _spares(outcomes: _Outcomes) -> list[Figure | None]:
+    """How long the next spare of a killed render server takes, and what others notice of it."""
+    name, how = "kill-server", "until the next spare of the render server is ready"
+    ready_s, rates, ages_ms = (
+        outcomes.of(name, *path)
+        for path in (("spare_ready_s",), ("meanwhile", "frames_per_s"), ("meanwhile", "unwaited_p95_ms"))
+    )
+    return [
+        worst("spare ready", "after the picture is back", ready_s, SHOWN, "s"),
+        worst("pictures a second of all cameras", how, rates, SHOWN, "", smallest=True),
+        worst("age without waiting, 95 of 100", how, ages_ms, SHOWN, "ms"),
     ]
 
 

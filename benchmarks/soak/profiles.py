@@ -13,7 +13,8 @@ class Profile:
 
     `nodes` sensor nodes send pictures of `size` (pixels) `frames_per_s` times a second; `output` and `method` change
     the demo's scene. `calm_s` is the time before, between and after faults, `load_s` that of faults that go on for
-    a while, `stop_s` that of stopped processes, `viewers` the number that joins and leaves.
+    a while, `stop_s` that of stopped processes, `spare_s` how long at most a fault waits until the spares of killed
+    processes are ready, `viewers` the number that joins and leaves.
     """
 
     nodes: int
@@ -24,6 +25,7 @@ class Profile:
     calm_s: float
     load_s: float
     stop_s: float
+    spare_s: float
     viewers: int
 
     @property
@@ -50,6 +52,7 @@ _DESK = Profile(
     calm_s=6.0,
     load_s=15.0,
     stop_s=10.0,
+    spare_s=180.0,
     viewers=50,
 )
 PROFILES = {
@@ -70,6 +73,7 @@ PROFILES = {
         calm_s=1.0,
         load_s=3.0,
         stop_s=2.0,
+        spare_s=0.0,
         viewers=10,
     ),
 }

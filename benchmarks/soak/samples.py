@@ -59,6 +59,16 @@ def read_process(process_id: int) -> ProcessSample:
     return ProcessSample(process_id, pages * os.sysconf("SC_PAGE_SIZE"), handles)
 
 
+def processor_time_s(process_id: int) -> float:
+    """Return the processor time that a process used since its start, all threads together (/proc).
+
+    Raises:
+        OSError: there is no such process, or no /proc.
+    """
+    numbers = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
+    return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def require_proc() -> None:
     """Check that processes can be examined.
 

@@ -1,12 +1,17 @@
 """The pace of work that leaves the cores and the GPU to another process until its result is needed."""
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from deltalight.render_server.gpu.context import GpuContext
 
 REST = 2.0  # times as long as it works
+LONGEST_REST = 10.0  # likewise, where the cores are never idle
+POLL_S = 0.02
+CPU_TIMES = Path("/proc/stat")
 
 IsCalled = Callable[[float], bool]
 """Waits so many seconds at most to be called; returns whether it is."""
@@ -19,7 +24,8 @@ class CalledError(BaseException):
 class Pace:
     """Rests between kernels and programs until it is called, and ends what is being built there if it `may_end`.
 
-    A lower priority would not do: a process without privileges does not get its own back, and a GPU knows none.
+    In software it takes a third of the processor time that others leave. A lower priority would not do: a process
+    without privileges does not get its own back, and a GPU knows none.
     """
 
     def __init__(self, gpu: GpuContext, is_called: IsCalled) -> None:
@@ -43,7 +49,28 @@ class Pace:
     def _rest(self, *_: object) -> None:
         if not self._is_called(0.0):
             self._gpu.ctx.finish()
-            self._is_called(REST * (self._clock() - self._since_s))
-            self._since_s = self._clock()
+            worked_s = self._clock() - self._since_s
+            if REST * worked_s >= POLL_S:
+                self._rest_from(worked_s)
+                self._since_s = self._clock()
         if self.may_end and self._is_called(0.0):
             raise CalledError
+
+    def _rest_from(self, worked_s: float) -> None:
+        since_s = idle_time_s() if self._gpu.is_software else None
+        if since_s is None:
+            self._is_called(REST * worked_s)
+            return
+        ends_s = time.monotonic() + LONGEST_REST * worked_s
+        while (idle_time_s() or 0.0) - since_s < REST * worked_s and time.monotonic() < ends_s:
+            if self._is_called(POLL_S):
+                return
+
+
+def idle_time_s() -> float | None:
+    """Returns for how long the host's cores were idle since its start, in seconds of a core; None if it cannot tell."""
+    try:
+        _, _user, _nice, _system, idle, waiting, *_ = CPU_TIMES.read_text().split(maxsplit=6)
+        return (int(idle) + int(waiting)) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError):  # no Linux
+        return None

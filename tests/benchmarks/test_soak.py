@@ -3,16 +3,19 @@
 import json
 import random
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 from xml.etree import ElementTree
 
 import pytest
 
-from deltalight.benchmarks.soak import peers
+from deltalight.benchmarks.soak import peers, spares
 from deltalight.benchmarks.soak.command import SoakJob, run_soak
 from deltalight.benchmarks.soak.crowd import Flow, Seen
 from deltalight.benchmarks.soak.faults import FAULTS, parse_faults
@@ -23,6 +26,7 @@ from deltalight.benchmarks.soak.plots import known_runs, nice_ceiling
 from deltalight.benchmarks.soak.profiles import PROFILES
 from deltalight.benchmarks.soak.report import Bar, FaultRecord, SoakReport, worst
 from deltalight.benchmarks.soak.samples import ProcessSample, Sample, parse_drops
+from deltalight.benchmarks.soak.station import Station
 from deltalight.protocol.envelope import decode, encode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
@@ -247,6 +251,45 @@ def test_a_load_is_compared_with_calm_spans_beside_which_their_own_difference_is
     change, by_itself = figures["change of others' rate"], figures["change of the rate by itself"]
     assert (change.result, change.is_met) == ("9.62 %", False)
     assert (by_itself.result, by_itself.is_met) == ("7.69 %", True)
+
+
+def test_what_a_spare_costs_others_is_shown_and_what_was_not_waited_for_is_not() -> None:
+    flow = {"frames_per_s": 52.0, "unwaited_p95_ms": 140.0}
+    outcomes = ({"spare_ready_s": 31.0, "meanwhile": flow}, {"spare_ready_s": None, "meanwhile": flow}, {})
+    kills = [FaultRecord(name="kill-server", began_s=1, ended_s=9, outcome=each) for each in outcomes]
+    figures = {each.what: each for each in all_figures(soaked(faults=kills))}
+    assert figures["spare ready"].result == "31 s"
+    assert figures["pictures a second of all cameras"].how.endswith("(2)")
+    assert figures["age without waiting, 95 of 100"].result == "140 ms"
+
+
+class OneSpare:
+    """Stands for a station whose spare is a process that works for a while, and then waits."""
+
+    def __init__(self, process_id: int | None) -> None:
+        self.process_id = process_id
+
+    def spare_id(self, _name: str) -> int | None:
+        return self.process_id
+
+    def check(self) -> None:
+        pass
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="there is no /proc")
+def test_a_spare_is_ready_once_it_works_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spares, "QUIET_S", 1.0)
+    monkeypatch.setattr(spares, "POLL_S", 0.05)
+    work = "import time\nwhile time.process_time() < 1: pass\ntime.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", work]) as process:
+        try:
+            ready_s = spares.wait_for_spare(cast(Station, OneSpare(process.pid)), "server", 30.0)
+        finally:
+            process.kill()
+    assert ready_s is not None
+    assert 0.8 < ready_s < 30
+    for known in (None, process.pid):  # none yet, or dead
+        assert spares.wait_for_spare(cast(Station, OneSpare(known)), "server", 0.3) is None
 
 
 def test_only_calm_samples_and_late_ones_count() -> None:
