@@ -22,7 +22,6 @@ from deltalight.render_server.scene.depth_surface import (
     ray_planes,
 )
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.threads import by_bands, for_each
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import LENSES_KEPT
 
@@ -142,22 +141,15 @@ def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
 def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     pixels, rays = node_rays(camera, stride)
     depth, all_rays = surface.fitted_depth, ray_planes(camera)
-    inverse, normals = (np.empty((*parts, *rays.shape[1:]), np.float32) for parts in ((), (3,)))
-
-    def fill(rows: slice) -> None:
-        first = rows.start * stride
-        flat = _median_pixels(depth[first : rows.stop * stride], stride) + first * camera.width
-        chosen = depth.ravel().take(flat)
-        gradient = surface.gradient.reshape(2, -1).take(flat, axis=1)
-        along = all_rays.reshape(2, -1).take(flat, axis=1)
-        shift = gradient[0] * (rays[0, rows] - along[0]) + gradient[1] * (rays[1, rows] - along[1])
-        # An outlier of the slope must not throw the node off the depths of its cell.
-        at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
-        inverse[rows] = np.where(chosen > 0, at_centre, 0)
-        normals[:, rows] = normals_along(chosen, gradient, along)
-
-    by_bands(fill, len(inverse))
-    return _Nodes(pixels, rays, inverse, normals)
+    flat = _median_pixels(depth, stride)
+    chosen = depth.ravel().take(flat)
+    gradient = surface.gradient.reshape(2, -1).take(flat, axis=1)
+    along = all_rays.reshape(2, -1).take(flat, axis=1)
+    shift = gradient[0] * (rays[0] - along[0]) + gradient[1] * (rays[1] - along[1])
+    # An outlier of the slope must not throw the node off the depths of its cell.
+    at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
+    inverse = np.where(chosen > 0, at_centre, np.float32(0))
+    return _Nodes(pixels, rays, inverse, np.stack(normals_along(chosen, gradient, along)))
 
 
 def _with_grazing(
@@ -315,27 +307,20 @@ def _world_mesh(
     for chosen, names in zip(triangles, QUAD_TRIANGLES, strict=True):
         for name in names:
             is_used[QUAD_CORNERS[name]] |= chosen
-    ends = np.cumsum(is_used, dtype=np.int32)  # of vertices, node by node
-    count = int(ends[-1])
-    positions, normals = np.empty((2, count, 3), np.float32)
-    uv = np.empty((count, 2), np.float32)
-
-    def fill(rows: slice) -> None:
-        used = np.flatnonzero(is_used[rows])
-        last = int(ends[rows.stop * shape[1] - 1])
-        own = slice(last - len(used), last)
-        depth = 1 / nodes.inverse_depth[rows].ravel().take(used).astype(np.float64)
-        x, y = nodes.rays[:, rows].reshape(2, -1).take(used, axis=1)
-        normal = nodes.normals[:, rows].reshape(3, -1).take(used, axis=1).astype(np.float64)
-        rotation = world_from_camera[:3, :3]
-        positions[own] = (
-            _turned(np.stack([x * depth, y * depth, depth]), rotation) + world_from_camera[:3, 3:]
-        ).T
-        normals[own] = _turned(normal, rotation).T
-        uv[own] = nodes.pixels[rows].reshape(-1, 2).take(used, axis=0)
-
-    by_bands(fill, len(is_used))
-    return TriangleMesh(positions, normals, _numbered(triangles, ends - 1, shape), uv, REAL_MATERIAL)
+    used = np.flatnonzero(is_used)
+    depth = 1 / nodes.inverse_depth.ravel().take(used).astype(np.float64)
+    x, y = nodes.rays.reshape(2, -1).take(used, axis=1)
+    rotation = world_from_camera[:3, :3]
+    positions = _turned(np.stack([x * depth, y * depth, depth]), rotation) + world_from_camera[:3, 3:]
+    normals = _turned(nodes.normals.reshape(3, -1).take(used, axis=1).astype(np.float64), rotation)
+    uv = nodes.pixels.reshape(-1, 2).take(used, axis=0)
+    numbers = np.cumsum(is_used, dtype=np.int32) - 1  # of vertices, node by node
+    return TriangleMesh(
+        *(np.ascontiguousarray(each.T, np.float32) for each in (positions, normals)),
+        _numbered(triangles, numbers, shape),
+        uv,
+        REAL_MATERIAL,
+    )
 
 
 def _turned(
@@ -354,13 +339,11 @@ def _numbered(
     ends = np.cumsum([np.count_nonzero(chosen) for chosen in triangles])
     found = np.empty((ends[-1], 3), np.int32)
 
-    def fill(kind: int) -> None:
-        node = first.take(np.flatnonzero(triangles[kind]))
-        own = found[ends[kind] - len(node) : ends[kind]]
-        for column, name in enumerate(QUAD_TRIANGLES[kind]):
+    for chosen, end, names in zip(triangles, ends, QUAD_TRIANGLES, strict=True):
+        node = first.take(np.flatnonzero(chosen))
+        own = found[end - len(node) : end]
+        for column, name in enumerate(names):
             own[:, column] = numbers.take(node + np.int32(offsets[name]))
-
-    for_each(fill, range(len(triangles)))
     return found
 
 

@@ -14,7 +14,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
-from deltalight.render_server.scene.threads import begun, by_bands
+from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.view import LENSES_KEPT
 
 GRID_STEP_PX = 4
@@ -259,17 +259,8 @@ def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
     height, width = frame.color.shape[:2]
     rows, columns = (max(length // GRID_STEP_PX, 1) for length in (height, width))
     table = decode_lut(frame.response)[None] / np.float32(frame.exposure_scale)
-    averaged = np.empty((rows, columns, 3), np.float32)
-
-    def fill(part: slice, own: slice) -> None:
-        linear = cv2.LUT(frame.color[own], table)
-        cv2.resize(linear, (columns, part.stop - part.start), averaged[part], interpolation=cv2.INTER_AREA)
-
-    if rows * GRID_STEP_PX == height:
-        by_bands(lambda part: fill(part, slice(part.start * GRID_STEP_PX, part.stop * GRID_STEP_PX)), rows)
-    else:
-        fill(slice(0, rows), slice(0, height))  # blocks of cells that begin between rows
-    return averaged
+    linear = cv2.LUT(frame.color, table)
+    return np.asarray(cv2.resize(linear, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
 def _subsampled_inverse_depth(depth: DepthImage | None) -> Float32[np.ndarray, "gh gw"] | None:

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, back_faces, bound_points, depth_mesh
-from deltalight.render_server.scene.depth_surface import grazing_depth_fill
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
+from deltalight.render_server.scene.grazing_depth import grazing_depth_fill
 from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import PosedFrame

@@ -1,17 +1,15 @@
-"""Work on all cores: NumPy and OpenCV let other threads run while they compute."""
+"""Work on other threads: NumPy and OpenCV let them run while they compute."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
 
 Result = TypeVar("Result")
-Part = TypeVar("Part")
 
-# Of a picture: few enough to stay in a core's cache, so many that threads seldom wait for each other.
-BAND_ROWS = 120
-MIN_BAND_ROWS = 24  # where cores would be idle otherwise
+# Threads wait for the interpreter around each call of NumPy: with less to do in each, two are no faster than one.
+LEAST_BAND_ROWS = 320
 
 
 def begun(call: Callable[[], Result]) -> "Future[Result]":
@@ -25,23 +23,15 @@ def by_bands(work: Callable[[slice], None], rows: int) -> None:
     Raises:
         Exception: what `work` raises.
     """
-    step = min(BAND_ROWS, max(-(-rows // _cores()), MIN_BAND_ROWS))
-    for_each(work, [slice(first, min(first + step, rows)) for first in range(0, rows, step)])
-
-
-def for_each(work: Callable[[Part], None], parts: Sequence[Part]) -> None:
-    """Calls `work` with each part, on this thread and on others that are free.
-
-    Raises:
-        Exception: what `work` raises.
-    """
-    pending = iter(parts)
+    bands = max(min(rows // LEAST_BAND_ROWS, _cores()), 1)
+    ends = [rows * number // bands for number in range(bands + 1)]
+    pending = iter(list(map(slice, ends[:-1], ends[1:])))
 
     def work_on() -> None:
         for part in pending:
             work(part)
 
-    helpers = [begun(work_on) for _ in range(min(_cores(), len(parts)) - 1)]
+    helpers = [begun(work_on) for _ in range(bands - 1)]
     work_on()
     for each in helpers:
         if not each.cancel():

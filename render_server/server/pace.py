@@ -68,7 +68,7 @@ class Pace:
 
 
 def idle_time_s() -> float | None:
-    """Returns for how long the host's cores were idle since its start, in seconds of a core; None if it cannot tell."""
+    """Returns how long the host's cores were idle since its start, in seconds of a core; None if it cannot tell."""
     try:
         _, _user, _nice, _system, idle, waiting, *_ = CPU_TIMES.read_text().split(maxsplit=6)
         return (int(idle) + int(waiting)) / os.sysconf("SC_CLK_TCK")

@@ -11,7 +11,7 @@ from deltalight.protocol.frames import BoardPose, DepthImage
 from deltalight.protocol.source import open_source
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.scene.depth_mesh import depth_mesh
-from deltalight.render_server.scene.depth_surface import grazing_depth_fill
+from deltalight.render_server.scene.grazing_depth import grazing_depth_fill
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
 from tests.render_server.scenes import COARSE, Stage, camera, cube, directional, frame, look_at, solve
 

@@ -9,7 +9,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
 from deltalight.protocol.messages import MAX_CAMERAS
 from deltalight.render_server.scene.depth_mesh import depth_mesh, stride_for_budget
-from deltalight.render_server.scene.depth_surface import depth_surface
+from deltalight.render_server.scene.depth_surface import depth_surface, window_radius
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0, 81.3], [0, 152.0, 58.9], [0, 0, 1]])
@@ -173,3 +173,52 @@ def test_real_depth_keeps_the_table_flat(shared_data: Path) -> None:
     points = mesh.positions[table].astype(float)
     _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     assert np.degrees(np.arccos(np.clip(np.abs(mesh.normals[table] @ axes[2]), 0, 1))).mean() < 10
+
+
+def masked(pattern: str) -> np.ndarray:
+    """Pixels that are valid in a picture large enough for many boxes of windows with gaps."""
+    valid = np.ones((240, 320), bool)
+    rng = np.random.default_rng(4)
+    if pattern == "holes":
+        valid[100:140, 60:100] = valid[:30, 200:] = False
+    elif pattern == "speckles":
+        valid[rng.random(valid.shape) < 0.02] = False
+    elif pattern == "rest":
+        valid[:, 9:] = False
+    return valid
+
+
+@pytest.mark.parametrize("pattern", ["whole", "holes", "speckles", "rest"])
+def test_slopes_are_those_of_least_squares_over_the_valid_pixels_of_each_window(pattern: str) -> None:
+    camera = CameraModel(320, 240, np.array([[300.0, 0, 160], [0, 310.0, 120], [0, 0, 1]]))
+    valid, rng = masked(pattern), np.random.default_rng(3)
+    inverse = 1 / (1.0 + 0.002 * rng.normal(size=valid.shape)).astype(np.float32)
+    depth = DepthImage(1 / inverse, valid, camera, 0.002)
+    radius = window_radius(depth, camera)
+    surface = depth_surface(depth, camera)
+    u, v = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    places = [
+        (0, 0),
+        (0, 3),
+        (120, 0),
+        (239, 319),
+        (1, 318),
+        (120, 160),
+        *rng.integers(0, (240, 320), (300, 2)),
+    ]
+    known = 0
+    for row, column in places:
+        window = np.s_[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
+        used = surface.inverse_depth[window] > 0
+        terms = np.stack([u[window][used] - column, v[window][used] - row, np.ones(used.sum())], axis=1)
+        found = surface.gradient[:, row, column]
+        if not np.isfinite(found).all():
+            few = used.sum() <= (radius + 1) ** 2
+            assert few or not surface.inverse_depth[row, column], (row, column)
+            continue
+        known += 1
+        expected, *_ = np.linalg.lstsq(
+            terms, surface.inverse_depth[window][used].astype(np.float64), rcond=None
+        )
+        np.testing.assert_allclose(found, expected[:2] * (300, 310), atol=2e-4)
+    assert known > (5 if pattern == "rest" else 200)

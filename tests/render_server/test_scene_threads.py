@@ -11,7 +11,7 @@ from deltalight.render_server.methods.light_maps import shadow_receivers
 from deltalight.render_server.real_geometry import COARSE_DIVISOR, RealGeometry
 from deltalight.render_server.scene import seen_depth, threads
 from deltalight.render_server.scene.depth_surface import depth_surface
-from deltalight.render_server.scene.threads import BAND_ROWS, by_bands
+from deltalight.render_server.scene.threads import LEAST_BAND_ROWS, by_bands
 from deltalight.render_server.scene.triangle_mesh import GpuMesh
 from deltalight.render_server.view import CameraView, PosedFrame
 from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at
@@ -19,7 +19,7 @@ from tests.render_server.scenes import checkered, depth_image, floor_depth, fram
 BUDGET = 2000
 
 
-@pytest.mark.parametrize("rows", [0, 1, BAND_ROWS, 5 * BAND_ROWS + 3])
+@pytest.mark.parametrize("rows", [0, 1, LEAST_BAND_ROWS, 5 * LEAST_BAND_ROWS + 3])
 def test_each_row_is_in_one_band(rows: int) -> None:
     seen = np.zeros(rows, int)
 
@@ -31,7 +31,7 @@ def test_each_row_is_in_one_band(rows: int) -> None:
 
 
 def test_bands_within_bands_do_not_wait_for_each_other() -> None:
-    seen = np.zeros((4 * BAND_ROWS, 3 * BAND_ROWS), int)
+    seen = np.zeros((4 * LEAST_BAND_ROWS, 3 * LEAST_BAND_ROWS), int)
 
     def note(band: slice) -> None:
         def note_columns(columns: slice) -> None:
@@ -48,7 +48,7 @@ def test_what_a_band_raises_is_raised() -> None:
         raise ValueError(str(band.start))
 
     with pytest.raises(ValueError, match="0"):
-        by_bands(fail, BAND_ROWS)
+        by_bands(fail, LEAST_BAND_ROWS)
 
 
 def test_normals_do_not_depend_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,8 +58,9 @@ def test_normals_do_not_depend_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> 
     depth_m[40:80, 50:90] -= 0.3
     depth = DepthImage(depth_m, rng.random(depth_m.shape) > 0.05, camera, 0.003)
     found = []
+    monkeypatch.setattr(threads, "_cores", lambda: 5)
     for rows in (len(depth_m), 7):
-        monkeypatch.setattr(threads, "BAND_ROWS", rows)
+        monkeypatch.setattr(threads, "LEAST_BAND_ROWS", rows)
         found.append(depth_surface(depth, camera))
     assert np.isfinite(found[0].gradient).any()
     assert np.array_equal(found[0].gradient, found[1].gradient, equal_nan=True)

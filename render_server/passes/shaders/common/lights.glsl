@@ -61,6 +61,12 @@ float linear_depth(LightView view, float d) {
     return view.range.z > 0.5 ? mix(near, far, d) : near * far / (far - d * (far - near));
 }
 
+// The map's depth of a distance along the view: linear_depth undone.
+float map_depth(LightView view, float z) {
+    float near = view.range.x, far = view.range.y;
+    return view.range.z > 0.5 ? (z - near) / (far - near) : far * (z - near) / (z * (far - near));
+}
+
 // Texel coordinate (pixel centres at .5) of a lateral position; outside its tile: negative.
 vec2 tile_texel(LightView view, vec2 s) {
     vec2 uv = 0.5 + 0.5 * s / view.tile.w;
@@ -102,9 +108,7 @@ float lit_fraction(sampler2D map, LightView view, vec2 s, float depth) {
     if (t.x < 0.0) return 1.0;
     t = clamp(t, view.tile.xy + 0.5, view.tile.xy + view.tile.z - 0.5);
     vec4 d = textureGather(map, t / vec2(textureSize(map, 0)), 0);   // (0,1) (1,1) (1,0) (0,0)
-    float near = view.range.x, far = view.range.y;
-    float limit = view.range.z > 0.5 ? (depth - near) / (far - near) : far * (depth - near) / (depth * (far - near));
-    vec4 lit = vec4(greaterThanEqual(d, vec4(min(depth <= near ? 0.0 : limit, 1.0))));
+    vec4 lit = vec4(greaterThanEqual(d, vec4(min(depth <= view.range.x ? 0.0 : map_depth(view, depth), 1.0))));
     vec2 f = fract(t - 0.5);
     return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
 }
@@ -140,17 +144,16 @@ vec2 shift_to(Spread k, float gap, vec2 o) {
     return k.square ? gap * (k.u * o.x + k.v * o.y) / (1.0 - dot(k.lean, o)) : gap * k.widest * o;
 }
 
-float norm_of(Spread k, vec2 o) { return k.square ? max(abs(o.x), abs(o.y)) : length(o); }
+float square_norm(vec2 o) { return max(abs(o.x), abs(o.y)); }
 
 float cross2(vec2 a, vec2 b) { return a.x * b.y - a.y * b.x; }
 
 // Whether a shift, reduced by `margin`, is within the light's area (shift_to solved for o by Cramer's rule,
 // undivided).
-bool within(Spread k, float gap, vec2 shift, float margin) {
-    if (!k.square) return length(shift) <= gap * k.widest + margin;
+bool within_rectangle(Spread k, float gap, vec2 shift, float margin) {
     shift *= max(1.0 - margin / max(length(shift), 1e-12), 0.0);
     vec2 q = vec2(cross2(shift, k.v), cross2(k.u, shift));
-    return norm_of(k, q) <= abs(gap * cross2(k.u, k.v) + dot(k.lean, q));
+    return square_norm(q) <= abs(gap * cross2(k.u, k.v) + dot(k.lean, q));
 }
 
 // Sample j of the light's area: a spiral on the unit disc, a Fibonacci lattice on the square.
@@ -175,19 +178,44 @@ int view_containing(int first, int count, vec3 p) {
 
 struct Blocking { float sum; float hits; float deepest; };   // depths
 
-void add_blockers(bool square, sampler2D map, Spread k, LightView view, Receiver r, int count, inout Blocking found) {
-    k.square = square;
+void add_blocker(float d, inout Blocking found) {
+    found = Blocking(found.sum + d, found.hits + 1.0, max(found.deepest, d));
+}
+
+// Of a disc: at a shift, only depths below a limit that falls with it are within the light's area, of the map's too. Each
+// sample is the one before, turned and moved outwards.
+void add_disc_blockers(sampler2D map, Spread k, LightView view, Receiver r, int count, inout Blocking found) {
+    float near = view.range.x, far = view.range.y, texels = 0.5 * view.tile.z / view.tile.w;
+    float widest = count == 1 ? 0.0 : k.widest * drift(view, r.depth, near);
+    float slope = (view.range.z > 0.5 ? 1.0 : near * far) / ((far - near) * max(k.widest, 1e-12));
+    float nearer = min(map_depth(view, r.depth - r.bias), 1.0);
+    float limit = map_depth(view, r.depth) + slope * 0.5 / texels;   // of half a texel less
+    vec2 low = view.tile.xy, high = low + view.tile.z, centre = low + 0.5 * view.tile.z + texels * r.s;
+    vec2 turn = vec2(cos(GOLDEN_ANGLE), sin(GOLDEN_ANGLE)), direction = vec2(1.0, 0.0);
+    float apart = widest / float(count), shift = 0.5 * apart;
+    int j = 0;
+    if (count > 0) do {
+        vec2 t = centre + texels * shift * direction;
+        float d = texelFetch(map, ivec2(t), 0).r;
+        bool in_tile = all(greaterThanEqual(t, low)) && all(lessThan(t, high));
+        if (in_tile && d < min(nearer, limit - slope * shift)) add_blocker(linear_depth(view, d), found);
+        direction = vec2(direction.x * turn.x - direction.y * turn.y, direction.x * turn.y + direction.y * turn.x);
+        shift += apart;
+    } while (++j < count);
+}
+
+void add_square_blockers(sampler2D map, Spread k, LightView view, Receiver r, int count, inout Blocking found) {
+    k.square = true;
     float gap = drift(view, r.depth, view.range.x);
     float margin = view.tile.w / view.tile.z;   // half a texel
     int j = 0;
     if (count > 0) do {
         vec2 unit = light_sample(k, j, count);
-        vec2 offset = count == 1 ? vec2(0.0) : shift_to(k, gap, norm_of(k, unit) * unit);
+        vec2 offset = count == 1 ? vec2(0.0) : shift_to(k, gap, square_norm(unit) * unit);
         vec2 t = tile_texel(view, r.s + offset);
         if (t.x < 0.0) continue;
         float d = first_depth(map, view, ivec2(t));
-        if (d >= r.depth - r.bias || !within(k, drift(view, r.depth, d), offset, margin)) continue;
-        found = Blocking(found.sum + d, found.hits + 1.0, max(found.deepest, d));
+        if (d < r.depth - r.bias && within_rectangle(k, drift(view, r.depth, d), offset, margin)) add_blocker(d, found);
     } while (++j < count);
 }
 
@@ -200,8 +228,8 @@ vec2 blockers(sampler2D map, Spread k, LightView view, Receiver r) {
     int count = widest < 0.5 * texel ? 1   // below half a texel: one sample
         : widest > WIDE_TEXELS * texel ? 2 * shadow_samples : shadow_samples;
     Blocking found = Blocking(0.0, 0.0, 0.0);
-    add_blockers(false, map, k, view, r, k.square ? 0 : count, found);
-    if (has_rectangles) add_blockers(true, map, k, view, r, k.square ? count : 0, found);
+    add_disc_blockers(map, k, view, r, k.square ? 0 : count, found);
+    if (has_rectangles) add_square_blockers(map, k, view, r, k.square ? count : 0, found);
     if (found.hits == 0.0) return vec2(lit_fraction(map, view, r.s, r.depth - r.bias) < 1.0 ? r.depth : NOTHING);
     return vec2(found.sum / found.hits, found.deepest);
 }
