@@ -157,21 +157,21 @@ class CameraModel:
         """Return the pixels (x, y) of points in the optical frame; NaN for points not in front (z <= 0)."""
         in_front = points[:, 2] > 0
         if len(points) and in_front.all():
-            return self._project_in_front(np.ascontiguousarray(points, np.float64))
+            return self._project_in_front(np.asarray(points, np.float64))
         pixels = np.full((len(points), 2), np.nan)
         if in_front.any():
-            pixels[in_front] = self._project_in_front(np.ascontiguousarray(points[in_front], np.float64))
+            pixels[in_front] = self._project_in_front(np.asarray(points[in_front], np.float64))
         return pixels
 
     def _project_in_front(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         if not self.has_distortion:
-            pixels = np.empty((len(points), 2))
+            pixels = np.empty((2, len(points)))
             for axis in (0, 1):  # each by itself: NumPy is slow along rows of two
                 focal, centre = self.matrix[axis, axis], self.matrix[axis, 2]
-                pixels[:, axis] = points[:, axis] / points[:, 2] * focal + centre
-            return pixels
+                pixels[axis] = points[:, axis] / points[:, 2] * focal + centre
+            return pixels.T
         zero = np.zeros(3)
-        shaped = points.reshape(-1, 1, 3)
+        shaped = np.ascontiguousarray(points).reshape(-1, 1, 3)
         if self.distortion_model == "equidistant":
             pixels, _ = cv2.fisheye.projectPoints(shaped, zero, zero, self.matrix, self._fisheye_coefficients)
         else:

@@ -92,7 +92,7 @@ class EdgeTriangles:
             scene,
             own,
             mesh_corners=mesh.corners,
-            clip_from_camera=view.clip_from_camera,
+            clip_from_world=view.clip_from_camera @ view.camera_from_world,
             triangle_count=mesh.triangle_count,
         )
 

@@ -48,21 +48,19 @@ class PosedSurface:
         """
         matrix, camera = self.view.camera_from_world, self.view.camera
         local = np.einsum("ij,jn->in", matrix[:3, :3], points) + matrix[:3, 3:]
-        ahead = local[2] > NEAR_M
-        pixel = np.full(points.shape[1], -1)
-        found = np.nan_to_num(camera.project(local[:, ahead].T), nan=-1.0)
-        column, row = (np.floor(axis + 0.5).astype(int) for axis in found.T)
+        ahead = np.flatnonzero(local[2] > NEAR_M)
+        column, row = camera.project(local.take(ahead, axis=1).T).T + 0.5
         inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-        pixel[ahead] = np.where(inside, row * camera.width + column, -1)
+        pixel = np.full(points.shape[1], -1)
+        pixel[ahead[inside]] = row[inside].astype(int) * camera.width + column[inside].astype(int)
         return local[2], pixel
 
     def pixels_per_area(self, points: Columns, normals: Columns) -> Float64[np.ndarray, " n"]:
         """Returns on how many pixels (1/m^2) surfaces are shown: fx fy |n.c| / z^3; 0 from behind."""
         fx, fy = self.view.camera.matrix[[0, 1], [0, 1]]
         to_eye = self.view.position[:, None] - points
-        along = np.einsum("i,in->n", -self.view.world_from_camera[:3, 2], to_eye)
-        z = np.maximum(along, NEAR_M)
         facing = np.einsum("in,in->n", normals, to_eye)
+        z = np.maximum(np.einsum("i,in->n", -self.view.world_from_camera[:3, 2], to_eye), NEAR_M)
         return np.asarray(fx * fy * np.maximum(facing, 0) / (z * z * z))
 
     def shows(
@@ -101,12 +99,12 @@ class DepthViews:
         for number, other in enumerate(self.frames):
             if number == index:
                 continue
-            depth_m, pixel = other.find(points)
             shown = other.pixels_per_area(points, normals)
-            larger = shown >= own if number < index else shown > own
-            copied |= larger & covered[number][pixel] & other.shows(depth_m, pixel)
-        kept = ~np.logical_and.reduce([copied[corner] for corner in mesh.triangles.T])
-        return replace(mesh, triangles=mesh.triangles[np.flatnonzero(kept)])
+            larger = np.flatnonzero(shown >= own if number < index else shown > own)
+            depth_m, pixel = other.find(points.take(larger, axis=1))
+            copied[larger] |= covered[number].take(pixel) & other.shows(depth_m, pixel)
+        one, two, three = copied.take(mesh.triangles).T
+        return replace(mesh, triangles=mesh.triangles.take(np.flatnonzero(~(one & two & three)), axis=0))
 
     def count_showing(self, points: Points) -> Int64[np.ndarray, " n"]:
         """Returns how many frames show a surface at each point."""

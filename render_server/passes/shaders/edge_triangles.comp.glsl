@@ -7,13 +7,13 @@
 
 layout(local_size_x = 64) in;
 layout(std430) buffer Tiles { Tile tiles[]; };
-uniform mat4 clip_from_camera;
+uniform mat4 clip_from_world;
 uniform uint triangle_count;
 
 // In texels; whole: beyond the near plane; beside: all of it before that plane, or beyond one side of the raster.
 struct Projected { vec2 a; vec2 b; vec2 c; bool is_whole; bool is_beside; };
 
-vec4 clip_of(vec3 place) { return clip_from_camera * (camera_from_world * vec4(place, 1.0)); }
+vec4 clip_of(vec3 place) { return clip_from_world * vec4(place, 1.0); }
 
 bool is_beyond_near(vec4 clip) { return clip.z >= -clip.w && clip.w > 0.0; }
 
@@ -50,6 +50,9 @@ bool meets(vec2 middle, float reach, Projected p) {
     vec3 apart = vec3(beyond(middle, p.a, p.b, p.c, l.x), beyond(middle, p.b, p.c, p.a, l.y), beyond(middle, p.c, p.a, p.b, l.z));
     return all(lessThanEqual(apart, reach * l));
 }
+
+// The next of the texels or tiles from `first` to `last`, row by row. (Two loops would execute the body for no lane, each once more.)
+ivec2 next_in(ivec2 at, ivec2 first, ivec2 last) { return at.x < last.x ? ivec2(at.x + 1, at.y) : ivec2(first.x, at.y + 1); }
 
 #ifdef FIND_THIN
 #include "common/geometry.glsl"
@@ -99,13 +102,16 @@ void find_thin(mat3 corners) {
         if (!is_stout(at)) mark_along_longest(at, first, last);
         return;
     }
-    for (int y = first.y; y <= last.y; ++y)
-        for (int x = first.x; x <= last.x; ++x)
-            if (meets(vec2(x, y), HALF, at) && shows_behind(ivec2(x, y), corners[0], n)) mark(ivec2(x, y));
+    ivec2 texel = first;
+    if (all(lessThanEqual(first, last))) do {
+        if (meets(vec2(texel), HALF, at) && shows_behind(texel, corners[0], n)) mark(texel);
+        texel = next_in(texel, first, last);
+    } while (texel.y <= last.y);
 }
 
 void main() {
-    for (uint i = first_item(); i < triangle_count; i += items_apart()) find_thin(corners_of(i));
+    uint i = first_item();
+    if (i < triangle_count) do find_thin(corners_of(i)); while ((i += items_apart()) < triangle_count);
 }
 #else
 layout(std430) buffer EdgeNodes { uint node_count; uint unused; uvec2 nodes[]; };   // triangle, next node + 1
@@ -121,14 +127,14 @@ void add_to_list(int tile, uint triangle) {
 
 void add_to_tiles(uint triangle, Projected p, ivec2 first, ivec2 last, int level) {
     float edge = float(tile_edge(level));
-    for (int y = first.y; y <= last.y; ++y) {
-        for (int x = first.x; x <= last.x; ++x) {
-            int tile = tile_number(ivec2(x, y), level);
-            bool is_wanted = level > 0 || tiles[tile].marks != 0u;
-            vec2 middle = edge * (vec2(x, y) + 0.5) - 0.5;
-            if (is_wanted && (!p.is_whole || meets(middle, 0.5 * edge + MARGIN, p))) add_to_list(tile, triangle);
-        }
-    }
+    ivec2 at = first;
+    do {
+        int tile = tile_number(at, level);
+        bool is_wanted = level > 0 || tiles[tile].marks != 0u;
+        vec2 middle = edge * (vec2(at) + 0.5) - 0.5;
+        if (is_wanted && (!p.is_whole || meets(middle, 0.5 * edge + MARGIN, p))) add_to_list(tile, triangle);
+        at = next_in(at, first, last);
+    } while (at.y <= last.y);
 }
 
 // One that is not whole may be anywhere.
@@ -142,6 +148,7 @@ void list(uint triangle) {
 }
 
 void main() {
-    for (uint i = first_item(); i < triangle_count; i += items_apart()) list(i);
+    uint i = first_item();
+    if (i < triangle_count) do list(i); while ((i += items_apart()) < triangle_count);
 }
 #endif
