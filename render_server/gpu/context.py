@@ -4,8 +4,10 @@ import ctypes
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import glcontext
@@ -16,6 +18,7 @@ from deltalight.render_server.gpu.buffer_images import TextureCalls
 from deltalight.render_server.gpu.lost_context import check_reset, reporting, reset_status
 
 SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
+THREADS = Path("/proc/self/task")
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "swrast")
 
 # What EGL and the GL loader say, and what a user can do about it.
@@ -333,6 +336,24 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
     except DeltalightError:
         ctx.release()
         raise
+    if software:
+        spread_raster_threads()
     ask = reset_status(ctx, context.load)
     images = limits["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]
     return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software, reset_status=ask, most_images=images)
+
+
+def spread_raster_threads() -> None:
+    """Keeps each of llvmpipe's raster threads on a core of its own (Linux).
+
+    They are woken together for a millisecond or two of work. Linux often wakes two of them on one core, and does not
+    part them before they are done.
+    """
+    if not THREADS.is_dir():
+        return
+    cores = sorted(os.sched_getaffinity(0))
+    for thread in THREADS.iterdir():
+        with suppress(OSError):  # it has ended, or this process may not
+            kind, _, number = (thread / "comm").read_text().strip().rpartition("-")
+            if kind == "llvmpipe" and number.isdecimal():
+                os.sched_setaffinity(int(thread.name), {cores[int(number) % len(cores)]})

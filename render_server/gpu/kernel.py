@@ -78,7 +78,7 @@ class Dispatch:
     written: Mapping[str, object]
 
 
-class _Program:
+class Program:
     """A linked program and its resources by name."""
 
     def __init__(
@@ -302,7 +302,7 @@ class _Program:
             watch(Dispatch(self.label, size, written()))
 
 
-class _Shader(ABC):
+class Shader(ABC):
     """The programs of one shader: with each set of its switches (`#pragma switch NAME`) that bindings turn on.
 
     All but the one without any are compiled when first run: what a scene lacks costs nothing.
@@ -311,28 +311,34 @@ class _Shader(ABC):
     def __init__(self, gpu: GpuContext, name: str | Path, defines: Mapping[str, float | str]) -> None:
         self._gpu, self._name, self._defines = gpu, name, defines
         self._plain = self._compiled(defines)
-        self._switched: dict[tuple[str, ...], _Program] = {}
+        self._switched: dict[tuple[str, ...], Program] = {}
         self.label, self.local_size = self._plain.label, self._plain.local_size
 
     @abstractmethod
-    def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
+    def _compiled(self, defines: Mapping[str, float | str]) -> Program:
         """Returns the linked program of these defines."""
 
-    def _shared(self, *source: str, link: Callable[[], _Program]) -> _Program:
+    def _shared(self, *source: str, link: Callable[[], Program]) -> Program:
         program = self._gpu.programs.take(self, source, link)
-        assert isinstance(program, _Program)
+        assert isinstance(program, Program)
         return program
 
-    def _bound(self, own: Bindings, shared: Sequence[Bindings]) -> tuple[_Program, Bindings]:
+    def _tell_compiled(self, label: str, stages: Mapping[str, str]) -> None:
+        """Tells the watchers, who look at what any GPU compiles."""
+        if self._gpu.compile_watchers:
+            self._gpu.compiled(label, stages)
+
+    def _bound(self, own: Bindings, shared: Sequence[Bindings]) -> tuple[Program, Bindings]:
         """Returns the program that the bindings choose, with everything bound, and what each name is bound to."""
         known: dict[str, Binding] = {}
         for source in (*reversed(shared), own):
             known.update(source)
-        program = self._chosen(self._plain.switched_on(known))
+        program = self._chosen(known)
         program.bind(own, known)
         return program, known
 
-    def _chosen(self, on: tuple[str, ...]) -> _Program:
+    def _chosen(self, known: Bindings) -> Program:
+        on = self._plain.switched_on(known)
         if not on:
             return self._plain
         if on not in self._switched:
@@ -349,7 +355,7 @@ class _Shader(ABC):
             self._gpu.programs.give_back(self, each)
 
 
-class Kernel(_Shader):
+class Kernel(Shader):
     """A compute shader with its defines: `name`.comp.glsl of the shaders' folder, or of another one if it is a path.
 
     The one place where work is dispatched, so that the memory barrier is never forgotten: a missing barrier does not
@@ -359,16 +365,15 @@ class Kernel(_Shader):
     def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
         super().__init__(gpu, name, defines)
 
-    def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
-        path, label = SHADERS / f"{self._name}.comp.glsl", _label(self._name, defines)
+    def _compiled(self, defines: Mapping[str, float | str]) -> Program:
+        path, label = SHADERS / f"{self._name}.comp.glsl", label_of(self._name, defines)
         source = shader_source(path, {**self._gpu.defines, **defines})
-        if self._gpu.compile_watchers:  # they look at what any GPU compiles
-            self._gpu.compiled(label, {"comp": shader_source(path, defines)})
+        self._tell_compiled(label, {"comp": shader_source(path, defines)})
         if self._gpu.is_software:
             source = with_images(source, self._gpu.most_images)
 
-        def link() -> _Program:
-            return _Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))
+        def link() -> Program:
+            return Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))
 
         return self._shared(source, link=link)
 
@@ -400,22 +405,22 @@ class Kernel(_Shader):
         program.report((), partial(program.written, known))
 
 
-class RasterKernel(_Shader):
+class RasterKernel(Shader):
     """A vertex and a fragment shader of one name; draws with depth test into a framebuffer."""
 
     def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
         super().__init__(gpu, name, defines)
 
-    def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
+    def _compiled(self, defines: Mapping[str, float | str]) -> Program:
         vertex, fragment = (
             shader_source(SHADERS / f"{self._name}.{stage}.glsl", defines) for stage in ("vert", "frag")
         )
-        label = _label(self._name, defines)
+        label = label_of(self._name, defines)
         self._gpu.compiled(label, {"vert": vertex, "frag": fragment})
 
-        def link() -> _Program:
+        def link() -> Program:
             program = self._gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
-            return _Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
+            return Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
 
         return self._shared(vertex, fragment, link=link)
 
@@ -453,7 +458,7 @@ def _attachments(target: moderngl.Framebuffer) -> dict[str, object]:
     return {f"attachment {number}": item for number, item in enumerate(items)}
 
 
-def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:
+def label_of(name: str | Path, defines: Mapping[str, float | str]) -> str:
     """Returns the shader's name and defines, e.g. `trace_cones REAL`."""
     stem = name.name if isinstance(name, Path) else name
     return " ".join([stem, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])

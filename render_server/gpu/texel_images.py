@@ -76,7 +76,7 @@ def _without_sampler(source: str, name: str, texels: str) -> str:
     head = f"texelFetch({name}, "
     # From the last one on, so that those in arguments are replaced before.
     while (at := source.rfind(head)) >= 0:
-        arguments, rest = _until(source, at + len(head), "(", ")")
+        arguments, rest = until_bracket(source, at + len(head), "(", ")")
         place, comma, level = arguments.rpartition(", ")
         if not comma or level != "0":
             raise ValueError(f"`{name}` has `#pragma texels`, but {arguments} is not of level 0.")
@@ -84,7 +84,7 @@ def _without_sampler(source: str, name: str, texels: str) -> str:
     return source
 
 
-def _until(text: str, start: int, opening: str, closing: str) -> tuple[str, str]:
+def until_bracket(text: str, start: int, opening: str, closing: str) -> tuple[str, str]:
     """Splits a text, from `start` on, at the bracket that closes the one before."""
     end = text.index(closing, start)
     while text.count(opening, start, end) > text.count(closing, start, end):
@@ -136,7 +136,7 @@ class _Array:
         for index, number in enumerate(self.header):
             source = self._with_number(source, index, number)
         for at in reversed([at for at in _places(source, self.name) if source[at + len(self.name)] == "["]):
-            index_text, rest = _until(source, at + len(self.name) + 1, "[", "]")
+            index_text, rest = until_bracket(source, at + len(self.name) + 1, "[", "]")
             source = f"{source[:at]}{read}(uint({index_text})){rest}"
         return source
 

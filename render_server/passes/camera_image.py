@@ -7,7 +7,8 @@ from jaxtyping import Float32, UInt8
 
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Kernel
+from deltalight.render_server.gpu.kernel import Binding
+from deltalight.render_server.gpu.picture_kernel import PictureKernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
@@ -30,7 +31,7 @@ class CameraImage:
         self.exposure_scale = 1.0
         self.codes = gpu.ctx.buffer(reserve=4 * size[0] * size[1], dynamic=True)  # as textures take them
         self.is_linear = False  # whether `linear` shows the picture that was uploaded last
-        self._linearize = Kernel(gpu, "linearize")
+        self._linearize = PictureKernel(gpu, "linearize")
         self._rays_of: object = None
         self._response_of: object = None
 
@@ -55,7 +56,7 @@ class CameraImage:
             return
         self.is_linear, self._has_levels = True, False
         self._linearize.run(
-            self.size, picture=self.code, code_radiance=self.code_radiance, linear_out=self.linear
+            (0, 0, *self.size), picture=self.code, code_radiance=self.code_radiance, linear_out=self.linear
         )
 
     def _write_response(self, decode: Float32[np.ndarray, "256 3"], exposure_scale: float) -> None:

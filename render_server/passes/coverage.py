@@ -14,6 +14,7 @@ from deltalight.render_server.gpu.list_groups import (
     ListGroups,
     list_threads,
 )
+from deltalight.render_server.gpu.picture_kernel import PictureKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.passes.gbuffer import GeometryBuffer, RasterGeometry
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
@@ -118,7 +119,7 @@ class SampleCoverage:
         self._filled: Rectangle = (0, 0, *size)  # what may hold anything
         self.pixels = gpu.ctx.buffer(reserve=LIST_HEADER_BYTES + 4 * math.prod(size))
         self.triangles = EdgeTriangles(gpu, raster)
-        self._first, self._groups = Kernel(gpu, "sample_coverage"), ListGroups(gpu, EDGE_GROUP)
+        self._first, self._groups = PictureKernel(gpu, "sample_coverage"), ListGroups(gpu, EDGE_GROUP)
         self._further = Kernel(
             gpu, "edge_samples", SAMPLES=len(PATTERN), OFFSETS_PX=_as_glsl(PATTERN), NEAR=NEAR_M
         )
@@ -147,7 +148,7 @@ class SampleCoverage:
         geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster)
         self.triangles.find_thin(mesh, view, raster, scene)
         self._first.run(
-            touched[2:],
+            touched,
             raster.bindings,
             scene,
             self._written,

@@ -8,6 +8,7 @@ import numpy as np
 from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.picture_kernel import PictureKernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.depth_fit import DepthFit, upload_depth
 from deltalight.render_server.passes.gbuffer import GeometryBuffer
@@ -31,10 +32,10 @@ class RealSurface:
         self._depth: moderngl.Texture | None = None
         self._fitted: moderngl.Texture | None = None
         if self._fits_depth:
-            self._from_depth = Kernel(gpu, "real_surface", FITS_DEPTH=1)
+            self._from_depth = PictureKernel(gpu, "real_surface", FITS_DEPTH=1)
         else:
             self._depth, self._fitted = texture_2d(gpu, size, 1, "f4"), texture_2d(gpu, size, 3, "f4")
-            self._from_depth = Kernel(gpu, "real_surface")
+            self._from_depth = PictureKernel(gpu, "real_surface")
         self._from_model = Kernel(gpu, "real_surface_model")
 
     @property
@@ -58,7 +59,7 @@ class RealSurface:
             found = self._fitted_by_cpu(depth, fitted)
         else:
             found = self._fitted_by_gpu(depth) if on_gpu is None else on_gpu
-        self._from_depth.run(self.size, scene, found, **self._images())
+        self._from_depth.run((0, 0, *self.size), scene, found, **self._images())
 
     def _fitted_by_gpu(self, depth: DepthImage) -> dict[str, Binding]:
         if self._fit is None:

@@ -316,7 +316,8 @@ def _world_mesh(
     uv = nodes.pixels.reshape(-1, 2).take(used, axis=0)
     numbers = np.cumsum(is_used, dtype=np.int32) - 1  # of vertices, node by node
     return TriangleMesh(
-        *(np.ascontiguousarray(each.T, np.float32) for each in (positions, normals)),
+        np.ascontiguousarray(positions.T, np.float32),
+        np.ascontiguousarray(normals.T, np.float32),
         _numbered(triangles, numbers, shape),
         uv,
         REAL_MATERIAL,

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, _Program
+from deltalight.render_server.gpu.kernel import Bindings, Program
 from tests.render_server.protected_scenes import METHODS, Case, pictures_of
 from tests.render_server.test_golden import psnr_db
 from tests.unwritten_memory import POISON, FilledContext
@@ -66,16 +66,16 @@ def test_what_new_memory_holds_does_not_show(
 def audit(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Kernels and names that bind something that they may write twice."""
     faults: list[str] = []
-    bind = _Program.bind
+    bind = Program.bind
 
-    def audited(program: _Program, own: Bindings, known: Bindings) -> None:
+    def audited(program: Program, own: Bindings, known: Bindings) -> None:
         bind(program, own, known)
         names = [slot.name for slot in (*program._samplers, *program._images, *program._storage)]
         for name, item in program.written(known).items():
             others = [other for other in names if known[other] is item and other != name]
             faults.extend(f"{program.label}: {name} and {other}" for other in others)
 
-    monkeypatch.setattr(_Program, "bind", audited)
+    monkeypatch.setattr(Program, "bind", audited)
     return faults
 
 

@@ -89,13 +89,13 @@ def test_textures_that_take_turns_are_checked_once_each_and_others_still(
 ) -> None:
     """As those of a room's cameras do."""
     checked: list[object] = []
-    check = kernel_module._Program._check_sampled
+    check = kernel_module.Program._check_sampled
 
     def noted(program: Any, slot: Any, item: object) -> None:  # noqa: ANN401 (not public)
         checked.append(item)
         check(program, slot, item)
 
-    monkeypatch.setattr(kernel_module._Program, "_check_sampled", noted)
+    monkeypatch.setattr(kernel_module.Program, "_check_sampled", noted)
     kernel = make("uniform sampler2D seen;", "values[0] = texelFetch(seen, ivec2(0), 0).r;")
     other = texture_2d(gpu, (1, 1), 1, "f4", data=np.array([7], np.float32).tobytes())
     codes = texture_2d(gpu, (1, 1), 4, "u1")

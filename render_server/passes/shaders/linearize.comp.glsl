@@ -3,6 +3,7 @@
 
 #include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D linear_out;
+#pragma outputs linear_out
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);

@@ -7,6 +7,7 @@
 uniform sampler2D depth_map;   // m along the optical axis, 0 unknown
 layout(rgba32f) writeonly uniform image2D position_out;
 layout(rgba16f) writeonly uniform image2D normal_out;
+#pragma outputs position_out normal_out
 
 vec3 camera_at(ivec2 pixel, float z) { return vec3(texelFetch(picture_rays, pixel, 0).xy, 1.0) * z; }
 

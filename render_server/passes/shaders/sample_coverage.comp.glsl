@@ -15,6 +15,7 @@ layout(rgba8) writeonly uniform image2D tint_out;
 // r: fraction in front of the real surface, g: behind it, b: g times its mean depth
 layout(rgba16f) writeonly uniform image2D sample_coverage;
 layout(rgba32f) writeonly uniform image2D second_surface;   // as in edge_samples.comp.glsl
+#pragma outputs position_out normal_out uv_out tint_out sample_coverage second_surface
 layout(std430) buffer Tiles { Tile tiles[]; };
 uniform sampler2D virtual_raster_uv;
 uniform sampler2D virtual_raster_tint;
