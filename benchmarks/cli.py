@@ -287,7 +287,8 @@ def soak(
         str,
         typer.Option(
             help="all, none, or of these, separated by commas: kill-node, kill-server, kill-web, kill-recorder, "
-            "stop-node, stop-server, stop-web, viewers, churn, nonsense, link-arm, link-foxglove, cut."
+            "stop-node, stop-server, stop-web, viewers, churn, nonsense, link-arm, link-foxglove, link-lossy, "
+            "link-reorder, cut."
         ),
     ] = "all",
     seed: Annotated[

@@ -28,6 +28,8 @@ from deltalight.services.rooms.status import (
 from deltalight.services.storage.drained import Drained
 
 MAXIMUM_FAILED_STARTS = 3  # in a row
+DOUBT_S = 60.0  # how long a device is taken last after no render server started on it
+RETRY_S = 10.0  # between attempts on such devices alone, of a room that ran before
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,8 @@ class _Room:
     drained: bool = False
     failed_starts: int = 0
     restarts: int = 0
+    has_run: bool = False
+    again_s: float = 0.0  # until then only on devices that are not doubted
 
     def wait(self, why: str) -> None:
         self.state, self.why, self.placement, self.shows = "waiting", why, None, False
@@ -104,6 +108,7 @@ class RoomKeeper:
         self._epoch = time.time_ns() // 1_000_000  # the newest
         self._rooms = {plan.name: _Room(plan, next(self._queue)) for plan in plans}
         self._faults: Mapping[str, str] = {}  # of nodes
+        self._doubted: dict[tuple[str, str], float] = {}  # until when, by host and device
         drained = Drained() if memory is None else memory.load()
         self._drained_hosts = set(drained.hosts)
         for name in drained.rooms & self._rooms.keys():
@@ -234,7 +239,8 @@ class RoomKeeper:
         sources = tuple(node.endpoint for node in room.plan.nodes)
         plan, avoid = room.plan, frozenset(self._drained_hosts)
         self._epoch += 1
-        order = RoomOrder(plan.name, self._epoch, sources, plan.session_file, plan.labels, avoid)
+        doubted = frozenset(self._doubted)
+        order = RoomOrder(plan.name, self._epoch, sources, plan.session_file, plan.labels, avoid, doubted)
         try:
             return self._placer.place(order, slot)
         except NoSlotError:
@@ -262,24 +268,39 @@ class RoomKeeper:
     def _hear(self, room: _Room, event: PlacementEvent) -> None:
         if room.state == "starting":
             self._notice(f"room {room.plan.name}: runs.")
-        room.state, room.shows, room.failed_starts = "running", event.shows, 0
+        room.state, room.shows, room.failed_starts, room.has_run = "running", event.shows, 0, True
         names = ", ".join(node.name for node in room.plan.nodes)
         room.why = "" if event.shows else f"No frames come from {names}."
 
     def _lose(self, room: _Room, event: PlacementEvent) -> None:
-        has_failed = room.state == "starting" and not event.host_refused
+        """Note a loss. What a room that ran before does not take any more is its device, which may be gone."""
+        is_of_device = event.refused and room.has_run
+        if room.state == "starting" and room.placement is not None:
+            self._doubt(room.placement.slot)
+            room.again_s = time.monotonic() + RETRY_S if is_of_device else 0.0
+        has_failed = room.state == "starting" and not (event.host_refused or is_of_device)
         room.failed_starts = room.failed_starts + 1 if has_failed else 0
         room.restarts += 1
         self._notice(f"room {room.plan.name}: {event.detail}")
         if room.successor is not None:
             successor, room.successor = room.successor, None
             room.run_as(successor)
-        elif event.refused or room.failed_starts >= MAXIMUM_FAILED_STARTS:
+        elif (event.refused and not is_of_device) or room.failed_starts >= MAXIMUM_FAILED_STARTS:
             room.wait(event.detail)
             room.state = "failed"
         else:
             room.wait(event.detail)
             room.queued = min(each.queued for each in self._rooms.values()) - 1
+
+    def _doubt(self, name: str) -> None:
+        """Take the device of a slot last for a while."""
+        for slot in self._placer.slots():
+            if slot.name == name:
+                self._doubted[slot.host, slot.device] = time.monotonic() + DOUBT_S
+
+    def _has_sound_slot(self) -> bool:
+        slots = self._placer.slots()
+        return any(slot.room is None and (slot.host, slot.device) not in self._doubted for slot in slots)
 
     def _note_successor(self, room: _Room, event: PlacementEvent) -> None:
         successor, before = room.successor, room.placement
@@ -324,8 +345,12 @@ class RoomKeeper:
         self._notice(f"room {room.plan.name}: leaves {host} and {where}.")
 
     def _place_waiting(self) -> None:
+        now_s = time.monotonic()
+        self._doubted = {device: until_s for device, until_s in self._doubted.items() if until_s > now_s}
         waiting = [room for room in self._rooms.values() if room.state == "waiting" and not room.drained]
         for room in sorted(waiting, key=lambda each: each.queued):
+            if room.again_s > now_s and not self._has_sound_slot():
+                continue
             try:
                 placement = self._place(room)
             except NoSlotError as fault:

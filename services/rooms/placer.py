@@ -24,7 +24,8 @@ class RoomOrder:
     """What a render server needs to know: its room, whose frames it reads, and the file that keeps the scene.
 
     `epoch` counts the placements of all rooms: endpoints of a newer one replace those of an older one of the room.
-    Its host has all `labels`, and is none of those to `avoid`, which are drained.
+    Its host has all `labels`, and is none of those to `avoid`, which are drained. Devices (host, device) that are
+    `doubted` are taken if no other is free.
     """
 
     room: str
@@ -33,6 +34,7 @@ class RoomOrder:
     session_file: Path
     labels: Mapping[str, str] = field(default_factory=dict)
     avoid: frozenset[str] = frozenset()
+    doubted: frozenset[tuple[str, str]] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,7 @@ def choose_slot(slots: Sequence[Slot], order: RoomOrder, wanted: str | None = No
     free = [slot for slot in usable if slot.room is None]
     if not free:
         raise NoSlotError(_why_none(order, fitting, usable))
+    free = [slot for slot in free if (slot.host, slot.device) not in order.doubted] or free
     of_host = Counter(slot.host for slot in free)
     return max(free, key=lambda slot: of_host[slot.host])
 

@@ -1,6 +1,6 @@
 """Rooms for tests: a placer of stand-ins in this process, plans, and a directory that a web process follows."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,11 +29,17 @@ class StandInPlacer:
     placed: dict[str, Placement] = field(default_factory=dict)
     released: list[Placement] = field(default_factory=list)
     events: list[PlacementEvent] = field(default_factory=list)
+    devices: Mapping[str, str] = field(
+        default_factory=dict
+    )  # of slots, where they have other than the default
     servers: dict[int, Recorder] = field(default_factory=dict)
 
     def slots(self) -> list[Slot]:
         rooms = {name: placement.room for name, placement in self.placed.items()}
-        return [Slot(name, "default", rooms.get(name), name.partition("/")[0]) for name in self.slot_names]
+        return [
+            Slot(name, self.devices.get(name, "default"), rooms.get(name), name.partition("/")[0])
+            for name in self.slot_names
+        ]
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
         chosen = choose_slot(self.slots(), order, slot).name

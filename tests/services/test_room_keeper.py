@@ -10,7 +10,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import ControlReply
 from deltalight.protocol.payloads import encode_control
 from deltalight.services.rooms.follower import RoomFollower
-from deltalight.services.rooms.keeper import MAXIMUM_FAILED_STARTS, RoomKeeper
+from deltalight.services.rooms.keeper import MAXIMUM_FAILED_STARTS, RETRY_S, RoomKeeper
 from deltalight.services.rooms.placer import Placement, RoomOrder
 from deltalight.services.rooms.status import RoomList, RoomStatus
 from deltalight.services.storage.drained import Drained, DrainedStore
@@ -218,6 +218,50 @@ def test_hosts_that_are_refused_are_no_failed_starts_of_the_room(
         placer.lose("hall", host_refused=True)
         keeper.poll()
     assert rooms(keeper)["hall"].state == "starting"
+
+
+def test_a_room_whose_gpu_is_gone_starts_on_another_one_of_its_host(tmp_path: Path) -> None:
+    """Its render server dies with the GPU, and the next one there finds no device and refuses to start."""
+    devices = {"here/1": "EGL 0", "here/2": "EGL 0", "here/3": "EGL 1"}
+    placer = StandInPlacer(tuple(devices), devices=devices)
+    keeper = RoomKeeper(plans(tmp_path, "hall"), placer)
+    running(keeper, placer, "hall")
+    assert rooms(keeper)["hall"].slot == "here/1"
+    placer.lose("hall")  # a crash is not the device's fault
+    keeper.poll()
+    assert rooms(keeper)["hall"].slot == "here/1"
+    placer.lose("hall", refused=True, detail="Only the software renderer llvmpipe was found.")
+    keeper.poll()
+    assert (states(keeper), rooms(keeper)["hall"].slot) == (["starting"], "here/3")
+    running(keeper, placer, "hall")
+    placer.lose("hall")
+    keeper.poll()
+    assert rooms(keeper)["hall"].slot == "here/3"
+
+
+def test_a_room_whose_only_gpu_is_gone_waits_is_tried_again_and_leaves_no_other_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placer, now_s = StandInPlacer(("slot-1",)), [1000.0]
+    monkeypatch.setattr("deltalight.services.rooms.keeper.time.monotonic", lambda: now_s[0])
+    keeper = RoomKeeper(plans(tmp_path, "hall", "door"), placer)
+    running(keeper, placer, "hall")
+    placer.lose("hall")
+    keeper.poll()
+    for attempt in range(5):
+        placer.lose("hall", refused=True, detail="There is no device.")
+        keeper.poll()
+        assert states(keeper) == ["waiting", "starting"], attempt  # the other one may be luckier
+        assert "There is no device" in rooms(keeper)["hall"].why
+        keeper.drain("door")
+        keeper.poll()
+        assert states(keeper)[0] == "waiting"
+        now_s[0] += RETRY_S + 0.1
+        keeper.poll()
+        assert states(keeper)[0] == "starting"
+        keeper.start("door")
+    running(keeper, placer, "hall")
+    assert states(keeper)[0] == "running"
 
 
 def test_a_room_whose_input_is_refused_fails_at_once(keeper: RoomKeeper, placer: StandInPlacer) -> None:

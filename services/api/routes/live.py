@@ -34,6 +34,7 @@ CODECS: dict[str, LiveCodec] = {"jpeg": "jpeg", "h264": "h264"}
 _TOO_MANY_ORDERS = "change view, camera and codec less often"
 UNKNOWN_CODEC = f"there is no such codec; ask for one of {', '.join(CODECS)}"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+RETRY_AFTER_S = "1"  # pictures come many times a second, or not for a while
 NO_ANSWER = "The render server does not respond, or (with Retry-After) has too many pending requests."
 JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
 
@@ -155,7 +156,8 @@ async def live_picture(shared: Shared, view: WantedView = None, camera: WantedCa
     shared.live.require(camera)
     frame = shared.live.newest_of(camera)
     if frame is None:
-        raise ProblemError(503, "no-picture", "No picture has come from the render server yet; see /state.")
+        sentence = "No picture has come from the render server yet; see /state."
+        raise ProblemError(503, "no-picture", sentence, {"Retry-After": RETRY_AFTER_S})
     jpeg = frame.picture(None).jpeg if view is None else await _next_in(shared.live, view, camera)
     return Response(jpeg, media_type="image/jpeg", headers=PICTURE_HEADERS)
 
@@ -342,7 +344,8 @@ async def _next_in(hub: LiveHub, view: ShownView, camera: str | None) -> bytes:
                         return frame.pictures[view].jpeg
         except TimeoutError:
             pass
-    raise ProblemError(503, "no-picture", f"No picture in the view {view} has come; see /state.")
+    sentence = f"No picture in the view {view} has come; see /state."
+    raise ProblemError(503, "no-picture", sentence, {"Retry-After": RETRY_AFTER_S})
 
 
 async def _mjpeg(hub: LiveHub, view: ShownView | None, camera: str | None) -> AsyncIterator[bytes]:
