@@ -135,7 +135,7 @@ vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b, out vec3 ratio) {
 // Where depth is unknown the change of light continues from surroundings of similar colour; 1 if there are none, or if not wanted.
 // (llvmpipe executes both sides of a branch, but no turn of a loop too many.)
 vec3 surrounding_ratio(ivec2 pixel, vec3 b, bool wanted) {
-    ivec2 centre = pixel / scale, last = textureSize(sample_pixels, 0) - 1;
+    ivec2 centre = ivec2(quotient(pixel.x, scale), quotient(pixel.y, scale)), last = textureSize(sample_pixels, 0) - 1;
     float total = 1e-4;   // no change if all are far away or of another colour
     vec3 sum = vec3(total);
     int reach = wanted ? FILL_RADIUS : -1;
@@ -200,11 +200,12 @@ void compose(ivec2 pixel) {
 // The pixels of the texels that change_ratio listed, or (`whole`) all pixels.
 void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
-    uint block = uint(scale * scale);
-    uint count = (whole ? uint(grid.x * grid.y) : listed_count()) * block, i = first_item();
+    int block = scale * scale;
+    uint count = (whole ? uint(grid.x * grid.y) : listed_count()) * uint(block), i = first_item();
     if (i < count) do {
-        uint index = whole ? i / block : texels[i / block];
-        ivec2 pixel = pixel_in_block(texel_of_index(index, grid.x), int(i % block), scale);
+        int number = quotient(int(i), block);
+        uint index = whole ? uint(number) : texels[number];
+        ivec2 pixel = pixel_in_block(texel_of_index(index, grid.x), int(i) - number * block, scale);
         if (all(lessThan(pixel, size))) compose(pixel);
     } while ((i += items_apart()) < count);
 }

@@ -74,9 +74,11 @@ void light(ivec2 pixel, ivec2 size) {
 void main() {
     ivec2 size = textureSize(real_surface_position, 0);
     int grid_width = (size.x + scale - 1) / scale;
-    uint block = uint(scale * scale), count = listed_count() * block, i = first_item();
+    int block = scale * scale;
+    uint count = listed_count() * uint(block), i = first_item();
     if (i < count) do {
-        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
+        int number = quotient(int(i), block);
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[number], grid_width), int(i) - number * block, scale);
         if (all(lessThan(pixel, size))) light(pixel, size);
     } while ((i += items_apart()) < count);
 }

@@ -67,30 +67,34 @@ void meet(uint triangle) {
     }
 }
 
-// Meets all triangles of a list; false if the list is not whole.
-bool meet_list(int tile) {
-    uint at = tiles[tile].first;
-    while (at != 0u && at != FULL) {
-        uvec2 node = nodes[at - 1u];
-        meet(node.x);
-        at = node.y;
-    }
-    return at != FULL;
+const int LISTS = 4 * LEVELS;
+
+// The list of the next tile around the place that is another one than those of its level before: the first node + 1, 0 if it is empty.
+uint next_list(inout int list, inout int first, inout int before) {
+    ++list;
+    int corner = list & 3, tile = tile_around(place, corner ^ (corner >> 1), list >> 2);
+    bool is_new = corner == 0 || (tile != before && tile != first);   // corners that follow one another may share a tile
+    if (corner == 0) first = tile;
+    before = tile;
+    return is_new ? tiles[tile].first : 0u;
 }
 
-// Of the tiles of each level, once each: corners that follow one another, or the last and the first, may share one.
+// Meets all triangles of the lists; false if one of them is not whole. All in one loop, so that no lane waits for the lists of others.
 bool meet_lists() {
-    bool is_whole = true;
-    for (int level = 0; level < LEVELS; ++level) {
-        int first = -1, before = -1;
-        for (int i = 0; i < 4; ++i) {
-            int tile = tile_around(place, i ^ (i >> 1), level);
-            if (tile != before && tile != first) is_whole = meet_list(tile) && is_whole;
-            before = tile;
-            if (i == 0) first = tile;
+    int list = -1, first = -1, before = -1;
+    uint at = 0u;
+    do {
+        do {
+            if (at == 0u && list < LISTS - 1) at = next_list(list, first, before);
+        } while (at == 0u && list < LISTS - 1);
+        if (at == FULL) return false;
+        if (at != 0u) {
+            uvec2 node = nodes[at - 1u];
+            meet(node.x);
+            at = node.y;
         }
-    }
-    return is_whole;
+    } while (at != 0u || list < LISTS - 1);
+    return true;
 }
 
 Fragment fragment_of(int k, uint triangle) { return fragment_at(triangle, ray_of_sample(k), right, down); }

@@ -126,7 +126,7 @@ void add_to_list(int tile, uint triangle) {
 }
 
 void add_to_tiles(uint triangle, Projected p, ivec2 first, ivec2 last, int level) {
-    float edge = float(tile_edge(level));
+    float edge = float(1 << tile_bits(level));
     ivec2 at = first;
     do {
         int tile = tile_number(at, level);

@@ -27,9 +27,11 @@ void recompose(ivec2 pixel) {
 
 void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
-    uint block = uint(scale * scale), count = listed_count() * block;
+    int block = scale * scale;
+    uint count = listed_count() * uint(block);
     for (uint i = first_item(); i < count; i += items_apart()) {
-        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid.x), int(i % block), scale);
+        int number = quotient(int(i), block);
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[number], grid.x), int(i) - number * block, scale);
         if (all(lessThan(pixel, size))) recompose(pixel);
     }
 }

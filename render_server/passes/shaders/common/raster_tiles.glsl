@@ -1,7 +1,8 @@
 // Square tiles of a raster row by row, what is marked in them, and lists of the triangles that may show there. Tiles of level 0 have
-// TILE texels an edge, those of each further level MOST_TILES times as many. Texels' centres are at integers.
-const int TILE = 2;
-const int MOST_TILES = 16;   // along an axis: a triangle is in the lists of the first level where it spans no more
+// 2^TILE_BITS texels an edge, those of each further level MOST_TILES times as many. Texels' centres are at integers.
+const int TILE_BITS = 1;     // TILE = 2; shifts, because llvmpipe divides integers lane by lane
+const int LEVEL_BITS = 4;
+const int MOST_TILES = 1 << LEVEL_BITS;   // along an axis: a triangle is in the lists of the first level where it spans no more
 const int LEVELS = 4;
 const uint UNEVEN = 1u;   // the samples of a pixel there may differ
 const uint THIN = 2u;     // something there may be thinner than a texel
@@ -11,19 +12,15 @@ struct Tile { uint marks; uint first; };   // first: node of the list + 1, 0: no
 uniform ivec2 raster_size;
 uniform ivec4 level_starts;   // number of each level's first tile
 
-int tile_edge(int level) {
-    int edge = TILE;
-    for (int i = 0; i < level; ++i) edge *= MOST_TILES;
-    return edge;
-}
+int tile_bits(int level) { return TILE_BITS + LEVEL_BITS * level; }   // of its edge
 
 ivec2 tile_of(vec2 place, int level) {
-    return clamp(ivec2(floor(place + 0.5)), ivec2(0), raster_size - 1) / tile_edge(level);
+    return clamp(ivec2(floor(place + 0.5)), ivec2(0), raster_size - 1) >> tile_bits(level);
 }
 
 int tile_number(ivec2 tile, int level) {
-    int edge = tile_edge(level);
-    return level_starts[level] + tile.y * ((raster_size.x + edge - 1) / edge) + tile.x;
+    int bits = tile_bits(level);
+    return level_starts[level] + tile.y * ((raster_size.x + (1 << bits) - 1) >> bits) + tile.x;
 }
 
 // The tiles around a place that hold the samples of a pixel there.

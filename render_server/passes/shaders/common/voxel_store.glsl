@@ -2,6 +2,7 @@
 // for every piece of a triangle inside a voxel, and fixed-point sums a slot. Integer atomics keep it bit-identical.
 // OpenGL guarantees no more than eight storage blocks, so a shader declares those that it uses: before this file it
 // defines GRID_ACCESS, TOUCHED_ACCESS, SURFELS_ACCESS or SUMS_ACCESS, as `readonly`, or empty to write the block too.
+#include "common/quotient.glsl"
 struct Surfel {
     vec4 position_area;    // world m, m^2
     vec4 normal_material;  // unit normal, material index
@@ -34,7 +35,10 @@ int fixed_point(float x) { return int(round(x * FIXED_POINT)); }
 // Voxels of further volumes follow in z.
 uint voxel_index(ivec3 v, int n) { return uint((v.z * n + v.y) * n + v.x); }
 
-ivec3 voxel_of_index(uint i, int n) { return ivec3(int(i) % n, (int(i) / n) % n, int(i) / (n * n)); }
+ivec3 voxel_of_index(uint i, int n) {
+    int row = quotient(int(i), n), layer = quotient(row, n);
+    return ivec3(int(i) - row * n, row - layer * n, layer);
+}
 
 #ifdef SEVERAL_VOLUMES
 // Goes to the volume of a voxel, or of a block of the coarser grid of `n` an edge, and returns its place there.

@@ -1,5 +1,6 @@
 // A list of texels of the reduced grid: passes walk it instead of branching, because software renderers run both sides
 // of a branch, and a GPU keeps its lanes full. What fills the list defines APPENDS_TEXELS.
+#include "common/quotient.glsl"
 #include "common/walk.glsl"
 #ifdef APPENDS_TEXELS
 layout(std430) buffer Texels { uint texel_count; uint texels[]; };
@@ -17,9 +18,13 @@ const uint GROUPS_IN_ROW = 256u;   // of workgroups that count_groups counted: O
 uint counted_group() { return gl_WorkGroupID.y * GROUPS_IN_ROW + gl_WorkGroupID.x; }
 #endif
 
-ivec2 texel_of_index(uint index, int grid_width) { return ivec2(int(index) % grid_width, int(index) / grid_width); }
+ivec2 texel_of_index(uint index, int grid_width) {
+    int row = quotient(int(index), grid_width);
+    return ivec2(int(index) - row * grid_width, row);
+}
 
 // Pixel number `inside` of the block of scale x scale pixels that a texel represents.
 ivec2 pixel_in_block(ivec2 texel, int inside, int scale) {
-    return texel * scale + ivec2(inside % scale, inside / scale);
+    int row = quotient(inside, scale);
+    return texel * scale + ivec2(inside - row * scale, row);
 }

@@ -1,0 +1,5 @@
+// Quotient of integers, neither below 0, at most 2^23; by floats, because software renderers divide integers lane by lane.
+int quotient(int a, int b) {
+    int q = int(float(a) / float(b)), rest = a - q * b;   // q is off by one at most
+    return q + int(rest >= b) - int(rest < 0);
+}
