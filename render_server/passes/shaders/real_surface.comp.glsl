@@ -5,6 +5,7 @@
 
 #include "common/pixel_group.glsl"
 uniform sampler2D depth_map;   // m along the optical axis, 0 unknown
+#pragma texels r32f depth_map
 layout(rgba32f) writeonly uniform image2D position_out;
 layout(rgba16f) writeonly uniform image2D normal_out;
 #pragma outputs position_out normal_out
