@@ -28,6 +28,7 @@ STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # endless responses that are no
 # POST requests without side effects.
 READ_ONLY_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
 WHEP_PATH = "/api/v1/whep"  # its sessions, below it, show pictures and change nothing
+ADDRESSES_OF_TOKEN = 4  # that may send as much as one may, all together
 WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE = 1 / 6, 10
 LOOPBACK_NAMES = frozenset({LOOPBACK, "localhost", "::1"})
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -69,6 +70,8 @@ class AuthMiddleware:
         self._secrets = secrets
         self._problems = problems
         self._rate = RateLimit(rules.requests_per_s, 2 * rules.requests_per_s)
+        of_token = ADDRESSES_OF_TOKEN * rules.requests_per_s
+        self._rate_of_tokens = RateLimit(of_token, 2 * of_token)
         self._wrong_tokens = RateLimit(WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE)
         self._streams = streams
 
@@ -95,8 +98,10 @@ class AuthMiddleware:
     async def _admit(self, scope: Scope) -> None:
         headers = Headers(scope=scope)
         self._check_names(headers)
-        self._check_rate(scope)
+        _count(self._rate, _client(scope))
         principal = await self._authenticate(scope, headers)
+        if known := principal.token_id or principal.name:
+            _count(self._rate_of_tokens, known)  # whatever addresses it comes from
         if principal.role == "view" and not _is_read_only(scope):
             raise _read_only_role(principal)
         set_principal(scope, principal)
@@ -126,13 +131,6 @@ class AuthMiddleware:
                 "origin",
                 "Requests from other sites are refused; open the page from this service's own address.",
             )
-
-    def _check_rate(self, scope: Scope) -> None:
-        client = _client(scope)
-        wait_s = self._rate.wait_s(client)
-        if wait_s > 0:
-            raise _too_many(wait_s, "rate", "Too many requests; send fewer a second.")
-        self._rate.take(client)
 
     async def _authenticate(self, scope: Scope, headers: Headers) -> Principal:
         """Authenticate a request; a token or ticket must be valid if sent, even where none is required."""
@@ -244,6 +242,18 @@ def _unknown_token(was_given: bool) -> ProblemError:
 
 def _unauthorized(sentence: str) -> ProblemError:
     return ProblemError(401, "token", sentence, {"WWW-Authenticate": "Bearer"})
+
+
+def _count(limit: RateLimit, sender: str) -> None:
+    """Count a request of a sender.
+
+    Raises:
+        ProblemError: it has sent too many.
+    """
+    wait_s = limit.wait_s(sender)
+    if wait_s > 0:
+        raise _too_many(wait_s, "rate", "Too many requests; send fewer a second.")
+    limit.take(sender)
 
 
 def _too_many(wait_s: float, kind: str, sentence: str) -> ProblemError:

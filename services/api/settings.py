@@ -77,7 +77,8 @@ class ApiSettings(StrictModel):
     )
     requests_per_s: Annotated[float, Field(ge=1, le=10_000)] = Field(
         default=100.0,
-        description="Sustained requests per second that one client may send; bursts may be twice that.",
+        description="Sustained requests per second from one address; bursts may be twice that, requests with one "
+        "token four times.",
     )
 
     @field_validator("host", "whep_host")

@@ -232,12 +232,13 @@ def test_peaks_are_measured(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.slow
 def test_counted_frames_agree_with_what_the_graph_ran(
-    renderer: SceneRenderer, take: Take, scene: SceneDocument
+    gpu: GpuContext, renderer: SceneRenderer, take: Take, scene: SceneDocument
 ) -> None:
+    """In software, kernels that write whole pictures are drawn: linearize, the real surface and first samples."""
     still = count_motion(renderer, list(steps_of("still", take, scene, 7)), 2)
     assert still.per_frame == {
-        "dispatches": 2,  # linearize and composite
-        "draws": 0,
+        "dispatches": 2 - gpu.is_software,  # linearize and composite
+        "draws": int(gpu.is_software),
         "framebuffer_clears": 0,
         "buffer_clears": 0,
         "buffer_clear_bytes": 0,
@@ -246,7 +247,9 @@ def test_counted_frames_agree_with_what_the_graph_ran(
         "uniform_writes": 0,
     }
     camera = count_motion(renderer, list(steps_of("camera", take, scene, 6)), 2)
-    assert camera.per_frame["draws"] == 2  # the objects' first samples, and a shadow map
+    assert (
+        camera.per_frame["draws"] == 2 + 3 * gpu.is_software
+    )  # the objects' first samples, and a shadow map
     assert camera.per_frame["dispatches"] > 10
     assert 0 < camera.python_ms.median <= camera.python_ms.p95
 
@@ -333,5 +336,6 @@ def test_counts_are_printed_as_table_and_as_json(capsys: pytest.CaptureFixture[s
     assert run(["bench", "counts", *OPTIONS, "--out", str(report)]) == 0
     assert "reads that wait for the GPU" in capsys.readouterr().out
     counts = json.loads(report.read_text())["methods"]["paper:cone_scale=4"]
-    assert counts["still"]["per_frame"]["dispatches"] == 2
-    assert counts["camera"]["per_frame"]["draws"] == 2
+    still = counts["still"]["per_frame"]
+    assert still["dispatches"] + still["draws"] == 2
+    assert counts["camera"]["per_frame"]["draws"] >= 2

@@ -3,7 +3,7 @@
 import gc
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.api import connections
-from deltalight.services.api.auth import WRONG_TOKENS_AT_ONCE
+from deltalight.services.api.auth import ADDRESSES_OF_TOKEN, WRONG_TOKENS_AT_ONCE
 from deltalight.services.api.credentials import SecretToken
 from deltalight.services.api.limits import REMEMBERED_CLIENTS, RateLimit
 from deltalight.services.api.settings import ApiSettings
@@ -238,6 +238,26 @@ def test_too_many_requests_are_told_when_to_come_again(tmp_path_factory: pytest.
     late = next(answer for answer in answers if answer.status_code == 429)
     assert "Too many requests" in sentence(late, 429)
     assert int(late.headers["retry-after"]) >= 1
+
+
+def test_requests_with_one_token_are_limited_whatever_addresses_they_come_from(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    with running_api(tmp_path_factory.mktemp("data"), requests_per_s=1) as running:
+        tokens = [running.store.tokens.create(name, "view") for name in ("shared", "other")]
+
+        def statuses(token: str, addresses: Iterable[int]) -> list[int]:
+            found = []
+            for last in addresses:
+                transport = httpx.HTTPTransport(local_address=f"127.0.0.{last}")
+                with httpx.Client(base_url=running.client.base_url, transport=transport) as client:
+                    found.append(client.get("/scenes", headers=bearer(token)).status_code)
+            return found
+
+        shared = statuses(tokens[0], range(2, 42))
+        assert shared[: 2 * ADDRESSES_OF_TOKEN] == [200] * (2 * ADDRESSES_OF_TOKEN)
+        assert 429 in shared
+        assert statuses(tokens[1], range(2, 4)) == [200, 200]
 
 
 def test_a_bucket_refills_and_forgets_old_clients() -> None:
