@@ -30,11 +30,12 @@ class RealSurface:
         self._fits_depth = not gpu.is_software if fits_depth is None else fits_depth
         self._fit: DepthFit | None = None  # made when asked to fit what nobody has fitted yet
         self._depth: moderngl.Texture | None = None
-        self._fitted: moderngl.Texture | None = None
+        self._slopes: tuple[moderngl.Texture, ...] = ()
         if self._fits_depth:
             self._from_depth = PictureKernel(gpu, "real_surface", FITS_DEPTH=1)
         else:
-            self._depth, self._fitted = texture_2d(gpu, size, 1, "f4"), texture_2d(gpu, size, 3, "f4")
+            self._depth, *slopes = (texture_2d(gpu, size, 1, "f4") for _ in range(3))
+            self._slopes = tuple(slopes)
             self._from_depth = PictureKernel(gpu, "real_surface")
         self._from_model = Kernel(gpu, "real_surface_model")
 
@@ -68,10 +69,11 @@ class RealSurface:
 
     def _fitted_by_cpu(self, depth: DepthImage, fitted: Callable[[], DepthSurface]) -> dict[str, Binding]:
         assert self._depth is not None
-        assert self._fitted is not None
         upload_depth(self._depth, depth)
-        self._fitted.write(np.ascontiguousarray(fitted().normals, np.float32), alignment=1)
-        return {"depth_map": self._depth, "fitted_normals": self._fitted}
+        for texture, slope in zip(self._slopes, fitted().gradient, strict=True):
+            texture.write(np.ascontiguousarray(slope), alignment=1)
+        slope_x, slope_y = self._slopes
+        return {"depth_map": self._depth, "slope_x": slope_x, "slope_y": slope_y}
 
     def from_model(
         self, raster: GeometryBuffer, scene: Bindings, *, tolerance: tuple[float, float] | None = None
@@ -97,5 +99,5 @@ class RealSurface:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.position, self.normal, self._depth, self._fitted, self._fit)
+        release_all(self.position, self.normal, self._depth, *self._slopes, self._fit)
         release_all(self._from_depth, self._from_model)

@@ -55,7 +55,11 @@ void main() {
         return;
     }
     vec3 world = world_at(pixel, z);
+#ifdef FITS_DEPTH
     vec3 fitted = fitted_normal(pixel);
+#else
+    vec3 fitted = fitted_normal(pixel, 1.0 / z);
+#endif
     bool unknown = fitted == vec3(0.0);
     vec3 normal = mat3(world_from_camera) * normalize(unknown ? -camera_at(pixel, z) : fitted);
     imageStore(position_out, pixel, vec4(world, z));

@@ -1,7 +1,13 @@
 // Normal of the depth map at a pixel, in the optical frame and towards the camera; zero where unknown. FITS_DEPTH: from
-// the plane that depth_columns fitted to its window; else `fitted_normals` holds it.
+// the plane that depth_columns fitted to its window; else from the slopes that numpy fitted.
 uniform sampler2D picture_rays;    // (x/z, y/z)
 #pragma texels rg32f picture_rays
+
+vec2 ray_at(ivec2 pixel) { return texelFetch(picture_rays, pixel, 0).xy; }
+
+// A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along (gradient by ray, w - gradient.ray).
+vec3 plane_normal(float w, vec2 gradient, vec2 ray) { return -normalize(vec3(gradient, w - dot(gradient, ray))); }
+
 #ifdef FITS_DEPTH
 uniform sampler2D inverse_depth;
 uniform sampler2D window_fits;
@@ -32,13 +38,8 @@ mat2 rays_by_pixel(ivec2 pixel) {
     return mat2(across / float(high.x - low.x), down / float(high.y - low.y));
 }
 
-vec2 ray_at(ivec2 pixel) { return texelFetch(picture_rays, pixel, 0).xy; }
-
 // Turns a change by pixel into a change by ray coordinate.
 vec2 by_ray(ivec2 pixel, vec2 slope) { return slope * inverse(rays_by_pixel(pixel)); }
-
-// A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along (gradient by ray, w - gradient.ray).
-vec3 plane_normal(float w, vec2 gradient, vec2 ray) { return -normalize(vec3(gradient, w - dot(gradient, ray))); }
 
 vec3 fitted_normal(ivec2 pixel) {
     float w = texelFetch(inverse_depth, pixel, 0).r;
@@ -47,7 +48,13 @@ vec3 fitted_normal(ivec2 pixel) {
     return known ? plane_normal(w, by_ray(pixel, slope.xy), ray_at(pixel)) : vec3(0.0);
 }
 #else
-uniform sampler2D fitted_normals;
+uniform sampler2D slope_x;   // change of w by x/z and y/z; NaN where unknown
+uniform sampler2D slope_y;
+#pragma texels r32f slope_x slope_y
 
-vec3 fitted_normal(ivec2 pixel) { return texelFetch(fitted_normals, pixel, 0).xyz; }
+// `w`: 1/z of the pixel, 1/m.
+vec3 fitted_normal(ivec2 pixel, float w) {
+    vec2 slope = vec2(texelFetch(slope_x, pixel, 0).r, texelFetch(slope_y, pixel, 0).r);
+    return isnan(slope.x) ? vec3(0.0) : plane_normal(w, slope, ray_at(pixel));
+}
 #endif
