@@ -25,8 +25,8 @@ from deltalight.render_server.gpu.kernel import (
 from deltalight.render_server.gpu.shader_source import SHADERS, declarations, shader_source
 from deltalight.render_server.gpu.texel_images import until_bracket, with_images
 from deltalight.render_server.gpu.textures import image_format, release_target
-from deltalight.render_server.view import Rectangle
 
+Box = tuple[int, int, int, int]  # x, y, width, height in pixels
 VERTEX_SHADER = """#version 430
 void main() { gl_Position = vec4(4.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1) - 1.0, 0.0, 1.0); }
 """
@@ -95,7 +95,7 @@ class _DrawnKernel(Shader):
         source = shader_source(path, {**self._gpu.defines, **defines})
         return self._shared("drawn", source, link=partial(_Drawn, self._gpu, label, source))
 
-    def draw(self, rectangle: Rectangle, /, *shared: Bindings, **own: Binding) -> None:
+    def draw(self, rectangle: Box, /, *shared: Bindings, **own: Binding) -> None:
         """Draws a rectangle of the outputs."""
         known: dict[str, Binding] = {}
         for source in (*reversed(shared), own, {"first_fragment": rectangle[:2]}):
@@ -149,7 +149,7 @@ class PictureKernel:
     def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
         self._kernel = _DrawnKernel(gpu, name, defines) if gpu.is_software else Kernel(gpu, name, **defines)
 
-    def run(self, rectangle: Rectangle, /, *shared: Bindings, **own: Binding) -> None:
+    def run(self, rectangle: Box, /, *shared: Bindings, **own: Binding) -> None:
         """Runs an invocation for each pixel of a rectangle of the outputs; the first one for that at its corner.
 
         Raises:
