@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event
+from threading import Event, Lock
 from typing import Any
 
 from deltalight.protocol.calibration import Extrinsics
@@ -120,6 +120,8 @@ class Recorder:
         self._job, self._notice = job, notice
         streams = ("stats", *RAW_STREAMS, *(() if job.composites is None else ("composite",)))
         self._queue = StreamQueue(job.all_endpoints, streams, job.keys)
+        self._followed: StreamQueue | None = None  # relit pictures of a render server that may be replaced
+        self._following = Lock()
         self._assembler = RawFrameAssembler(job.node)
         self._files = ExitStack()
         self._writer: RecordingWriter | None = None
@@ -130,6 +132,18 @@ class Recorder:
         self._node_drops_before: int | None = None
         self._started_s = self._started_cpu_s = 0.0
 
+    def follow(self, endpoint: str | None) -> None:
+        """Keep the relit pictures of this render server from now on, None = of none; any thread may call it.
+
+        Raises:
+            DeltalightError: the endpoint leaves the host without keys, or is malformed.
+        """
+        queue = None if endpoint is None else StreamQueue((endpoint,), ("composite",), self._job.keys)
+        with self._following:
+            before, self._followed = self._followed, queue
+        if before is not None:
+            before.close()
+
     def run(self, stop: Event) -> RecordStatus:
         """Record until `stop` is set or enough was recorded; without any frame no file is left.
 
@@ -137,7 +151,8 @@ class Recorder:
             DeltalightError: the disk refused; the sentence says what of the recording is readable.
         """
         try:
-            with closing(self._queue), self._files:
+            with closing(self._queue), self._files, ExitStack() as ending:
+                ending.callback(self.follow, None)
                 while not stop.is_set() and not self._is_enough():
                     self._receive(POLL_S)
                     self._check_progress()
@@ -167,7 +182,15 @@ class Recorder:
             return True
         if frame is not None:
             self._write(frame)
+        self._take_followed()
         return multipart is not None or frame is not None
+
+    def _take_followed(self) -> None:
+        """Take the pictures of the render server that is followed; none of them waits for long."""
+        with self._following:
+            queue = self._followed
+        while queue is not None and (multipart := queue.take(0)) is not None:
+            self._take_picture(multipart)
 
     def _take_rest(self) -> None:
         """Write what arrived before the end and, where relit pictures come, wait for that of the last frame."""
@@ -179,6 +202,7 @@ class Recorder:
             pass
         while awaits and self._relit.last_ns < self._last_ns and time.monotonic() < until_s:
             multipart = self._queue.take(POLL_S)
+            self._take_followed()
             if multipart is not None and bytes(multipart[0]).startswith(b"composite."):
                 self._take_picture(multipart)
 

@@ -41,7 +41,8 @@ class RecordingSession:
 class RecordingSessions:
     """Starts and stops recordings: one per node at a time, or one of whichever node is heard first.
 
-    Calls `publish(session, is_growing)` once a second for each, and once at its end.
+    Calls `publish(session, is_growing)` once a second for each, and once at its end. Relit pictures are those of the
+    `room` (directory, name), whichever render server it has; None: of the one at the first endpoint.
     """
 
     def __init__(
@@ -49,8 +50,10 @@ class RecordingSessions:
         store: RecordingStore,
         endpoints: Sequence[str],
         publish: Callable[[RecordingSession, bool], None],
+        room: tuple[str, str] | None = None,
     ) -> None:
         self._store, self._endpoints, self._publish = store, tuple(endpoints), publish
+        self._room = room
         self._running: dict[str, RecordingSession] = {}
         self._lock = Lock()
 
@@ -134,7 +137,7 @@ class RecordingSessions:
     ) -> ChildProcess:
         words = [word for endpoint in self._endpoints for word in ("--subscribe", endpoint)]
         # One of these endpoints is the render server's, and the recorder takes such pictures from all of them.
-        words += ["--composites", self._endpoints[0]] if composites else []
+        words += self._of_composites() if composites else []
         words += [] if session.node == NODE_ANY else ["--name", session.node]
         words += [] if duration_s is None else ["--duration", str(duration_s)]
         attached = None if scene is None else _scene_file(scene)
@@ -149,6 +152,12 @@ class RecordingSessions:
         return ChildProcess(
             *command, on_line=lambda child, line: self._note(session, child, line), on_end=end
         )
+
+    def _of_composites(self) -> list[str]:
+        if self._room is None:
+            return ["--composites", self._endpoints[0]]
+        directory, name = self._room
+        return ["--rooms", directory, "--room", name]
 
     def _note(self, session: RecordingSession, child: ChildProcess, line: str) -> None:
         """Parse the recorder's output, one line a second; its standard error explains why no frame arrives."""

@@ -230,7 +230,12 @@ class _Builder:
             tickets=self._tickets,
             recordings=self._recordings,
             videos=self._videos,
-            recording_sessions=RecordingSessions(self._recordings, endpoints, publish_recording),
+            recording_sessions=RecordingSessions(
+                self._recordings,
+                endpoints,
+                publish_recording,
+                None if self._settings.rooms is None else (self._settings.rooms, room),
+            ),
             replay=replay,
             snapshots=self._snapshots,
             settings=self._settings,

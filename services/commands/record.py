@@ -45,6 +45,16 @@ def record(
             help="Endpoint of the render server whose relit pictures are kept too, beside the frames."
         ),
     ] = None,
+    rooms: Annotated[
+        str | None,
+        typer.Option(help="Directory of rooms (`up --rooms`), to keep the relit pictures of --room."),
+    ] = None,
+    room: Annotated[
+        str | None,
+        typer.Option(
+            help="Room of --rooms whose relit pictures are kept too, whichever render server it has."
+        ),
+    ] = None,
     duration: Annotated[float | None, typer.Option(min=0.1, help="Stop after this many seconds.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
     config_file: ConfigFile = None,
@@ -63,7 +73,7 @@ def record(
 
     settings = load_configuration(config_file).section("keys", KeySettings)
     places = node_endpoints(subscribe, node, settings)
-    keys = settings.load([*places, *(each for each in (control, composites) if each is not None)])
+    keys = settings.load([*places, *(each for each in (control, composites, rooms) if each is not None)])
     job = RecordJob(
         out,
         tuple(places),
@@ -78,7 +88,27 @@ def record(
     console = Console(stderr=True, soft_wrap=True)
     recorder = Recorder(job, lambda sentence: console.print(sentence, markup=False, highlight=False))
     shown = _progress_lines() if progress else _progress_on(console)
-    _run(recorder, shown, lambda status: _print_summary(status, as_json=as_json))
+    with _following(recorder, rooms, room, keys):
+        _run(recorder, shown, lambda status: _print_summary(status, as_json=as_json))
+
+
+@contextmanager
+def _following(
+    recorder: "Recorder", directory: str | None, room: str | None, keys: "Keys | None"
+) -> Iterator[None]:
+    """Have the recorder keep the relit pictures of a room, if one is named, whichever render server it has."""
+    from deltalight.protocol.errors import DeltalightError
+    from deltalight.services.rooms.follower import following
+
+    if (directory is None) != (room is None):
+        raise DeltalightError(
+            "--rooms and --room belong together: give the directory of rooms and one of its rooms."
+        )
+    if directory is None or room is None:
+        yield
+        return
+    with following(directory, room, keys, recorder.follow):
+        yield
 
 
 def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":

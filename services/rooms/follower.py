@@ -1,13 +1,17 @@
 """Follows the directory of rooms: the newest endpoints of each room, and no older ones."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from typing import Protocol
 
 import structlog
 
+from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys
 from deltalight.protocol.message_fields import as_sentence
+from deltalight.services.rooms.directory import DirectoryClient
 from deltalight.services.rooms.status import RoomEndpoints, RoomList
 
 POLL_INTERVAL_S = 0.2
@@ -103,3 +107,32 @@ class RoomFollower:
                 if self.is_answered:
                     log.warning("the directory of rooms does not answer", fault=str(fault))
                 self.is_answered = False
+
+
+@contextmanager
+def following(
+    directory: str, room: str, keys: Keys | None, use: Callable[[str | None], None]
+) -> Iterator[None]:
+    """Call `use` with the endpoint at which a room's render server publishes, now and whenever it is another.
+
+    Raises:
+        DeltalightError: the directory does not answer, or has no such room.
+    """
+    client = DirectoryClient(directory, keys)
+
+    def follow(name: str, endpoints: RoomEndpoints | None) -> None:
+        if name == room:
+            use(None if endpoints is None else endpoints.publish)
+
+    with closing(client):
+        follower = RoomFollower(client, follow)
+        follower.look()
+        names = [each.name for each in follower.newest.rooms]
+        if room not in names:
+            known = nearest(room, names) or ", ".join(names) or "none"
+            raise DeltalightError(f"there is no room {room[:80]}; did you mean {known}?")
+        follower.start()
+        try:
+            yield
+        finally:
+            follower.close()

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +31,9 @@ from deltalight.protocol.source import open_source
 from deltalight.services import ports, recorder
 from deltalight.services.cli import app
 from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
+from deltalight.services.rooms.directory import DirectoryServer
+from deltalight.services.rooms.follower import following
+from deltalight.services.rooms.keeper import RoomKeeper
 from deltalight.services.stream_queue import StreamQueue
 from tests.services.conftest import ROOT, RunCli
 from tests.services.record_samples import (
@@ -44,6 +47,7 @@ from tests.services.record_samples import (
     messages,
     write,
 )
+from tests.services.room_samples import StandInPlacer, plans, running
 
 PATIENCE_S = 60
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -268,6 +272,59 @@ def test_relit_pictures_are_kept_with_their_frames(
     shown = cli("recordings", "info", tmp_path / "a.mcap").stdout
     assert f"relit pictures │ {status.composites}" in " ".join(shown.split())
     assert running.status.as_dict()["composites"] == status.composites
+
+
+def test_relit_pictures_of_a_room_go_on_when_another_render_server_takes_it_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "SILENCE_S", PATIENCE_S)
+    node, placer = Publisher("tcp://127.0.0.1:*"), StandInPlacer()
+    keeper = RoomKeeper(plans(tmp_path, "hall", "door"), placer)
+    directory = ports.endpoint(ports.private_ports(1)[0])
+    running(keeper, placer, "hall", "door")
+    server = Publisher(placer.of("hall").publish)
+    shown: list[int] = []
+    with (
+        closing(DirectoryServer(directory, keeper)),
+        recording(RecordJob(tmp_path / "a.mcap", (node.endpoint,))) as (made, _, end),
+        following(directory, "hall", None, made.follow),
+    ):
+        for frame in frames(400):
+            if frame.frame_id == 150:
+                server.close()
+                placer.lose("hall")
+                running(keeper, placer, "hall")
+                server = Publisher(placer.of("hall").publish)
+            for multipart in messages(frame).values():
+                node.send(multipart)
+            server.send(composite(frame))
+            time.sleep(0.01)
+            if made.status.composites > len(shown):
+                shown.append(frame.frame_id)
+            if shown and shown[-1] > 200:
+                break
+    node.close()
+    server.close()
+    assert end.result().frames > 150
+    kept = [number for number, frame in enumerate(open_source(tmp_path / "a.mcap")) if frame.composite]
+    assert min(shown) < 150 < max(shown)
+    assert len(kept) == made.status.composites
+
+
+def test_a_room_to_record_is_one_of_a_directory_that_answers(cli: RunCli, tmp_path: Path) -> None:
+    directory, out = ports.endpoint(ports.private_ports(1)[0]), tmp_path / "a.mcap"
+    nobody = ("--subscribe", ports.endpoint(ports.private_ports(1)[0]))
+
+    def refused(*options: str) -> str:
+        answer = cli("record", "--out", out, *nobody, *options)
+        assert answer.returncode == 2
+        return answer.stderr
+
+    assert "belong together" in refused("--room", "hall")
+    assert "does not answer" in refused("--rooms", directory, "--room", "hall")
+    with closing(DirectoryServer(directory, RoomKeeper(plans(tmp_path, "hall"), StandInPlacer()))):
+        assert "did you mean hall?" in refused("--rooms", directory, "--room", "hal")
+    assert not out.exists()
 
 
 def test_a_node_that_goes_and_comes_back_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
