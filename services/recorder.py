@@ -151,8 +151,7 @@ class Recorder:
             DeltalightError: the disk refused; the sentence says what of the recording is readable.
         """
         try:
-            with closing(self._queue), self._files, ExitStack() as ending:
-                ending.callback(self.follow, None)
+            with closing(self._queue), self._files:
                 while not stop.is_set() and not self._is_enough():
                     self._receive(POLL_S)
                     self._check_progress()

@@ -330,9 +330,7 @@ class Shader(ABC):
 
     def _bound(self, own: Bindings, shared: Sequence[Bindings]) -> tuple[Program, Bindings]:
         """Returns the program that the bindings choose, with everything bound, and what each name is bound to."""
-        known: dict[str, Binding] = {}
-        for source in (*reversed(shared), own):
-            known.update(source)
+        known = merged(own, shared)
         program = self._chosen(known)
         program.bind(own, known)
         return program, known
@@ -456,6 +454,14 @@ class RasterKernel(Shader):
 def _attachments(target: moderngl.Framebuffer) -> dict[str, object]:
     items = [*target.color_attachments, target.depth_attachment]
     return {f"attachment {number}": item for number, item in enumerate(items)}
+
+
+def merged(own: Bindings, shared: Sequence[Bindings]) -> dict[str, Binding]:
+    """Returns what each name is bound to: `own` takes precedence, then `shared` in order."""
+    known: dict[str, Binding] = {}
+    for source in (*reversed(shared), own):
+        known.update(source)
+    return known
 
 
 def label_of(name: str | Path, defines: Mapping[str, float | str]) -> str:

@@ -21,6 +21,7 @@ from deltalight.render_server.gpu.kernel import (
     Program,
     Shader,
     label_of,
+    merged,
 )
 from deltalight.render_server.gpu.shader_source import SHADERS, declarations, shader_source
 from deltalight.render_server.gpu.texel_images import until_bracket, with_images
@@ -33,7 +34,7 @@ void main() { gl_Position = vec4(4.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1) -
 _PRAGMA = re.compile(r"#pragma outputs (.+)")
 _LOCAL_SIZE = re.compile(r"layout\(local_size[^)]*\) in;")
 _OUTPUT = r"layout\(\w+\) writeonly uniform ([iu]?)image2D {};"
-_BUILT_IN: Final = {  # of a compute shader, in a fragment shader; those after the first are read by nobody there
+_BUILT_IN: Final = {  # of a compute shader, in a fragment shader; nobody reads those after the first there
     "gl_GlobalInvocationID": "uvec3(uvec2(gl_FragCoord.xy) - uvec2(first_fragment), 0u)",
     "gl_WorkGroupID": "uvec3(0u)",
     "gl_NumWorkGroups": "uvec3(1u)",
@@ -97,9 +98,7 @@ class _DrawnKernel(Shader):
 
     def draw(self, rectangle: Box, /, *shared: Bindings, **own: Binding) -> None:
         """Draws a rectangle of the outputs."""
-        known: dict[str, Binding] = {}
-        for source in (*reversed(shared), own, {"first_fragment": rectangle[:2]}):
-            known.update(source)
+        known = merged({**own, "first_fragment": rectangle[:2]}, shared)
         program = self._chosen(known)
         assert isinstance(program, _Drawn)
         outputs = {name: self._output(name, wanted, known) for name, wanted in program.outputs.items()}

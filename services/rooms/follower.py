@@ -115,6 +115,8 @@ def following(
 ) -> Iterator[None]:
     """Call `use` with the endpoint at which a room's render server publishes, now and whenever it is another.
 
+    None = it has none; so it is told at the end.
+
     Raises:
         DeltalightError: the directory does not answer, or has no such room.
     """
@@ -136,3 +138,4 @@ def following(
             yield
         finally:
             follower.close()
+            use(None)

@@ -166,3 +166,22 @@ def test_programs_free_the_textures_through_which_they_read_buffers(
     assert is_texture(name)
     kernel.release()
     assert not is_texture(name)
+
+
+@pytest.mark.parametrize("divisor", [1, 2, 3, 5, 7, 16, 63, 64, 100, 640, 1279, 3840])
+def test_quotients_by_floats_are_those_of_integers(make: MakeKernel, gpu: GpuContext, divisor: int) -> None:
+    """Around multiples, where rounding would show, up to the pixels of 4K and the voxels of 512 an edge."""
+    top = min(divisor << 21, 512**3)
+    some = np.linspace(0, top // divisor, 40, dtype=int) * divisor
+    dividends = np.unique(np.clip([some - 1, some, some + divisor - 1], 0, top)).astype(np.int32)
+    given, found = (gpu.ctx.buffer(dividends.tobytes()) for _ in range(2))
+    kernel = make(
+        "layout(std430) readonly buffer Given { int given[]; };\n"
+        "layout(std430) writeonly buffer Found { int found[]; };\n"
+        'uniform int divisor;\n#include "common/quotient.glsl"\n',
+        "int i = int(gl_GlobalInvocationID.x); found[i] = quotient(given[i], divisor); values[0] = 0.0;",
+    )
+    kernel.run((len(dividends),), Out=gpu.discarded_buffer, Given=given, Found=found, divisor=divisor)
+    assert np.array_equal(np.frombuffer(found.read(), np.int32), dividends // divisor)
+    given.release()
+    found.release()

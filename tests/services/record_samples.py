@@ -14,7 +14,7 @@ from deltalight.benchmarks.speed.motions import STANDING
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.envelope import encode
+from deltalight.protocol.envelope import decode, encode
 from deltalight.protocol.frames import BoardPose, SensorFrame
 from deltalight.protocol.messages import CompositeMessage
 from deltalight.protocol.pictures import depth_from_steps
@@ -30,6 +30,7 @@ from deltalight.sensor_node.frame_messages import (
     pose_multipart,
 )
 from deltalight.services.demo import RECORDING
+from deltalight.services.stream_queue import StreamQueue
 from tests.protocol.fisheye_samples import coded
 
 WIDTH, HEIGHT = 64, 48
@@ -185,3 +186,26 @@ def feeding(*, relights: bool = False) -> Iterator[tuple[str, Feed]]:
     finally:
         feed.close()
         publisher.close()
+
+
+class Published:
+    """What a node publishes, watched by another subscriber: capture times by frame number."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.captured_ns: dict[int, int] = {}
+        self._queue = StreamQueue([endpoint], ["color"])
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._queue.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            multipart = self._queue.take(0.1)
+            if multipart is not None:
+                header = decode(multipart)[0]
+                self.captured_ns[header.frame_id] = header.capture_ns

@@ -20,7 +20,6 @@ import pytest
 from typer.testing import CliRunner
 
 from deltalight.protocol.calibration import Extrinsics, save_extrinsics_yaml
-from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.pictures import depth_from_steps
@@ -34,12 +33,12 @@ from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.follower import following
 from deltalight.services.rooms.keeper import RoomKeeper
-from deltalight.services.stream_queue import StreamQueue
 from tests.services.conftest import ROOT, RunCli
 from tests.services.record_samples import (
     BOARD,
     HEIGHT,
     WIDTH,
+    Published,
     camera,
     composite,
     feeding,
@@ -97,29 +96,6 @@ def wait_for(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < deadline_s
         time.sleep(0.02)
-
-
-class Published:
-    """What a node publishes, watched by another subscriber: capture times by frame number."""
-
-    def __init__(self, endpoint: str) -> None:
-        self.captured_ns: dict[int, int] = {}
-        self._queue = StreamQueue([endpoint], ["color"])
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._queue.close()
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            multipart = self._queue.take(0.1)
-            if multipart is not None:
-                header = decode(multipart)[0]
-                self.captured_ns[header.frame_id] = header.capture_ns
 
 
 @pytest.mark.slow

@@ -182,14 +182,14 @@ void add_blocker(float d, inout Blocking found) {
     found = Blocking(found.sum + d, found.hits + 1.0, max(found.deepest, d));
 }
 
-// Of a disc: at a shift, only depths below a limit that falls with it are within the light's area, of the map's too. Each
-// sample is the one before, turned and moved outwards.
+// Of a disc. What lies within the light's area at a shift is nearer the light by an amount that grows with the shift: in the map's own
+// depth, below a limit that falls linearly. Each sample is the one before, turned and moved outwards.
 void add_disc_blockers(sampler2D map, Spread k, LightView view, Receiver r, int count, inout Blocking found) {
     float near = view.range.x, far = view.range.y, texels = 0.5 * view.tile.z / view.tile.w;
     float widest = count == 1 ? 0.0 : k.widest * drift(view, r.depth, near);
     float slope = (view.range.z > 0.5 ? 1.0 : near * far) / ((far - near) * max(k.widest, 1e-12));
     float nearer = min(map_depth(view, r.depth - r.bias), 1.0);
-    float limit = map_depth(view, r.depth) + slope * 0.5 / texels;   // of half a texel less
+    float limit = map_depth(view, r.depth) + slope * 0.5 / texels;   // a shift counts beyond half a texel
     vec2 low = view.tile.xy, high = low + view.tile.z, centre = low + 0.5 * view.tile.z + texels * r.s;
     vec2 turn = vec2(cos(GOLDEN_ANGLE), sin(GOLDEN_ANGLE)), direction = vec2(1.0, 0.0);
     float apart = widest / float(count), shift = 0.5 * apart;
