@@ -12,8 +12,9 @@ import time
 import uuid
 from collections import deque
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from deltalight.protocol.clock import CLOCK_OP
 from deltalight.protocol.envelope import decode
@@ -29,6 +30,8 @@ ANSWER_TIMEOUT_S = 1.0
 LATE_AFTER_S = 3.0  # reports come each second; whoever is late is asked
 REMEMBERED_GAPS = 10
 WORKING_SHARE = 0.02  # of a core; waiting threads take less
+DEAF_ON_GPU_S = 60.0  # the driver links the largest shader within some seconds
+LONGEST_FRAME_ON_GPU_S = 300.0
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,8 @@ class Patience:
     """How long signs of life may stay away, in seconds.
 
     Without any sign: `times` the longest time between the last reports, at least `floor_s`; `start_s` before the
-    first report. Working, but neither reporting nor answering: `deaf_s`, longer than a server's longest command.
-    Answering, but not reporting: `longest_frame_s`.
+    first report. Working, but neither reporting nor answering: `deaf_s`, longer than a server's longest call of the
+    driver. Answering, but not reporting: `longest_frame_s`.
     """
 
     times: float = 10.0
@@ -45,6 +48,10 @@ class Patience:
     start_s: float = 120.0
     deaf_s: float = 300.0
     longest_frame_s: float = 1800.0
+
+    def on_gpu(self) -> "Patience":
+        """Return that for a GPU, which needs no minutes for a kernel or a frame; its driver spins where it hangs."""
+        return replace(self, deaf_s=DEAF_ON_GPU_S, longest_frame_s=LONGEST_FRAME_ON_GPU_S)
 
 
 @dataclass
@@ -80,7 +87,7 @@ class Heartbeat:
             return f"gave no sign of life for {silent_s:.0f} s"
         if unanswered_s > max(self.patience.deaf_s, self._allowed_s()):
             return f"neither reported nor answered for {unanswered_s:.0f} s"
-        if unreported_s > self.patience.longest_frame_s:
+        if unreported_s > max(self.patience.longest_frame_s, self._allowed_s()):
             return f"finished nothing for {unreported_s:.0f} s"
         return None
 
@@ -110,6 +117,7 @@ class Watchdog:
         self._client = RequestClient(control, keys=keys)
         self._receiver = Receiver([reports], ["stats"], keys=keys)
         self._closing = threading.Event()
+        self._knows_device = False
         self.newest: StatsMessage | None = None  # report
         self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
         self._thread.start()
@@ -133,6 +141,8 @@ class Watchdog:
                 heartbeat.note_report(time.monotonic())
                 for multipart in reports.values():
                     self._keep(multipart)
+                if not self._knows_device:
+                    self._learn_device()
             elif heartbeat.unreported_s(time.monotonic()) > LATE_AFTER_S:
                 self._examine()
 
@@ -144,15 +154,22 @@ class Watchdog:
     def _examine(self) -> None:
         if self._use.grew():
             self._heartbeat.worked_s = time.monotonic()
-        if self._answers():
+        if self._answer(CLOCK_OP) is not None:
             self._heartbeat.answered_s = time.monotonic()
 
-    def _answers(self) -> bool:
-        request = ControlRequest(node="supervisor", id=uuid.uuid4().hex, op=CLOCK_OP)
+    def _learn_device(self) -> None:
+        answer = self._answer("stats")
+        self._knows_device = answer is not None
+        if answer is not None and answer.get("is_software") is False:
+            self._heartbeat.patience = self._heartbeat.patience.on_gpu()
+
+    def _answer(self, op: str) -> dict[str, Any] | None:
+        request = ControlRequest(node="supervisor", id=uuid.uuid4().hex, op=op)
         try:
-            return self._client.request(request, ANSWER_TIMEOUT_S).error is None
+            reply = self._client.request(request, ANSWER_TIMEOUT_S)
         except DeltalightError:
-            return False
+            return None
+        return reply.payload if reply.error is None else None
 
 
 class ProcessorUse:

@@ -33,6 +33,7 @@ from deltalight.protocol.messages import (
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.protocol.subscriber import ReceivedMultipart
+from deltalight.render_server.gpu.context import is_software_renderer
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.cameras import RoomCameras, Taken
 from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceOrder
@@ -283,7 +284,7 @@ class RenderSession:
             "room": self._room,
             "snapshot": self._snapshot,
             "set_source": self._set_source,
-            "stats": lambda _: {"stats": self.stats().model_dump(mode="json")},
+            "stats": self._stats,
             "gl_objects": lambda _: dict(self._count_objects()),
             "shutdown": self._shut_down,
         }
@@ -293,13 +294,12 @@ class RenderSession:
         return commands[request.op](request)
 
     def _ping(self, _request: ControlRequest) -> dict[str, object]:
-        epoch = {} if self._epoch is None else {"epoch": self._epoch}
-        return {
-            "scene_id": self.scene_id,
-            "revision": self.scene.revision,
-            "instance": self.instance,
-            **epoch,
-        }
+        shown = {"scene_id": self.scene_id, "revision": self.scene.revision, "instance": self.instance}
+        return shown if self._epoch is None else {**shown, "epoch": self._epoch}
+
+    def _stats(self, _request: ControlRequest) -> dict[str, object]:
+        is_software = is_software_renderer(self._renderer_name)
+        return {"stats": self.stats().model_dump(mode="json"), "is_software": is_software}
 
     def _set_view(self, request: ControlRequest) -> dict[str, object]:
         """Changes the view; the sender of the previous scene does not know the result, so its id is dropped."""

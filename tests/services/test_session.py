@@ -313,9 +313,10 @@ def test_other_commands(session: RenderSession) -> None:
         "revision": 3,
         "instance": session.instance,
     }
-    stats = session.execute(request("stats"))["stats"]
-    assert isinstance(stats, dict)
+    answer = session.execute(request("stats"))
+    assert isinstance(stats := answer["stats"], dict)
     assert stats["detail"] == "abacus"
+    assert answer["is_software"] is False
     with pytest.raises(DeltalightError, match="did you mean shutdown"):
         session.execute(request("shutdwn"))
     session.execute(request("shutdown"))

@@ -67,6 +67,25 @@ def test_a_process_that_works_or_answers_has_longer() -> None:
     assert busy.fault(1803) == "finished nothing for 1801 s"
 
 
+def test_a_gpu_needs_no_minutes_for_one_call_or_frame() -> None:
+    spinning = heartbeat(1, 2)
+    spinning.patience = PATIENCE.on_gpu()
+    spinning.worked_s = 61
+    assert spinning.fault(61.9) is None
+    assert spinning.fault(63) == "neither reported nor answered for 61 s"
+    spinning.answered_s = 302
+    assert spinning.fault(301) is None
+    assert spinning.fault(303) == "finished nothing for 301 s"
+
+
+def test_slow_frames_are_waited_for_on_a_gpu_too() -> None:
+    slow = heartbeat(1, 41)
+    slow.patience = PATIENCE.on_gpu()
+    slow.worked_s = 441
+    assert slow.fault(440) is None
+    assert slow.fault(442) == "neither reported nor answered for 401 s"
+
+
 def test_processor_time_is_that_of_the_process() -> None:
     before_s = processor_time_s(os.getpid())
     while time.process_time() < before_s + 0.1:
@@ -75,17 +94,21 @@ def test_processor_time_is_that_of_the_process() -> None:
     assert processor_time_s(2**22 + 1) == 0.0  # beyond the highest id
 
 
-@pytest.fixture
-def answering() -> Iterator[ReplyServer]:
-    server = ReplyServer("tcp://127.0.0.1:*", lambda _request: {})
-    yield server
+@pytest.fixture(params=[True, False], ids=["software", "gpu"])
+def answering(request: pytest.FixtureRequest) -> Iterator[tuple[ReplyServer, Patience]]:
+    """A server that says on what it renders, and the patience that it needs."""
+    server = ReplyServer("tcp://127.0.0.1:*", lambda _request: {"is_software": request.param})
+    yield server, PATIENCE if request.param else PATIENCE.on_gpu()
     server.close()
 
 
-def test_answers_and_reports_are_heard(answering: ReplyServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_and_reports_are_heard(
+    answering: tuple[ReplyServer, Patience], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, needed = answering
     monkeypatch.setattr("deltalight.services.watchdog.LATE_AFTER_S", 0.0)
     publisher = Publisher("tcp://127.0.0.1:*")
-    watchdog = Watchdog(os.getpid(), publisher.endpoint, answering.endpoint, patience=PATIENCE)
+    watchdog = Watchdog(os.getpid(), publisher.endpoint, server.endpoint, patience=PATIENCE)
     heard, began_s = watchdog._heartbeat, time.monotonic()
     while heard.reported_s is None or heard.answered_s <= began_s:
         publisher.send(encode(StatsMessage(node="server", capture_ns=1, state="running", frame_id=0)))
@@ -94,6 +117,7 @@ def test_answers_and_reports_are_heard(answering: ReplyServer, monkeypatch: pyte
     watchdog.close()
     publisher.close()
     assert watchdog.fault() is None
+    assert heard.patience == needed
 
 
 def test_a_stopped_process_is_killed_and_started_again() -> None:
