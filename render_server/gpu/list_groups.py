@@ -28,6 +28,14 @@ def list_threads(gpu: GpuContext, longest: int | None = None) -> int:
     return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
 
 
+def map_threads(gpu: GpuContext, side: int) -> int:
+    """Returns the number of threads for walking a square map of `side` texels.
+
+    In software these are whole rows, so that a thread's next texel lies near its last one.
+    """
+    return side * max(1, SOFTWARE_WALKERS // side) if gpu.is_software else list_threads(gpu, side**2)
+
+
 class ListGroups:
     """Counts the workgroups that walk a list of shaders/common/work_list.glsl, for `Kernel.run_counted`."""
 

@@ -5,7 +5,7 @@ import moderngl
 from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import list_threads
+from deltalight.render_server.gpu.list_groups import list_threads, map_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
@@ -61,21 +61,16 @@ class SplitInjection:
         """Injects all lights; `scene` brings the objects' materials."""
         for store in (real, virtual):
             clear_buffer(self._gpu, store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4)
-        sums: Bindings = {
-            **real.bindings,
-            "RealLight": real.delta_sums,
-            "VirtualGrid": virtual.grid,
-            "VirtualLight": virtual.delta_sums,
-            "real_albedo": real_albedo,
-        }
-        threads = (list_threads(self._gpu, lights.tile_size**2),)
+        real_sums: Bindings = {**real.bindings, "Sums": real.delta_sums, "real_albedo": real_albedo}
+        virtual_sums: Bindings = {**virtual.bindings, "Sums": virtual.delta_sums}
+        threads = (map_threads(self._gpu, lights.tile_size),)
         for real_views, virtual_views in lights.views_of_lights:
             for view in real_views:
-                self._real.run(threads, sums, scene, view_index=view)
+                self._real.run(threads, real_sums, scene, view_index=view)
             for view in virtual_views:
-                self._virtual.run(threads, sums, scene, view_index=view)
-            for store in (real, virtual):
-                self._divide.run((self._threads,), store.bindings, Light=store.delta_sums)
+                self._virtual.run(threads, virtual_sums, scene, view_index=view)
+            for sums, of_objects in ((real_sums, False), (virtual_sums, True)):
+                self._divide.run((self._threads,), sums, of_objects=of_objects)
 
     def release(self) -> None:
         """Frees the programs."""

@@ -15,9 +15,7 @@
 #include "common/map_texels.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430) buffer RealLight { int real_light[]; };         // per slot, below
-layout(std430) readonly buffer VirtualGrid { uint virtual_grid[]; };
-layout(std430) buffer VirtualLight { int virtual_light[]; };
+layout(std430) buffer Sums { int sums[]; };   // per slot of the set that is walked (split_sums.glsl)
 uniform sampler2D real_albedo;
 uniform sampler2D real_light_normal;
 uniform sampler2D virtual_light_uv;
@@ -27,27 +25,22 @@ uniform sampler2D virtual_light_normal;
 uniform int view_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 
-const bool REAL_SET = true, VIRTUAL_SET = false;
 const float SNAP = 0.25;   // voxels: a surface on the border of two voxels belongs to the one that it touched
 // Voxels: what lies just above a border (ABOVE_BORDERS of passes/volumes.py) stays there in spite of a map's rounding:
 // rasterisers snap corners of triangles to 1/256 of a texel.
 const float ABOVE_ROUNDING = 0.01;
 
-uint grid_at(bool real_set, ivec3 voxel) {
-    uint i = voxel_index(voxel, volume_size);
-    return real_set ? grid[i] : virtual_grid[i];
-}
+uint entry_at(vec3 q) { return inside_volume(q) ? grid[voxel_index(ivec3(q), volume_size)] : 0u; }
 
 // Slot of the touched voxel at q, a hair above, or next to it, -1 if there is none.
-int slot_near(bool real_set, vec3 q) {
-    for (int j = -1; j < 8; ++j) {
-        vec3 corner = j < 0 ? vec3(0.0) : vec3(j & 1, (j >> 1) & 1, j >> 2) * 2.0 - 1.0;
-        vec3 at = q + ABOVE_ROUNDING + SNAP * corner;
-        if (!inside_volume(at)) continue;
-        uint entry = grid_at(real_set, ivec3(at));
-        if (entry != 0u) return int(entry) - 1;
-    }
-    return -1;
+int slot_near(vec3 q) {
+    uint entry = entry_at(q + ABOVE_ROUNDING);
+    int j = 0;
+    if (entry == 0u) do {
+        vec3 corner = vec3(j & 1, (j >> 1) & 1, j >> 2) * 2.0 - 1.0;
+        entry = entry_at(q + ABOVE_ROUNDING + SNAP * corner);
+    } while (entry == 0u && ++j < 8);
+    return int(entry) - 1;
 }
 
 // Where thousands of texels share a face of a voxel, each brings a few steps of fixed point, and all the same error of
@@ -60,19 +53,38 @@ void choose_rounding(LightView view, ivec2 texel, float depth) {
     even = across * across > MANY ? even_noise(vec2(texel)) : -1.0;
 }
 
-void add(bool real_set, int at, float amount) {
-    int part = even < 0.0 ? fixed_point(amount) : int(floor(amount * FIXED_POINT + even));
-    if (real_set) atomicAdd(real_light[at], part); else atomicAdd(virtual_light[at], part);
+int rounded(float amount) { return even < 0.0 ? fixed_point(amount) : int(floor(amount * FIXED_POINT + even)); }
+
+// Sums of the texels of one voxel that a thread comes to one after another: one addition to memory for all of them.
+int held_slot = -1;
+ivec3 held_delta = ivec3(0), held_rho = ivec3(0);
+int held_area = 0;
+
+void add_held() {
+    if (held_slot < 0) return;
+    int at = held_slot * LIGHT_SUMS;
+    for (int j = 0; j < 3; ++j) {
+#ifndef VIRTUAL   // what objects gain in V_delta is what they gain in V_rho (split_radiance)
+        atomicAdd(sums[at + DELTA + j], held_delta[j]);
+#endif
+        atomicAdd(sums[at + RHO + j], held_rho[j]);
+    }
+    atomicAdd(sums[at + AREA], held_area);
 }
 
 // Flux and area per voxel face, so that fixed point serves every scale.
-void add_flux(bool real_set, int slot, int volume, vec3 flux) {
-    for (int j = 0; j < 3; ++j)
-        add(real_set, slot * LIGHT_SUMS + volume + j, flux[j] / (PI * voxel_edge * voxel_edge));
-}
-
-void add_area(bool real_set, int slot, float area) {
-    add(real_set, slot * LIGHT_SUMS + AREA, area / (voxel_edge * voxel_edge));
+void hold(int slot, bool shadowed, vec3 flux, float area) {
+    if (slot != held_slot) {
+        add_held();
+        held_slot = slot;
+        held_delta = held_rho = ivec3(0);
+        held_area = 0;
+    }
+    float face = voxel_edge * voxel_edge;
+    vec3 shares = flux / (PI * face);
+    ivec3 parts = ivec3(rounded(shares.r), rounded(shares.g), rounded(shares.b));
+    if (shadowed) held_delta -= parts; else held_rho += parts;
+    held_area += rounded(area / face);
 }
 
 #ifdef VIRTUAL
@@ -91,13 +103,11 @@ void split(Light light, LightView view, ivec2 texel) {
     choose_rounding(view, texel, depth);
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;
-    int slot = slot_near(VIRTUAL_SET, volume_coordinate(p));
+    int slot = slot_near(volume_coordinate(p));
     if (slot < 0) return;
     vec3 flux = texel_light(light, view, s) * virtual_albedo(texel);
-    add_flux(VIRTUAL_SET, slot, DELTA, flux);
-    add_flux(VIRTUAL_SET, slot, RHO, flux);
     vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
-    add_area(VIRTUAL_SET, slot, lit_area(light, view, s, p, n));
+    hold(slot, false, flux, lit_area(light, view, s, p, n));
 }
 #else
 bool is_wanted(LightView view, ivec2 texel) {
@@ -110,14 +120,13 @@ void split(Light light, LightView view, ivec2 texel) {
     float depth = first_depth(real_light_depth, view, texel);
     vec3 p = ray_point(view, s, depth);
     choose_rounding(view, texel, depth);
-    int slot = slot_near(REAL_SET, volume_coordinate(p));
+    int slot = slot_near(volume_coordinate(p));
     if (slot < 0) return;
     Hit object = first_hit(virtual_light_depth, light.views.z, light.views.w, p);
     bool shadowed = object.present && object.depth <= object.ray_depth + bias_real;
     vec3 flux = texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb;
-    add_flux(REAL_SET, slot, shadowed ? DELTA : RHO, shadowed ? -flux : flux);
     vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
-    add_area(REAL_SET, slot, lit_area(light, view, s, p, n));
+    hold(slot, shadowed, flux, lit_area(light, view, s, p, n));
 }
 #endif
 
@@ -129,4 +138,5 @@ void main() {
         split(light, view, map_texel(view, i));
         i = next_wanted(view, i + items_apart());
     } while (i < texels_of(view));
+    add_held();
 }

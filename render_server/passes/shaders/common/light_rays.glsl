@@ -35,15 +35,18 @@ float intensity_towards(Light light, vec3 d) {
     return is_rectangle(light) ? max(dot(d, normal_area), 0.0) : spot_fraction(light, d);
 }
 
+// Cosine between a texel's ray and the view's axis.
+float cosine_to_axis(vec2 s) { return inversesqrt(1.0 + dot(s, s)); }
+
 // Light of a texel's rays before any reflection: I dW, or E_perp A (no cosine: a tilted surface receives the same
 // rays on a larger area).
 vec3 texel_light(Light light, LightView view, vec2 s) {
     float side = 2.0 * view.tile.w / view.tile.z;
     vec3 parallel_rays = light.color.rgb * side * side;
     if (view.range.z > 0.5) return parallel_rays;
-    float slant2 = 1.0 + dot(s, s);
-    vec3 d = transpose(mat3(view.view_from_world)) * vec3(s, 1.0) * inversesqrt(slant2);
-    return parallel_rays * pow(slant2, -1.5) * intensity_towards(light, d);
+    float straight = cosine_to_axis(s);
+    vec3 d = transpose(mat3(view.view_from_world)) * vec3(s, 1.0) * straight;
+    return parallel_rays * straight * straight * straight * intensity_towards(light, d);
 }
 
 vec3 direction_to_light(Light light, vec3 p) {
@@ -59,7 +62,8 @@ float lit_area(Light light, LightView view, vec2 s, vec3 p, vec3 n) {
     float side = 2.0 * view.tile.w / view.tile.z, across = side * side;
     if (view.range.z < 0.5) {
         vec3 way = p - ray_point(view, s, 0.0);
-        across *= dot(way, way) * pow(1.0 + dot(s, s), -1.5);
+        float straight = cosine_to_axis(s);
+        across *= dot(way, way) * straight * straight * straight;
     }
     return across / max(abs(dot(n, direction_to_light(light, p))), LEAST_COSINE);
 }
