@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.services.rooms_installation import Installation, settled, started, wait_for
+from deltalight.benchmarks.rooms.installation import Installation, settled, started
+from deltalight.benchmarks.rooms.processes import wait_for
 
 pytestmark = pytest.mark.slow(seconds=20)
 KILLS = 20
@@ -28,7 +29,7 @@ def test_a_killed_room_returns_with_an_equal_picture_and_the_other_goes_on(
     assert before != hall, "the object was moved, and is not seen"
     other = installation.server("hall")
     frames, restarts = installation.frames("hall"), installation.room("hall").restarts
-    installation.wait_for_spare()
+    installation.wait_for_spares()
     gap = installation.kill("door")
     with capsys.disabled():
         print(f"\na killed room was away for {gap}")
@@ -48,10 +49,10 @@ def test_a_drained_room_makes_place_for_the_one_that_waits(installation: Install
     assert settled(installation, "attic") != b""
     installation.client.post("/rooms/attic/drain").raise_for_status()
     wait_for(lambda: any(slot.room is None for slot in installation.directory.rooms().slots))
-    epoch = installation.room("door").endpoints.epoch  # type: ignore[union-attr]
+    epoch = installation.epoch("door")
     picture = settled(installation, "door")
     installation.client.post("/rooms/door/move", json={}).raise_for_status()
-    wait_for(lambda: installation.room("door").endpoints.epoch > epoch)  # type: ignore[union-attr]
+    wait_for(lambda: installation.epoch("door") > epoch)
     assert settled(installation, "door") == picture
     installation.client.post("/rooms/hall/start").raise_for_status()
     wait_for(lambda: installation.is_shown("hall"))
@@ -62,14 +63,14 @@ def test_twenty_kills_in_a_row_lose_no_room_and_leave_no_process(
     installation: Installation, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wait_for(lambda: installation.is_shown("hall") and installation.is_shown("door"))
-    installation.wait_for_spare()
+    installation.wait_for_spares()
     before, earlier = installation.count_of(""), restarts(installation)
     gaps = [installation.kill(("hall", "door")[number % 2]) for number in range(KILLS)]
     with capsys.disabled():
         print("\n" + "; ".join(gaps))
     wait_for(lambda: installation.is_shown("hall") and installation.is_shown("door"))
     assert restarts(installation) >= earlier + KILLS
-    installation.wait_for_spare()
+    installation.wait_for_spares()
     assert installation.count_of("") == before
 
 
