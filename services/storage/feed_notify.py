@@ -3,13 +3,13 @@
 import queue
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Protocol
 from uuid import uuid4
 
 import psycopg
 import structlog
-from sqlalchemy import Engine, text
+from sqlalchemy import Connection, Engine, text
 
 from deltalight.services.storage.faults import StorageFaultError
 from deltalight.services.storage.feed import Feed
@@ -87,19 +87,27 @@ class NotifyFeed(Feed):
         has_listened = False
         while not self._stop.is_set():
             try:
-                with self._explained(), self._engine.connect() as connection:
-                    driver = connection.connection.driver_connection
-                    assert isinstance(driver, psycopg.Connection)
-                    connection.exec_driver_sql(f"LISTEN {CHANNEL}")
+                with ExitStack() as stack:
+                    connection = self._listening(stack)
                     if has_listened:
                         self._missed()
                         self._tick(is_changed=True)
                     has_listened = True
+                    driver = connection.connection.driver_connection
+                    assert isinstance(driver, psycopg.Connection)
                     self._listen(driver)
-                    connection.exec_driver_sql(f"UNLISTEN {CHANNEL}")
+                    with self._explained():
+                        connection.exec_driver_sql(f"UNLISTEN {CHANNEL}")
             except (StorageFaultError, psycopg.Error) as fault:
                 log.debug("events of other web processes are not heard now", fault=str(fault).strip())
                 self._stop.wait(TRY_AGAIN_S)
+
+    def _listening(self, stack: ExitStack) -> Connection:
+        """Return a connection that hears, until the `stack` unwinds; what comes later is no answer of the database."""
+        with self._explained():
+            connection = stack.enter_context(self._engine.connect())
+            connection.exec_driver_sql(f"LISTEN {CHANNEL}")
+        return connection
 
     def _listen(self, connection: psycopg.Connection[Any]) -> None:
         while not self._stop.is_set():
