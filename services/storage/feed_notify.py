@@ -103,7 +103,7 @@ class NotifyFeed(Feed):
                 self._stop.wait(TRY_AGAIN_S)
 
     def _listening(self, stack: ExitStack) -> Connection:
-        """Return a connection that hears, until the `stack` unwinds; what comes later is no answer of the database."""
+        """Return a connection that hears, until the `stack` unwinds; that it hears nothing is no fault."""
         with self._explained():
             connection = stack.enter_context(self._engine.connect())
             connection.exec_driver_sql(f"LISTEN {CHANNEL}")
