@@ -38,7 +38,7 @@ from deltalight.services.rooms.status import RoomStatus
 
 NODE = "desk"
 ROOMS = ("hall", "door", "attic")
-INTERRUPTED = 130  # exit code of Ctrl-C
+TERMINATED = 143  # exit code after SIGTERM
 
 
 class Installation:
@@ -188,7 +188,7 @@ def installed(folder: Path, *options: str, log: Path | None = None) -> Iterator[
     """Run the rooms of `folder`/rooms.yaml; nothing is left afterwards. What they write goes to `log` if it is given.
 
     Raises:
-        DeltalightError: a process outlives it, or it ends as something else than interrupted.
+        DeltalightError: a process outlives it, or it ends otherwise than told to.
     """
     page_port, rooms_port = ports.private_ports(2)
     words = ("up", "--rooms", str(folder / "rooms.yaml"), "--allow-software", "--data", str(folder / "data"))
@@ -200,7 +200,7 @@ def installed(folder: Path, *options: str, log: Path | None = None) -> Iterator[
     found = Installation(process, page_port, rooms_port)
     try:
         yield found
-        _interrupt(process, found)
+        _end(process, found)
     finally:
         process.kill()
         process.wait()
@@ -216,12 +216,12 @@ def _written_to(log: Path | None) -> Iterator[BinaryIO | None]:
             yield lines
 
 
-def _interrupt(process: subprocess.Popen[bytes], found: Installation) -> None:
+def _end(process: subprocess.Popen[bytes], found: Installation) -> None:
     children = children_of(found.process)
-    process.send_signal(signal.SIGINT)
+    process.terminate()  # SIGINT is ignored where a shell started all this in the background
     code = process.wait(PATIENCE_S)
     left = psutil.wait_procs(children, timeout=PATIENCE_S)[1]
-    if code != INTERRUPTED or left:
+    if code != TERMINATED or left:
         raise DeltalightError(
             f"the rooms ended with exit code {code} and left {len(left)} processes; end these and see the log."
         )

@@ -93,9 +93,7 @@ class NotifyFeed(Feed):
                         self._missed()
                         self._tick(is_changed=True)
                     has_listened = True
-                    driver = connection.connection.driver_connection
-                    assert isinstance(driver, psycopg.Connection)
-                    self._listen(driver)
+                    self._listen(connection)
                     with self._explained():
                         connection.exec_driver_sql(f"UNLISTEN {CHANNEL}")
             except (StorageFaultError, psycopg.Error) as fault:
@@ -109,12 +107,22 @@ class NotifyFeed(Feed):
             connection.exec_driver_sql(f"LISTEN {CHANNEL}")
         return connection
 
-    def _listen(self, connection: psycopg.Connection[Any]) -> None:
-        while not self._stop.is_set():
-            is_changed = False
-            for found in connection.notifies(timeout=LOOK_S):
-                is_changed = True
-                sender, payload = found.payload[: len(self._name)], found.payload[len(self._name) :]
-                if sender != self._name:
-                    self._pass_on(payload)
-            self._tick(is_changed=is_changed)
+    def _listen(self, connection: Connection) -> None:
+        driver = connection.connection.driver_connection
+        assert isinstance(driver, psycopg.Connection)
+        try:
+            while not self._stop.is_set():
+                self._tick(is_changed=self._hear_all(driver))
+        except psycopg.Error as fault:
+            connection.invalidate(fault)
+            raise
+
+    def _hear_all(self, driver: psycopg.Connection[Any]) -> bool:
+        """Pass on what comes within a moment; return whether anything did, also from this process."""
+        is_changed = False
+        for found in driver.notifies(timeout=LOOK_S):
+            is_changed = True
+            sender, payload = found.payload[: len(self._name)], found.payload[len(self._name) :]
+            if sender != self._name:
+                self._pass_on(payload)
+        return is_changed
