@@ -36,17 +36,20 @@ class Run:
 
 @dataclass(frozen=True)
 class Act:
-    """One kind of act: `do` it, and `undo` what the next one would miss.
+    """One kind of act: `prepare` what it needs beside ready spares, `do` it, and `undo` what the next one would miss.
 
     While an act `goes_on`, the room still shows pictures, and the longest gap between these counts. Else that from
     the act to the first picture of a later frame does, which has to be at most `bar_s`, in seconds, in either case.
+    `is_warm`: a spare is expected to take the room over.
     """
 
     what: str
     bar_s: float
     do: Callable[[Run], None]
     undo: Callable[[Run], None] = lambda _run: None
+    prepare: Callable[[Run], None] = lambda _run: None
     goes_on: bool = False
+    is_warm: bool = True
 
     @property
     def how(self) -> str:
@@ -82,6 +85,7 @@ def measure(run: Run, name: str, act: Act) -> ActRecord:
     installation.wait_for_spares(quiet_s=LONGEST_REST_S if run.hosts is None else SHORT_S)
     picture, epoch, server = settled(installation, ROOM), installation.epoch(ROOM), installation.server(ROOM)
     present, load = installation.processes(), os.getloadavg()[0]
+    act.prepare(run)
     began_s = time.monotonic()
     act.do(run)
     wait_for(lambda: is_gone(server), "The end of a render server")
@@ -126,6 +130,14 @@ def _add_host(run: Run) -> None:
     wait_for(lambda: {each.host for each in run.installation.directory.rooms().slots} == names, "A new host")
 
 
+def _replace_free_host(run: Run) -> None:
+    """Kill the host without a room and start another, which has no spare yet."""
+    assert run.hosts is not None
+    slots = run.installation.directory.rooms().slots
+    run.hosts.kill(next(slot.host for slot in slots if slot.room is None))
+    _add_host(run)
+
+
 def _move(run: Run) -> None:
     run.installation.directory.command("move", ROOM)
 
@@ -155,6 +167,14 @@ LOCAL_ACTS = {
 RAY_ACTS = {
     "kill-server": Act("kill -9 of the render server", HERE_S, _kill_server),
     "kill-host": Act("kill -9 of its host's raylet", OVER_HOSTS_S, _kill_host, _add_host),
+    "kill-host-cold": Act(
+        "kill -9 of its host's raylet, as soon as another host has started",
+        OVER_HOSTS_S,
+        _kill_host,
+        _add_host,
+        _replace_free_host,
+        is_warm=False,
+    ),
     "move": Act("move to another host", OVER_HOSTS_S, _move, goes_on=True),
     "drain-host": Act("drain its host", OVER_HOSTS_S, _drain_host, _undrain_hosts, goes_on=True),
 }

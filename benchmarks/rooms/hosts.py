@@ -71,7 +71,10 @@ class Hosts:
 
     def _add(self, **more: object) -> Any:  # noqa: ANN401 (Ray's)
         common = {"num_cpus": 0, "node_ip_address": LOOPBACK, "object_store_memory": OBJECT_STORE_BYTES}
-        return self.cluster.add_node(**common, **more)
+        handler = signal.getsignal(signal.SIGTERM)
+        node = self.cluster.add_node(**common, **more)
+        signal.signal(signal.SIGTERM, handler)  # Ray's own ends the process without the rest of it
+        return node
 
 
 @contextmanager

@@ -35,7 +35,7 @@ def all_figures(acts: Mapping[str, Mapping[str, Act]], records: Sequence[ActReco
         for what, values in (
             ("picture equal", [each.same_picture for each in own]),
             ("epoch newer", [each.epoch_after > each.epoch_before for each in own]),
-            ("new render server was a spare", [each.by_spare for each in own]),
+            ("taken over by a spare", [each.by_spare for each in own if of_placer[each.act].is_warm]),
         ):
             shares = [float(value) for value in values]
             figures.append(worst(f"{placer}: {what}", "after each, 1 = yes", shares, ALL, "", smallest=True))

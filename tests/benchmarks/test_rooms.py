@@ -19,13 +19,15 @@ def record(**changed: object) -> ActRecord:
 
 def test_figures_meet_their_bars_or_not() -> None:
     records = [record(), record(gap_s=15.1), record(act="move", same_picture=False, epoch_after=1)]
+    records.append(record(act="kill-host-cold", by_spare=False))
     figures = {each.what: each for each in all_figures(ACTS, records)}
     assert {what: each.is_met for what, each in figures.items()} == {
         "ray: kill -9 of its host's raylet": False,
+        "ray: kill -9 of its host's raylet, as soon as another host has started": True,
         "ray: move to another host": True,
         "ray: picture equal": False,
         "ray: epoch newer": False,
-        "ray: new render server was a spare": True,
+        "ray: taken over by a spare": True,
     }
     assert figures["ray: kill -9 of its host's raylet"].result == "2 to 15.1 s"
 
