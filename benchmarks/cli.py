@@ -306,6 +306,27 @@ def soak(
     print_report(run_soak(job, out, lambda text: typer.echo(f"soak: {text}", err=True)), out)
 
 
+@bench.command()
+def rooms(
+    *,
+    times: Annotated[int, typer.Option(min=1, max=100, help="How often each act is measured.")] = 5,
+    placer: Annotated[
+        Literal["local", "ray", "both"],
+        typer.Option(help="What places the rooms; ray: on hosts of a cluster on this machine."),
+    ] = "both",
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path("rooms"),
+) -> None:
+    """Kill, move and drain a room of real processes, and report for how long its viewers see nothing."""
+    try:
+        from deltalight.benchmarks.rooms.command import print_report, run_rooms
+    except ModuleNotFoundError as missing:
+        raise DeltalightError(
+            f"`bench rooms` needs the package {missing.name}; install the project with its dev extra."
+        ) from missing
+    placers = ("local", "ray") if placer == "both" else (placer,)
+    print_report(run_rooms(placers, times, out, lambda text: typer.echo(f"rooms: {text}", err=True)), out)
+
+
 def _speed_job(methods: str, motions: str, frames: int, size: str | None, device: int | None) -> "SpeedJob":
     from deltalight.benchmarks.variants import RENDERED, parse_variants
     from deltalight.services.commands.options import parse_size

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
+import httpx
+
 from deltalight import __version__
 from deltalight.benchmarks.soak.crowd import Crowd
 from deltalight.benchmarks.soak.faults import FAULTS, Run
@@ -15,7 +17,7 @@ from deltalight.benchmarks.soak.figures import Soaked, all_courses, all_figures
 from deltalight.benchmarks.soak.link import LoopThread
 from deltalight.benchmarks.soak.plots import draw_soak
 from deltalight.benchmarks.soak.profiles import choose_profile
-from deltalight.benchmarks.soak.report import FaultRecord, Machine, SoakReport, markdown
+from deltalight.benchmarks.soak.report import FaultRecord, Machine, SoakReport, markdown, print_figures
 from deltalight.benchmarks.soak.samples import Sampler, require_proc
 from deltalight.benchmarks.soak.spares import wait_for_spare
 from deltalight.benchmarks.soak.station import SERVER, Station, running_station
@@ -56,7 +58,7 @@ def run_soak(job: SoakJob, out: Path, say: Say) -> SoakReport:
     Raises:
         DeltalightError: this is no Linux, no picture came, or it did not come back after a fault.
     """
-    require_proc()
+    require_proc("bench soak")
     make_output_folder(out)
     report = soak(job, say)
     write_bytes(out / "soak.json", report.model_dump_json().encode())
@@ -85,7 +87,7 @@ def soak(job: SoakJob, say: Say) -> SoakReport:
         log = _Log(time.monotonic())
         with Sampler(station) as sampler:
             _put_to_faults(job, run, log, say)
-        renderer, deaths = _renderer(station), station.deaths()
+        renderer, deaths = renderer_of(station.client), station.deaths()
         names, cameras = station.names, station.cameras
         seconds = time.monotonic() - log.began_s
         seen = run.crowd.between(log.began_s, float("inf"))
@@ -163,8 +165,9 @@ def _wait(station: Station, condition: Callable[[], bool], otherwise: str) -> No
         time.sleep(0.1)
 
 
-def _renderer(station: Station) -> str:
-    known = station.client.get("/nodes").raise_for_status().json()
+def renderer_of(client: httpx.Client, nodes: str = "/nodes") -> str:
+    """Return what the render server that reports to a web process renders with."""
+    known = client.get(nodes).raise_for_status().json()
     detail = next((each["detail"] for each in known if each["kind"] == "render_server"), "")
     return str(detail).partition("; ")[0]  # remarks about faults and cameras follow
 
@@ -181,12 +184,4 @@ def _orphans(ids: set[int]) -> int:
 
 def print_report(report: SoakReport, out: Path) -> None:
     """Print the figures as a table, and where the files are."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("Figure", "How tested (times)", "Result", "Bar", "Met", title="Soak", title_justify="left")
-    for each in report.figures:
-        table.add_row(each.what, each.how, each.result, each.bar, "yes" if each.is_met else "no")
-    console = Console()
-    console.print(table)
-    console.print(f"The report is in {out}: soak.json, soak.md, {PLOT}")
+    print_figures("Soak", report.figures, f"The report is in {out}: soak.json, soak.md, {PLOT}")

@@ -70,13 +70,19 @@ class Flow:
 
 
 class Crowd:
-    """Viewers in an event loop of their own; one of each camera measures, and connects again when it must."""
+    """Viewers in an event loop of their own; one of each camera measures, and connects again when it must.
 
-    def __init__(self, thread: LoopThread, port: int, cameras: Sequence[str]) -> None:
+    They look at the only room of the web process at `port`, or at its `room` of that name.
+    """
+
+    def __init__(
+        self, thread: LoopThread, port: int, cameras: Sequence[str], room: str | None = None
+    ) -> None:
         self.cameras = cameras
         self.seen: deque[Seen] = deque(maxlen=KEPT_PICTURES)
         self._thread = thread
-        self._address = f"ws://127.0.0.1:{port}/api/v1/live"
+        place = "" if room is None else f"/rooms/{room}"
+        self._address = f"ws://127.0.0.1:{port}/api/v1{place}/live"
         self._newest: dict[str, tuple[LiveHeader, bytes]] = {}
         self._lock = threading.Lock()
         for camera in cameras:

@@ -104,15 +104,32 @@ def markdown(report: SoakReport, plot: str) -> str:
         "",
         f"![Age, rate, memory, handles, GL objects and drops over time]({plot})",
         "",
-        "| figure | how tested (times) | result | bar | met |",
-        "|---|---|---|---|---|",
-        *(_row(each) for each in report.figures),
+        *figure_rows(report.figures),
         "",
         "| fault | began, s | outcome |",
         "|---|--:|---|",
         *(f"| {each.name} | {each.began_s:.0f} | {_outcome(each.outcome)} |" for each in report.faults),
     ]
     return "\n".join(lines) + "\n"
+
+
+def figure_rows(figures: Sequence[Figure]) -> list[str]:
+    """Return the lines of a table of figures, in Markdown."""
+    head = ["| figure | how tested (times) | result | bar | met |", "|---|---|---|---|---|"]
+    return [*head, *(_row(each) for each in figures)]
+
+
+def print_figures(title: str, figures: Sequence[Figure], where: str) -> None:
+    """Print a table of figures, and `where` the files are."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("Figure", "How tested (times)", "Result", "Bar", "Met", title=title, title_justify="left")
+    for each in figures:
+        table.add_row(each.what, each.how, each.result, each.bar, "yes" if each.is_met else "no")
+    console = Console()
+    console.print(table)
+    console.print(where)
 
 
 def _row(figure: Figure) -> str:

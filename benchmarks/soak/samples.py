@@ -69,8 +69,8 @@ def processor_time_s(process_id: int) -> float:
     return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def require_proc() -> None:
-    """Check that processes can be examined.
+def require_proc(command: str) -> None:
+    """Check that a command can examine processes.
 
     Raises:
         DeltalightError: this is no Linux.
@@ -78,7 +78,7 @@ def require_proc() -> None:
     try:
         read_process(os.getpid())
     except OSError as fault:
-        raise DeltalightError("`bench soak` examines processes by /proc; run it on Linux.") from fault
+        raise DeltalightError(f"`{command}` examines processes by /proc; run it on Linux.") from fault
 
 
 @dataclass

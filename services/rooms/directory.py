@@ -16,10 +16,12 @@ from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.request import ReplyServer, RequestClient
 from deltalight.services.rooms.keeper import RoomKeeper
 from deltalight.services.rooms.status import RoomList
+from deltalight.services.storage.faults import StorageFaultError
 
 ANSWER_TIMEOUT_S = 2.0
 LIST, DRAIN, START, MOVE = "rooms", "drain", "start", "move"
 DRAIN_HOST, UNDRAIN_HOST = "drain-host", "undrain-host"
+STORAGE_FAULT = "storage_fault"  # in place of the rooms: why a command could not be stored, which passes
 
 
 class SilentDirectoryError(DeltalightError):
@@ -52,7 +54,10 @@ class DirectoryServer:
         if request.op == CLOCK_OP:
             return clock_payload(time.time_ns())
         if request.op in commands:
-            commands[request.op]()
+            try:
+                commands[request.op]()
+            except StorageFaultError as fault:
+                return {STORAGE_FAULT: str(fault)}
         elif request.op not in (LIST, "ping"):
             known = (LIST, *commands)
             hint = nearest(request.op, known) or ", ".join(known)
@@ -85,6 +90,7 @@ class DirectoryClient:
 
         Raises:
             SilentDirectoryError: the directory does not answer.
+            StorageFaultError: it cannot store that now.
             DeltalightError: it refuses.
         """
         return self._ask(op, {"room": room, **({} if slot is None else {"slot": slot})})
@@ -94,6 +100,7 @@ class DirectoryClient:
 
         Raises:
             SilentDirectoryError: the directory does not answer.
+            StorageFaultError: it cannot store that now.
             DeltalightError: it refuses.
         """
         return self._ask(op, {"host": host})
@@ -110,6 +117,8 @@ class DirectoryClient:
             ) from fault
         if reply.error is not None:
             raise DeltalightError(reply.error)
+        if STORAGE_FAULT in reply.payload:
+            raise StorageFaultError(str(reply.payload[STORAGE_FAULT]))
         return validate(RoomList, reply.payload, "the directory's answer")
 
 

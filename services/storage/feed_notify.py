@@ -3,13 +3,13 @@
 import queue
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Protocol
 from uuid import uuid4
 
 import psycopg
 import structlog
-from sqlalchemy import Engine, text
+from sqlalchemy import Connection, Engine, text
 
 from deltalight.services.storage.faults import StorageFaultError
 from deltalight.services.storage.feed import Feed
@@ -87,26 +87,42 @@ class NotifyFeed(Feed):
         has_listened = False
         while not self._stop.is_set():
             try:
-                with self._explained(), self._engine.connect() as connection:
-                    driver = connection.connection.driver_connection
-                    assert isinstance(driver, psycopg.Connection)
-                    connection.exec_driver_sql(f"LISTEN {CHANNEL}")
+                with ExitStack() as stack:
+                    connection = self._listening(stack)
                     if has_listened:
                         self._missed()
                         self._tick(is_changed=True)
                     has_listened = True
-                    self._listen(driver)
-                    connection.exec_driver_sql(f"UNLISTEN {CHANNEL}")
+                    self._listen(connection)
+                    with self._explained():
+                        connection.exec_driver_sql(f"UNLISTEN {CHANNEL}")
             except (StorageFaultError, psycopg.Error) as fault:
                 log.debug("events of other web processes are not heard now", fault=str(fault).strip())
                 self._stop.wait(TRY_AGAIN_S)
 
-    def _listen(self, connection: psycopg.Connection[Any]) -> None:
-        while not self._stop.is_set():
-            is_changed = False
-            for found in connection.notifies(timeout=LOOK_S):
-                is_changed = True
-                sender, payload = found.payload[: len(self._name)], found.payload[len(self._name) :]
-                if sender != self._name:
-                    self._pass_on(payload)
-            self._tick(is_changed=is_changed)
+    def _listening(self, stack: ExitStack) -> Connection:
+        """Return a connection that hears, until the `stack` unwinds; that it hears nothing is no fault."""
+        with self._explained():
+            connection = stack.enter_context(self._engine.connect())
+            connection.exec_driver_sql(f"LISTEN {CHANNEL}")
+        return connection
+
+    def _listen(self, connection: Connection) -> None:
+        driver = connection.connection.driver_connection
+        assert isinstance(driver, psycopg.Connection)
+        try:
+            while not self._stop.is_set():
+                self._tick(is_changed=self._hear_all(driver))
+        except psycopg.Error as fault:
+            connection.invalidate(fault)
+            raise
+
+    def _hear_all(self, driver: psycopg.Connection[Any]) -> bool:
+        """Pass on what comes within a moment; return whether anything did, also from this process."""
+        is_changed = False
+        for found in driver.notifies(timeout=LOOK_S):
+            is_changed = True
+            sender, payload = found.payload[: len(self._name)], found.payload[len(self._name) :]
+            if sender != self._name:
+                self._pass_on(payload)
+        return is_changed

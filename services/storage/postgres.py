@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
+from threading import Lock
 from typing import Any, TypeVar
 
 import psycopg
@@ -18,6 +19,7 @@ from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultEr
 from deltalight.services.storage.feed import Feed
 from deltalight.services.storage.feed_notify import NotifyFeed
 from deltalight.services.storage.last_known import LastKnown
+from deltalight.services.storage.prompt_connection import PromptConnection
 from deltalight.services.storage.schema import stored_version
 
 WRITER_LOCK = 0x64656C74616C6967  # of pg_advisory_xact_lock: "deltalig"
@@ -40,11 +42,13 @@ log = structlog.get_logger()
 class PostgresDatabase(Database):
     """A database at an address `postgresql://USER@HOST/NAME`; writers take turns by an advisory lock.
 
-    While it does not answer, reads have the answers of last time.
+    While it does not answer, reads have the answers of last time. Whoever asks it then fails at once, except for one
+    at a time, who tries again.
     """
 
     def __init__(self, address: str) -> None:
         self._try_again_s = 0.0  # nobody tries before
+        self._trial = Lock()
         self._is_gone = False
         self._is_open = False
         self._last = LastKnown()
@@ -59,10 +63,12 @@ class PostgresDatabase(Database):
             pool_timeout=BUSY_TIMEOUT_S,
         )
         super().__init__(engine, url.set(drivername="postgresql").render_as_string(hide_password=True))
+        event.listen(engine, "do_connect", self._connect)
         event.listen(engine, "connect", _prepare)
         self._reading = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
         self._open()
         self._is_open = True
+        engine.dispose()  # of the connection that may have changed the layout, which takes its time
 
     def answer(self, key: Hashable, read: Callable[[], Answer]) -> Answer:
         """Return what `read` returns; while the database is away, what it returned last time under this `key`."""
@@ -84,16 +90,44 @@ class PostgresDatabase(Database):
         return stored_version(connection)
 
     def _begin(self, connection: Connection) -> None:
+        if self._is_gone:  # it was asked whether it is there, or has accepted the connection
+            self._is_gone = False
+            log.info("the database answers again")
         options = connection.get_execution_options()
         if options.get(WRITES, False):
             if not options.get(IS_DURABLE, True):
                 connection.exec_driver_sql("SET LOCAL synchronous_commit = off")
             connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({WRITER_LOCK})")
 
+    def _connect(
+        self, _dialect: object, _entry: object, args: list[Any], options: dict[str, Any]
+    ) -> PromptConnection:
+        connection = PromptConnection.connect(*args, **options)
+        connection.is_prompt = self._is_open
+        return connection
+
     @contextmanager
     def _explained(self) -> Iterator[None]:
+        with self._in_turn(), self._in_sentences():
+            yield
+
+    @contextmanager
+    def _in_turn(self) -> Iterator[None]:
+        """While it is away, let nobody try soon after a trial, or beside another one."""
         if time.monotonic() < self._try_again_s:
             raise DatabaseGoneError(GONE)
+        if not self._is_gone:
+            yield
+        elif self._trial.acquire(blocking=False):
+            try:
+                yield
+            finally:
+                self._trial.release()
+        else:
+            raise DatabaseGoneError(GONE)
+
+    @contextmanager
+    def _in_sentences(self) -> Iterator[None]:
         try:
             yield
         except IntegrityError:  # a fault of this program, not of the database
@@ -110,10 +144,6 @@ class PostgresDatabase(Database):
             raise self._gone_error(fault) from fault
         except PoolTimeoutError as fault:
             raise StorageFaultError("Too many requests wait for the database; try again soon.") from fault
-        else:
-            if self._is_gone:
-                self._is_gone = False
-                log.info("the database answers again")
 
     def _gone_error(self, fault: DBAPIError) -> DatabaseGoneError:
         """Return the error for clients, who need not know where the database is; that is in the log, once."""

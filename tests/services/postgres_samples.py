@@ -10,6 +10,7 @@ import time
 from itertools import count
 from pathlib import Path
 
+import psutil
 import pytest
 
 USERS = ("postgres", "nobody")  # in place of root, as whom it refuses to run
@@ -64,8 +65,25 @@ class PostgresServer:
             assert time.monotonic() < deadline_s, (self._folder / "log").read_text()
             time.sleep(0.05)
 
+    def hang(self) -> None:
+        """Keep all connections and say nothing, until `go_on` or `stop`."""
+        for process in self._processes():
+            process.suspend()
+
+    def go_on(self) -> None:
+        for process in self._processes():
+            process.resume()
+
+    def _processes(self) -> list[psutil.Process]:
+        """The one that accepts connections first, so that no other begins meanwhile."""
+        if self._process is None:
+            return []
+        first = psutil.Process(self._process.pid)
+        return [first, *first.children()]
+
     def stop(self, *, at_once: bool = False) -> None:
         """Cut all connections; `at_once` like a power cut, so that it recovers from its log at the next start."""
+        self.go_on()
         process, self._process = self._process, None
         if process is not None:
             process.send_signal(signal.SIGQUIT if at_once else signal.SIGINT)

@@ -2,13 +2,25 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
+import psutil
+import pytest
+
+from deltalight.benchmarks.rooms.processes import is_render_server
 from deltalight.services import ports
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
 from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot, choose_slot
 from deltalight.services.rooms.status import RoomList, RoomNode
 from tests.services.render_server_samples import Recorder
+
+WITHOUT_RAY = pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed")
+
+
+def is_rendering(process: psutil.Process) -> bool:
+    """Whether a process is a render server, or the actor of a cluster that holds one."""
+    return is_render_server(process) or "RenderActor" in process.name()
 
 
 def plans(folder: Path, *names: str) -> list[RoomPlan]:

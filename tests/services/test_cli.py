@@ -67,6 +67,7 @@ COMMANDS = {
     "bench quality",
     "bench real",
     "bench rest",
+    "bench rooms",
     "bench soak",
     "bench sweep",
     "bench node",

@@ -7,7 +7,6 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from importlib.util import find_spec
 from pathlib import Path
 
 import psutil
@@ -16,7 +15,8 @@ import pytest
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.host import HostCommands
-from deltalight.services.rooms import local_placer
+from deltalight.services.rooms import keeper, local_placer
+from deltalight.services.rooms.keeper import RoomKeeper
 from deltalight.services.rooms.local_placer import Command, LocalPlacer
 from deltalight.services.rooms.placer import (
     NoSlotError,
@@ -28,6 +28,8 @@ from deltalight.services.rooms.placer import (
 )
 from deltalight.services.rooms.ray_cluster import RayCluster
 from deltalight.services.rooms.ray_placer import RayPlacer
+from deltalight.services.rooms.status import RoomStatus
+from tests.services.room_samples import WITHOUT_RAY, plans
 
 # Reports as a render server does, until it is ended.
 REPORTING = """
@@ -49,6 +51,14 @@ Path(sys.argv[1]).with_suffix(".part").write_text(line[1:])
 Path(sys.argv[1]).with_suffix(".part").rename(sys.argv[1])
 """
 REFUSING = "import sys; print('deltalight: The scene is wrong; mend it.', file=sys.stderr); sys.exit(2)"
+# Finds no device while this file is there.
+OF_DEVICE = """
+import sys
+from pathlib import Path
+if Path(sys.argv.pop()).exists():
+    print("deltalight: There is no device; plug it in.", file=sys.stderr)
+    sys.exit(2)
+"""
 PATIENCE_S = 90.0
 
 
@@ -58,7 +68,7 @@ KINDS = (
         "ray",
         marks=[
             pytest.mark.slow,
-            pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
+            WITHOUT_RAY,
         ],
     ),
 )
@@ -165,6 +175,37 @@ def test_a_server_that_refuses_its_input_says_why(make: Make) -> None:
     placer.place(order("hall", 1))
     lost = until(placer, lambda event: event.kind == "lost")
     assert (lost.refused, lost.detail) == (True, "The scene is wrong; mend it.")
+
+
+def test_a_room_whose_device_is_gone_says_so_and_starts_once_it_is_back(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keeper, "RETRY_S", 0.5)
+    gone = tmp_path / "gone"
+    placer = make(
+        lambda _order, placement, _device: ChildSpec(
+            "room", ("-c", OF_DEVICE + REPORTING, placement.publish, str(gone))
+        )
+    )
+    rooms = RoomKeeper(plans(tmp_path, "hall"), placer)
+    ran = until_room(rooms, lambda room: room.state == "running")
+    gone.touch()
+    os.kill(placer.process_ids()[str(ran.slot)], signal.SIGKILL)
+    until_room(rooms, lambda room: room.state == "waiting" and "There is no device" in room.why)
+    gone.unlink()
+    again = until_room(rooms, lambda room: room.state == "running")
+    assert again.restarts > ran.restarts + 1
+
+
+def until_room(rooms: RoomKeeper, wanted: Callable[[RoomStatus], bool]) -> RoomStatus:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline_s:
+        rooms.poll()
+        (room,) = rooms.status().rooms
+        if wanted(room):
+            return room
+        time.sleep(0.02)
+    pytest.fail("it never came")
 
 
 def test_closing_leaves_no_process(placer: AnyPlacer) -> None:

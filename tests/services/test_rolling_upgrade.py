@@ -9,12 +9,12 @@ from pathlib import Path
 import httpx
 import pytest
 
+from deltalight.benchmarks.rooms.processes import wait_for
 from deltalight.benchmarks.soak.profiles import choose_profile
 from deltalight.benchmarks.soak.station import soaked_scene, write_take
 from deltalight.protocol.messages import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
 from deltalight.services import ports
 from tests.services.conftest import ROOT
-from tests.services.rooms_installation import wait_for
 
 # The command of the version before: it sends and reads the oldest schema version alone.
 OLDER = f"""

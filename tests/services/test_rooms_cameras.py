@@ -14,13 +14,14 @@ import trimesh
 from jaxtyping import UInt8
 
 import deltalight as dl
+from deltalight.benchmarks.rooms.installation import Installation, installed
+from deltalight.benchmarks.rooms.processes import PATIENCE_S, wait_for
 from deltalight.protocol.files import write_png
 from deltalight.protocol.pictures import decode_rgb
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
 from deltalight.sensor_node.cameras.synthetic import FRAMES_PER_ROUND, SyntheticCamera, default_camera
 from tests.services.dashboard_samples import SCREENSHOTS
-from tests.services.rooms_installation import PATIENCE_S, Installation, installed, wait_for
 
 pytestmark = pytest.mark.slow
 

@@ -3,97 +3,41 @@
 Each host is a raylet of this machine; render servers, sockets and pictures are real.
 """
 
-import itertools
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
 from playwright.sync_api import Locator, expect
 
-from deltalight.services.rooms.follower import RoomFollower
-from deltalight.services.rooms.ray_cluster import (
-    FULL_PRIORITY,
-    LOOPBACK_ONLY,
-    NO_STATISTICS,
-    OBJECT_STORE_BYTES,
-    RayCluster,
-)
-from tests.services.dashboard_samples import SIZE, USES_BROWSER, chromium, complaints_of, photograph
-from tests.services.rooms_installation import (
+from deltalight.benchmarks.rooms.hosts import Hosts, running_hosts
+from deltalight.benchmarks.rooms.installation import Installation, settled, started
+from deltalight.benchmarks.rooms.processes import (
     PATIENCE_S,
-    Installation,
+    children_of,
     is_gone,
-    settled,
-    started,
     wait_for,
-    wait_until_idle,
 )
+from deltalight.services.rooms.ray_cluster import RayCluster
+from tests.services.dashboard_samples import SIZE, USES_BROWSER, chromium, complaints_of, photograph
+from tests.services.room_samples import WITHOUT_RAY, is_rendering
 
 pytestmark = [
     pytest.mark.slow(seconds=25),
-    pytest.mark.skipif(find_spec("ray") is None, reason="the extra `cluster` is not installed"),
+    WITHOUT_RAY,
 ]
-# A host that is silent for a second and a half is dead (Ray's default is 15 s).
-HEALTH_CHECKS = {
-    "health_check_initial_delay_ms": 1000,
-    "health_check_period_ms": 500,
-    "health_check_timeout_ms": 500,
-    "health_check_failure_threshold": 3,
-}
-
-
-class Hosts:
-    """A Ray cluster whose hosts have a slot each; the first process of the cluster has none."""
-
-    def __init__(self) -> None:
-        os.environ.update(LOOPBACK_ONLY | NO_STATISTICS | FULL_PRIORITY)
-        from ray.cluster_utils import Cluster
-
-        self.cluster = Cluster()
-        self.networks: dict[str, str | None] = {}  # of the hosts that live, by their labels
-        self.raylets: list[psutil.Process] = []  # of these and of those that were killed
-        self._raylets: dict[str, psutil.Process] = {}
-        self._numbers = itertools.count(1)
-        self._add(include_dashboard=False, _system_config=HEALTH_CHECKS)
-
-    def add(self, name: str = "", **labels: str) -> str:
-        """Start a host; return its name, which no host has had before."""
-        name = name or f"host{next(self._numbers)}"
-        node = self._add(node_name=name, resources={"render_slot": 1}, labels=labels)
-        self.networks[name] = labels.get("network")
-        self._raylets[name] = psutil.Process(node.all_processes["raylet"][0].process.pid)
-        self.raylets.append(self._raylets[name])
-        return name
-
-    def raylet(self, name: str) -> psutil.Process:
-        return self._raylets[name]
-
-    def kill(self, name: str) -> None:
-        os.kill(self.raylet(name).pid, signal.SIGKILL)
-        del self.networks[name]
-
-    def _add(self, **more: object) -> Any:  # noqa: ANN401 (Ray's)
-        common = {"num_cpus": 0, "node_ip_address": "127.0.0.1", "object_store_memory": OBJECT_STORE_BYTES}
-        return self.cluster.add_node(**common, **more)
 
 
 @pytest.fixture(scope="module")
 def hosts() -> Iterator[Hosts]:
-    hosts = Hosts()
-    hosts.add(network="east")
-    hosts.add()
-    yield hosts
-    hosts.cluster.shutdown()
+    with running_hosts({"network": "east"}, {}) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")
@@ -141,21 +85,12 @@ def host_of(installation: Installation, room: str) -> str:
 
 def rendering(host: psutil.Process) -> list[psutil.Process]:
     """The render servers of a host, and the actors that hold them."""
-    if is_gone(host):
-        return []
-    found = host.children(recursive=True)
-    return [process for process in found if "RenderActor" in process.name() or "server" in process.cmdline()]
-
-
-def epoch(installation: Installation, room: str) -> int:
-    endpoints = installation.room(room).endpoints
-    assert endpoints is not None
-    return endpoints.epoch
+    return [process for process in children_of(host) if is_rendering(process)]
 
 
 def kill_host(hosts: Hosts, installation: Installation, room: str) -> float:
     """Kill the raylet of a room's host; return the seconds until a viewer has a picture from another."""
-    before, server = epoch(installation, room), installation.server(room)
+    before, server = installation.epoch(room), installation.server(room)
     hosts.kill(host_of(installation, room))
     killed_s = time.monotonic()
     shown_s = installation.shown_after(room, before)
@@ -163,48 +98,24 @@ def kill_host(hosts: Hosts, installation: Installation, room: str) -> float:
     return shown_s - killed_s
 
 
-def test_two_rooms_run_on_two_hosts_and_the_third_waits_and_says_why(
+def test_rooms_run_on_all_hosts_with_the_priority_of_other_processes(
     hosts: Hosts, installation: Installation
 ) -> None:
     arrange(hosts, installation, "hall", "door")
     used = {installation.room(name).slot for name in ("hall", "door")}
     assert used == {f"{name}/1" for name in hosts.networks}
-    rendering_at = {server.nice() for name in hosts.networks for server in servers(hosts.raylet(name))}
-    assert max(rendering_at) <= psutil.Process().nice()
-    installation.directory.command("start", "attic")
-    wait_for(lambda: "all 2 slots are in use" in installation.room("attic").why)
-    assert installation.room("attic").state == "waiting"
+    running = [process for name in hosts.networks for process in rendering(hosts.raylet(name))]
+    assert max(process.nice() for process in running) <= psutil.Process().nice()
     joined = RayCluster(hosts.cluster.address, 0)
     found = {host.name: (host.slots, host.labels.get("network")) for host in joined.hosts()}
     joined.close()
     assert found == {name: (1, network) for name, network in hosts.networks.items()}
 
 
-def test_a_killed_render_server_is_replaced_by_the_spare_of_its_host(
-    hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arrange(hosts, installation, "hall")
-    slot, before = installation.room("hall").slot, settled(installation, "hall")
-    raylet = hosts.raylet(host_of(installation, "hall"))
-    wait_for(lambda: len(servers(raylet)) == 2)
-    wait_until_idle(max(servers(raylet), key=lambda server: server.create_time()))
-    said = installation.kill("hall")
-    with capsys.disabled():
-        print(f"\na render server of a host that lives was replaced after {said}")
-    assert "by the spare" in said
-    assert (installation.room("hall").slot, settled(installation, "hall")) == (slot, before)
-
-
-def servers(host: psutil.Process) -> list[psutil.Process]:
-    return [process for process in rendering(host) if "server" in process.cmdline()]
-
-
 def test_rooms_of_killed_hosts_return_on_others_with_equal_pictures(
     hosts: Hosts, installation: Installation, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arrange(hosts, installation, "hall")
-    follower = RoomFollower(installation.directory, lambda _room, _endpoints: None)
-    stale = installation.directory.rooms()
     before, gaps_s = settled(installation, "hall"), []
     for _ in range(2):
         gaps_s.append(kill_host(hosts, installation, "hall"))
@@ -212,22 +123,19 @@ def test_rooms_of_killed_hosts_return_on_others_with_equal_pictures(
         assert settled(installation, "hall") == before
     with capsys.disabled():
         print(f"\nrooms of killed hosts were away for {', '.join(f'{gap_s:.2f} s' for gap_s in gaps_s)}")
-    follower.take(installation.directory.rooms())
-    follower.take(stale)
-    assert follower.refused >= 1
 
 
 def test_a_room_of_a_killed_host_waits_for_a_slot_and_says_so(
     hosts: Hosts, installation: Installation
 ) -> None:
     arrange(hosts, installation, "hall", "door")
-    other, picture = epoch(installation, "hall"), settled(installation, "hall")
+    other, picture = installation.epoch("hall"), settled(installation, "hall")
     server = installation.server("door")
     hosts.kill(host_of(installation, "door"))
     wait_for(lambda: installation.room("door").state == "waiting")
     wait_for(lambda: "all 1 slots are in use" in installation.room("door").why)
     wait_for(lambda: is_gone(server))
-    assert (epoch(installation, "hall"), settled(installation, "hall")) == (other, picture)
+    assert (installation.epoch("hall"), settled(installation, "hall")) == (other, picture)
     liar = hosts.add("liar", gpu="NVIDIA-H100-80GB-HBM3")
     wait_for(
         lambda: "The host liar is refused: it claims the device NVIDIA-H100" in installation.room("door").why

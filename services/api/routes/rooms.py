@@ -22,7 +22,7 @@ from deltalight.services.rooms.directory import (
     SilentDirectoryError,
 )
 from deltalight.services.rooms.status import HOST_PATTERN, RoomList, RoomState, RoomStatus, SlotStatus
-from deltalight.services.storage.faults import ConflictError, NotFoundError
+from deltalight.services.storage.faults import ConflictError, NotFoundError, StorageFaultError
 
 router = APIRouter(tags=["rooms"])
 ROUTERS = (router,)
@@ -199,6 +199,8 @@ def _ordered(rooms: Rooms, order: Callable[[DirectoryClient], RoomList]) -> Room
         return order(rooms.directory)
     except SilentDirectoryError as fault:
         raise ProblemError(503, "directory", str(fault)) from fault
+    except StorageFaultError:  # 503 as well
+        raise
     except DeltalightError as refusal:
         raise ConflictError(str(refusal)) from refusal
 

@@ -1,0 +1,1 @@
+"""`deltalight bench rooms`: how long rooms are away when what shows them is killed, moved or drained."""
