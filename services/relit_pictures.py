@@ -3,14 +3,9 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 
-import numpy as np
-from jaxtyping import UInt8
-
 from deltalight.protocol.codecs import decode_color
-from deltalight.protocol.envelope import decode
 from deltalight.protocol.messages import CompositeMessage
-from deltalight.protocol.pictures import decode_rgb, encode_png
-from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.pictures import encode_png
 
 RELIT_VIEW = "composite"
 KEPT_FRAMES = 1024  # half a minute: a renderer that is farther behind has left frames out
@@ -26,20 +21,6 @@ def relit_picture(message: CompositeMessage, parts: Sequence[memoryview]) -> byt
     if message.encoding == "jpeg":
         return bytes(part)
     return encode_png(decode_color(part, message.encoding, message.shape))
-
-
-def composite_topic(camera: str | None) -> str:
-    """Return what to subscribe to: the pictures of one of several cameras, or None = all that come."""
-    return "composite" if camera is None else f"composite.{camera}"
-
-
-def newest_picture(receiver: Receiver, timeout_s: float) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return the newest relit picture (sRGB) that comes within this time."""
-    for multipart in (receiver.latest(timeout_s) or {}).values():
-        message, parts = decode(multipart)
-        if isinstance(message, CompositeMessage) and (coded := relit_picture(message, parts)) is not None:
-            return decode_rgb(coded, "of the render server")
-    return None
 
 
 class RelitPictures:

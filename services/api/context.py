@@ -13,6 +13,7 @@ from deltalight.services.api.camera_finder import CameraFinder
 from deltalight.services.api.credentials import Tickets
 from deltalight.services.api.events import EventHub
 from deltalight.services.api.fisheye import FisheyeView
+from deltalight.services.api.heard_jobs import HeardJobs
 from deltalight.services.api.limits import StreamLimits
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.metrics import Metrics
@@ -76,6 +77,7 @@ class Context:
     whep: WhepSessions
     room: str
     server_name: str  # in its render server's messages, until there is one
+    heard: HeardJobs = field(default_factory=HeardJobs)
     others: list["Context"] = field(default_factory=list)
 
     def change(

@@ -44,6 +44,7 @@ class EventRelay:
             raise DeltalightError(f"Another web process sent the event {kind!r:.40}, which stays in its own.")
         if kind == "scene":
             context.link.look_again()
+        context.heard.hear(kind, body)
         context.events.deliver(kind, body)
 
     def _missed(self) -> None:

@@ -41,8 +41,9 @@ class RecordingSession:
 class RecordingSessions:
     """Starts and stops recordings: one per node at a time, or one of whichever node is heard first.
 
-    Calls `publish(session, is_growing)` once a second for each, and once at its end. Relit pictures are those of the
-    `room` (directory, name), whichever render server it has; None: of the one at the first endpoint.
+    Calls `publish(session, is_growing)` at the start of each, once a second from then on, and once at its end. Relit
+    pictures are those of the `room` (directory, name), whichever render server it has; None: of the one at the first
+    endpoint.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class RecordingSessions:
         except BaseException:
             self._forget(session)
             raise
+        self._publish(session, True)
         return session
 
     def stop(self, name: str) -> None:

@@ -25,6 +25,7 @@ from deltalight.services.storage.faults import ConflictError
 # A child takes two seconds for imports and its first frame on a slow machine, five with two busy cores.
 START_TIMEOUT_S = 20.0
 POLL_PERIOD_S = 0.5
+REPEAT_PERIOD_S = 2.0
 START_ASK_TIMEOUT_S = 0.5  # short, to notice soon that a child ended instead of answering
 END_TIMEOUT_S = 3.0
 NODE = "replay"
@@ -87,7 +88,8 @@ class ReplayControl:
 
     `server` is the endpoint of the render server's commands, `playback` that at which the recording that the node
     plays is controlled (None: it is a camera). Calls `publish` with the position of what is shown twice a second
-    while it moves and with None when a camera is shown again, and `notice` with sentences for the user.
+    while it moves, every two seconds while it is paused, and with None when a camera is shown again; and `notice`
+    with sentences for the user.
     """
 
     def __init__(
@@ -228,12 +230,13 @@ class ReplayControl:
 
     def _watch(self, playback: PlaybackClient) -> None:
         """Publish how a position changes while it is shown, until that is over for good."""
-        last = None
+        last, due_s = None, 0.0
         while playback in (self._shown, self._source):
             position = self._moved(playback) if playback is self._shown else None
-            if position is not None and position != last and playback is self._shown:
+            is_new = position != last or time.monotonic() >= due_s
+            if position is not None and is_new and playback is self._shown:
                 self._publish(position)
-                last = position
+                last, due_s = position, time.monotonic() + REPEAT_PERIOD_S
             time.sleep(POLL_PERIOD_S)
 
     @staticmethod

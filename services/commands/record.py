@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from deltalight.services.commands.options import ConfigFile, NodeName, NodeStreams, node_endpoints
+from deltalight.services.commands.room_options import Room, Rooms, following_room
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -45,16 +46,8 @@ def record(
             help="Endpoint of the render server whose relit pictures are kept too, beside the frames."
         ),
     ] = None,
-    rooms: Annotated[
-        str | None,
-        typer.Option(help="Directory of rooms (`up --rooms`), to keep the relit pictures of --room."),
-    ] = None,
-    room: Annotated[
-        str | None,
-        typer.Option(
-            help="Room of --rooms whose relit pictures are kept too, whichever render server it has."
-        ),
-    ] = None,
+    rooms: Rooms = None,
+    room: Room = None,
     duration: Annotated[float | None, typer.Option(min=0.1, help="Stop after this many seconds.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
     config_file: ConfigFile = None,
@@ -88,27 +81,8 @@ def record(
     console = Console(stderr=True, soft_wrap=True)
     recorder = Recorder(job, lambda sentence: console.print(sentence, markup=False, highlight=False))
     shown = _progress_lines() if progress else _progress_on(console)
-    with _following(recorder, rooms, room, keys):
+    with following_room(rooms, room, keys, recorder.follow):
         _run(recorder, shown, lambda status: _print_summary(status, as_json=as_json))
-
-
-@contextmanager
-def _following(
-    recorder: "Recorder", directory: str | None, room: str | None, keys: "Keys | None"
-) -> Iterator[None]:
-    """Have the recorder keep the relit pictures of a room, if one is named, whichever render server it has."""
-    from deltalight.protocol.errors import DeltalightError
-    from deltalight.services.rooms.follower import following
-
-    if (directory is None) != (room is None):
-        raise DeltalightError(
-            "--rooms and --room belong together: give the directory of rooms and one of its rooms."
-        )
-    if directory is None or room is None:
-        yield
-        return
-    with following(directory, room, keys, recorder.follow):
-        yield
 
 
 def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":

@@ -1,20 +1,19 @@
 """`deltalight stream`: the relit picture to a media server."""
 
 import time
-from contextlib import closing
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from deltalight.services.commands.options import ConfigFile, OneCamera
-from deltalight.services.ports import COMPOSITE_PORT, endpoint
+from deltalight.services.commands.room_options import Composites, Room, Rooms, relit_pictures
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import numpy as np
 
-    from deltalight.protocol.receiver import Receiver
+    from deltalight.services.picture_source import PictureSource
     from deltalight.services.stream_out import StreamOut, StreamStatus
 
 SHOW_PERIOD_S = 0.5
@@ -30,9 +29,9 @@ def stream(
             help="Address of the media server: rtsp://HOST:8554/NAME, rtmp://HOST/live/NAME, or srt://HOST:8890?streamid=ID.",
         ),
     ],
-    composites: Annotated[
-        str, typer.Option(help="Endpoint at which the render server publishes relit pictures.")
-    ] = endpoint(COMPOSITE_PORT),
+    composites: Composites = None,
+    rooms: Rooms = None,
+    room: Room = None,
     camera: OneCamera = None,
     config_file: ConfigFile = None,
 ) -> None:
@@ -42,9 +41,7 @@ def stream(
 
     from deltalight.protocol.errors import DeltalightError
     from deltalight.protocol.keys import KeySettings
-    from deltalight.protocol.receiver import Receiver
     from deltalight.services.h264 import why_unavailable
-    from deltalight.services.relit_pictures import composite_topic
     from deltalight.services.settings import load_configuration
     from deltalight.services.srt import why_unavailable as why_no_srt
     from deltalight.services.stream_out import StreamOut, Target
@@ -53,30 +50,29 @@ def stream(
     reason = why_unavailable() or (why_no_srt() if target.container == "mpegts" else None)
     if reason is not None:
         raise DeltalightError(reason)
-    keys = load_configuration(config_file).section("keys", KeySettings).load([composites])
+    keys = load_configuration(config_file).section("keys", KeySettings)
     console = Console(stderr=True, soft_wrap=True)
 
     def tell(sentence: str) -> None:
         console.print(sentence, markup=False, highlight=False)
 
     with (
-        closing(Receiver([composites], [composite_topic(camera)], keys=keys)) as receiver,
+        relit_pictures(composites, rooms, room, camera, keys) as (source, place),
         StreamOut(target, tell) as out,
     ):
-        tell(f"Waiting for the first picture of {composites}.")
+        tell(f"Waiting for the first picture of {place}.")
         with Live(console=console, transient=True, auto_refresh=False) as live:
-            _send_all(receiver, out, lambda status: live.update(_line(status), refresh=True))
+            _send_all(source, out, lambda status: live.update(_line(status), refresh=True))
 
 
-def _send_all(receiver: "Receiver", out: "StreamOut", show: "Callable[[StreamStatus], None]") -> None:
+def _send_all(source: "PictureSource", out: "StreamOut", show: "Callable[[StreamStatus], None]") -> None:
     """Send each picture, and the last one again while none comes."""
-    from deltalight.services.relit_pictures import newest_picture
     from deltalight.services.stream_out import REPEAT_AFTER_S
 
     picture: np.ndarray | None = None
     shown_s = 0.0
     while True:
-        newer = newest_picture(receiver, REPEAT_AFTER_S)
+        newer = source.newest(REPEAT_AFTER_S)
         picture = picture if newer is None else newer
         if picture is not None:
             out.show(picture)

@@ -1,9 +1,6 @@
 """Hosts are upgraded one after another: processes that speak the oldest schema version run beside those of today."""
 
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -12,37 +9,8 @@ import pytest
 from deltalight.benchmarks.rooms.processes import wait_for
 from deltalight.benchmarks.soak.profiles import choose_profile
 from deltalight.benchmarks.soak.station import soaked_scene, write_take
-from deltalight.protocol.messages import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
 from deltalight.services import ports
-from tests.services.conftest import ROOT
-
-# The command of the version before: it sends and reads the oldest schema version alone.
-OLDER = f"""
-import sys
-from importlib.util import find_spec, module_from_spec
-from pathlib import Path
-name = "deltalight.protocol.messages"
-spec = find_spec(name)
-source = Path(spec.origin).read_text()
-now = "SCHEMA_VERSION: Final = {SCHEMA_VERSION}\\n"
-assert now in source
-sys.modules[name] = module_from_spec(spec)
-exec(compile(source.replace(now, "SCHEMA_VERSION: Final = {OLDEST_SCHEMA_VERSION}\\n", 1), spec.origin, "exec"),
-     sys.modules[name].__dict__)
-from deltalight.services.cli import main
-main()
-"""
-
-
-@contextmanager
-def running(*arguments: object, is_older: bool = False) -> Iterator[None]:
-    program = ["-c", OLDER] if is_older else ["-m", "deltalight.services.cli"]
-    process = subprocess.Popen([sys.executable, *program, *map(str, arguments)], cwd=ROOT)
-    try:
-        yield
-    finally:
-        process.kill()
-        process.wait()
+from tests.services.older_version import running
 
 
 class Station:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,13 @@ import pytest
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services import h264, ports, srt, stream_out
+from deltalight.services.rooms.directory import DirectoryServer
+from deltalight.services.rooms.keeper import RoomKeeper
 from deltalight.services.srt import SrtAddress
 from deltalight.services.stream_out import StreamOut, Target
 from tests.services.conftest import ROOT, RunCli
 from tests.services.moving_samples import HEIGHT, WIDTH, MovingStream, picture, psnr_db
+from tests.services.room_samples import StandInPlacer, plans, running
 
 LEAST_PSNR_DB = 35.0
 PATIENCE_S = 60.0
@@ -81,6 +84,25 @@ def receiving(url: str, folder: Path) -> Iterator[Receiver]:
         receiver.close()
 
 
+@contextmanager
+def sending(*options: str) -> Iterator["subprocess.Popen[str]"]:
+    """`deltalight stream` as a process, killed at the end."""
+    command = [sys.executable, "-m", "deltalight.services.cli", "stream", *options]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.1)
+
+
 def show_until(out: StreamOut, is_enough: Callable[[], object]) -> None:
     """Show pictures that move, ten a second, until there is enough."""
     deadline_s, phase = time.monotonic() + PATIENCE_S, 0
@@ -135,29 +157,61 @@ def test_ctrl_c_ends_the_command_and_no_line_holds_a_secret(tmp_path: Path) -> N
     port, published = ports.private_ports(2)
     url = f"rtsp://{ports.LOOPBACK}:{port}/stream-key"
     stream = MovingStream(published)
-    command = [
-        sys.executable,
-        "-m",
-        "deltalight.services.cli",
-        "stream",
-        "--composites",
-        ports.endpoint(published),
-    ]
     secret = url.replace("//", "//me:secret@")
-    with receiving(url, tmp_path / "got") as receiver:
-        sending = subprocess.Popen([*command, "--to", secret], cwd=ROOT, stderr=subprocess.PIPE, text=True)
-        deadline_s = time.monotonic() + PATIENCE_S
-        while len(receiver.pictures) < 3:
-            assert time.monotonic() < deadline_s
-            time.sleep(0.1)
-        sending.send_signal(signal.SIGINT)
-        _, printed = sending.communicate(timeout=PATIENCE_S)
+    options = ("--composites", ports.endpoint(published), "--to", secret)
+    with receiving(url, tmp_path / "got") as receiver, sending(*options) as process:
+        wait_for(lambda: len(receiver.pictures) >= 3)
+        process.send_signal(signal.SIGINT)
+        _, printed = process.communicate(timeout=PATIENCE_S)
     stream.close()
-    assert sending.returncode == 130, printed
+    assert process.returncode == 130, printed
     assert "is receiving the relit picture, 160x120" in printed
     assert "secret" not in printed
     assert "stream-key" not in printed
     assert "Traceback" not in printed
+
+
+@pytest.mark.slow
+def test_pictures_of_a_room_go_on_when_another_render_server_takes_it_over(tmp_path: Path) -> None:
+    (port,) = ports.private_ports(1)
+    url, directory = f"rtsp://{ports.LOOPBACK}:{port}/room", ports.endpoint(ports.private_ports(1)[0])
+    placer = StandInPlacer()
+    keeper = RoomKeeper(plans(tmp_path, "hall", "door"), placer)
+    running(keeper, placer, "hall", "door")
+    options = ("--rooms", directory, "--room", "hall", "--to", url)
+    with (
+        closing(DirectoryServer(directory, keeper)),
+        receiving(url, tmp_path / "got") as receiver,
+        closing(MovingStream(_port(placer, "door"))),
+        sending(*options),
+    ):
+        with closing(MovingStream(_port(placer, "hall"))) as first:
+            wait_for(lambda: len(receiver.pictures) > 3)
+            first.is_still = True
+            wait_for(lambda: psnr_db(*receiver.pictures[-2:]) > LEAST_PSNR_DB)
+        still = receiver.pictures[-1]
+        placer.lose("hall")
+        running(keeper, placer, "hall")
+        with closing(MovingStream(_port(placer, "hall"))):
+            wait_for(lambda: psnr_db(receiver.pictures[-1], still) < LEAST_PSNR_DB)
+            count = len(receiver.pictures)
+            wait_for(lambda: len(receiver.pictures) > count + 5)
+
+
+def _port(placer: StandInPlacer, room: str) -> int:
+    return int(placer.of(room).publish.rpartition(":")[2])
+
+
+def test_pictures_are_of_a_room_or_of_an_endpoint(cli: RunCli) -> None:
+    def refused(*options: str) -> str:
+        done = cli("stream", "--to", "rtsp://media.example/a", *options)
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
+        return done.stderr
+
+    nobody = ports.endpoint(ports.private_ports(1)[0])
+    assert "belong together" in refused("--room", "hall")
+    assert "give one of them" in refused("--composites", nobody, "--rooms", nobody, "--room", "hall")
+    assert "does not answer" in refused("--rooms", nobody, "--room", "hall")
 
 
 @pytest.mark.slow

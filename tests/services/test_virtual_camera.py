@@ -6,7 +6,11 @@ import os
 import shutil
 import struct
 import subprocess
+import sys
 import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import cv2
@@ -14,13 +18,18 @@ import numpy as np
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.publisher import Publisher
+from deltalight.services import ports
 from deltalight.services import virtual_camera as module
 from deltalight.services.commands import virtual_camera as command_module
 from deltalight.services.commands.virtual_camera import virtual_camera
+from deltalight.services.rooms.directory import DirectoryServer
+from deltalight.services.rooms.keeper import RoomKeeper
 from deltalight.services.virtual_camera import S_FMT, VirtualCamera, fitted, yuyv
-from tests.services.conftest import RunCli
+from tests.services.conftest import ROOT, RunCli
 from tests.services.record_samples import HEIGHT, WIDTH, composite, frames
+from tests.services.room_samples import StandInPlacer, plans, running
 
 OUTPUT, CAPTURE, DEVICE_CAPS = 2, 1, 0x80000000
 CAPS_OFFSET, DEVICE_CAPS_OFFSET = 84, 88
@@ -147,6 +156,25 @@ def test_the_command_without_a_device_is_one_sentence(cli: RunCli, tmp_path: Pat
     assert len(done.stderr.splitlines()) == 1
 
 
+@contextmanager
+def publishing(frame: SensorFrame, endpoint: str = "tcp://127.0.0.1:*") -> Iterator[str]:
+    """A render server that shows one picture; yields its endpoint."""
+    publisher, stop = Publisher(endpoint), threading.Event()
+
+    def publish() -> None:
+        while not stop.wait(0.02):
+            publisher.send(composite(frame))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        yield publisher.endpoint
+    finally:
+        stop.set()
+        thread.join()
+        publisher.close()
+
+
 @pytest.mark.usefixtures("kernel")
 def test_relit_pictures_are_shown_and_repeated(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (frame,) = frames(1)
@@ -159,20 +187,54 @@ def test_relit_pictures_are_shown_and_repeated(device: Path, monkeypatch: pytest
 
     monkeypatch.setattr(VirtualCamera, "show", show)
     monkeypatch.setattr(command_module, "PERIOD_S", 0.01)
-    publisher, stop = Publisher("tcp://127.0.0.1:*"), threading.Event()
-
-    def publish() -> None:
-        while not stop.wait(0.02):
-            publisher.send(composite(frame))
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            virtual_camera(device=device, composites=publisher.endpoint)
-    finally:
-        stop.set()
-        thread.join()
-        publisher.close()
+    with publishing(frame) as endpoint, pytest.raises(KeyboardInterrupt):
+        virtual_camera(device=device, composites=endpoint)
     assert [picture.shape for picture in shown] == [(HEIGHT, WIDTH, 3)] * 3
     assert all(np.array_equal(picture, frame.color) for picture in shown)
+
+
+# The command with a kernel that takes every format; what is written to the device is appended to a file.
+WITH_KERNEL = f"""
+import fcntl, struct
+def ioctl(_file, request, data):
+    if request != {S_FMT}:
+        struct.pack_into("=I", data, {CAPS_OFFSET}, {OUTPUT})
+fcntl.ioctl = ioctl
+from deltalight.services.cli import main
+main()
+"""
+
+
+@pytest.mark.slow
+def test_a_room_is_shown_whichever_render_server_it_has(device: Path, tmp_path: Path) -> None:
+    before, after = frames(2)
+    directory, placer = ports.endpoint(ports.private_ports(1)[0]), StandInPlacer()
+    keeper = RoomKeeper(plans(tmp_path, "hall"), placer)
+    running(keeper, placer, "hall")
+    options = ["--device", str(device), "--rooms", directory, "--room", "hall"]
+    command = [sys.executable, "-c", WITH_KERNEL, "virtual-camera", *options]
+
+    def wait_for(frame: SensorFrame) -> None:
+        """Wait until the last whole picture is this one."""
+        wanted, deadline_s = yuyv(frame.color), time.monotonic() + 60
+        while True:
+            data = device.read_bytes()
+            end = len(data) // len(wanted) * len(wanted)
+            if data[max(0, end - len(wanted)) : end] == wanted:
+                return
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+
+    with closing(DirectoryServer(directory, keeper)):
+        process = subprocess.Popen(command, cwd=ROOT)
+        try:
+            with publishing(before, placer.of("hall").publish):
+                wait_for(before)
+                placer.lose("hall")
+                running(keeper, placer, "hall")
+                with publishing(after, placer.of("hall").publish):
+                    wait_for(after)  # although the earlier one still sends
+            assert process.poll() is None
+        finally:
+            process.kill()
+            process.wait()

@@ -19,6 +19,8 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services import ports
 from deltalight.services.api import serve
+from deltalight.services.api.heard_jobs import LIFE_S as HEARD_S
+from deltalight.services.api.heard_jobs import HeardJobs
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host_store import activate_first
 from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultError
@@ -194,6 +196,30 @@ def test_feeds_reach_all_but_the_sender_and_outlive_killed_ones(tmp_path: Path, 
     }
     if database is None:
         assert list((tmp_path / ".feed").iterdir()) == []
+
+
+def test_what_is_heard_of_jobs_is_kept_while_it_is_repeated() -> None:
+    now_s = 0.0
+    heard = HeardJobs(lambda: now_s)
+    assert heard.replay() is None
+    heard.hear("replay", {"recording": "take"})
+    for name, state in (
+        ("one", "waiting"),
+        ("two", "recording"),
+        ("two", "finished"),
+        ("three", "recording"),
+    ):
+        heard.hear("recording", {"id": name, "state": state})
+    heard.hear("recording", {"id": "three", "deleted": True})
+    heard.hear("scene", {"id": "one"})
+    assert [each["id"] for each in heard.growing()] == ["one"]
+    now_s = HEARD_S / 2
+    heard.hear("recording", {"id": "one", "state": "recording"})
+    now_s = HEARD_S * 1.25
+    assert heard.replay() is None
+    assert [each["state"] for each in heard.growing()] == ["recording"]
+    now_s = HEARD_S * 2
+    assert heard.growing() == []
 
 
 def test_what_is_known_ends_and_is_bounded() -> None:

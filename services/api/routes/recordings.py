@@ -1,11 +1,12 @@
 """Routes of recordings, and of the replay of one in place of the live nodes."""
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from fastapi import APIRouter, Body, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import Field, StrictBool
+from pydantic import Field, StrictBool, ValidationError
 
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
@@ -24,6 +25,7 @@ from deltalight.services.storage.faults import ConflictError
 router = APIRouter(tags=["recordings"], prefix="/recordings", dependencies=[JOBS])
 replay_router = APIRouter(tags=["recordings"], prefix="/replay", dependencies=[JOBS])
 ROUTERS = (router, replay_router)
+Heard = TypeVar("Heard", bound=StrictModel)
 
 RecordingId = Annotated[
     str,
@@ -222,10 +224,9 @@ class ReplayAnswer(StrictModel):
 @in_pool("recordings")
 def list_recordings(shared: Shared) -> list[RecordingAnswer]:
     """List all recordings: those in progress first, then newest first."""
-    growing = shared.recording_sessions.running()
-    names = {session.id for session in growing}
-    stored = [RecordingAnswer.stored(recording) for recording in shared.recordings.all(growing=names)]
-    return [RecordingAnswer.growing(session) for session in growing] + stored
+    growing = _growing(shared)
+    stored = [RecordingAnswer.stored(recording) for recording in shared.recordings.all(growing=set(growing))]
+    return [*growing.values(), *stored]
 
 
 @router.post("", status_code=201, responses=responses(409, 422, 503))
@@ -278,12 +279,8 @@ async def upload_recording(
 @in_pool("recordings")
 def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
     """Return the facts of a recording."""
-    growing = _growing(shared, recording_id)
-    return (
-        RecordingAnswer.stored(shared.recordings.get(recording_id))
-        if growing is None
-        else RecordingAnswer.growing(growing)
-    )
+    growing = _growing(shared).get(recording_id)
+    return RecordingAnswer.stored(shared.recordings.get(recording_id)) if growing is None else growing
 
 
 @router.post("/{recording_id}/stop", responses=responses(404, 409, 422))
@@ -345,7 +342,9 @@ def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
 @in_pool("replay")
 def get_replay(shared: Shared) -> ReplayAnswer:
     """Return which recording is shown and its position; without one, the position in the node's own recording."""
-    return replay_answer(shared.replay.position())
+    heard = shared.heard.replay()
+    answer = None if heard is None else _as_heard(ReplayAnswer, heard)
+    return answer or replay_answer(shared.replay.position())
 
 
 @replay_router.put("", responses=responses(404, 409, 422, 503))
@@ -400,8 +399,19 @@ def recording_event(
     return {**ended.model_dump(), "detail": session.detail or ended.detail}
 
 
-def _growing(shared: Context, recording_id: str) -> RecordingSession | None:
-    return next((each for each in shared.recording_sessions.running() if each.id == recording_id), None)
+def _growing(shared: Context) -> dict[str, RecordingAnswer]:
+    """Return the recordings in progress by name: its own, and those of the web process that records."""
+    heard = [_as_heard(RecordingAnswer, body) for body in shared.heard.growing()]
+    own = [RecordingAnswer.growing(session) for session in shared.recording_sessions.running()]
+    return {each.id: each for each in (*heard, *own) if each is not None}
+
+
+def _as_heard(model: type[Heard], body: Mapping[str, Any]) -> Heard | None:
+    """Return the answer in another web process's event; None for one of a version with other fields."""
+    try:
+        return model.model_validate(body)
+    except ValidationError:
+        return None
 
 
 def require_at_rest(shared: Context, recording_id: str) -> None:
@@ -410,5 +420,5 @@ def require_at_rest(shared: Context, recording_id: str) -> None:
     Raises:
         ConflictError: it is still growing.
     """
-    if _growing(shared, recording_id) is not None:
+    if recording_id in _growing(shared):
         raise ConflictError(f"{recording_id} is still being recorded; stop it first.")

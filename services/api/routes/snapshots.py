@@ -182,7 +182,7 @@ def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) ->
         capture_ns=answer["capture_ns"],
         scene_id=None if active is None else active.head.id,
         scene_revision=None if active is None else active.document.revision,
-        recording=shared.replay.recording,
+        recording=shared.replay.recording or (shared.heard.replay() or {}).get("recording"),
         pictures=[_described(picture, files, faults) for picture in wanted.pictures],
         files=files,
     )
