@@ -198,7 +198,9 @@ class RecordingWriter:
     def _sync_each_second(self) -> None:
         """Synchronise in a separate thread, so that a slow disk does not delay the frames."""
         while not self._stop.wait(SYNC_PERIOD_S):
-            with suppress(OSError):  # the next frame, which is written anew with what may be lost, tells of it
+            with suppress(
+                OSError
+            ):  # the next frame, which is written anew with what may be lost, tells of it
                 self._file.sync()
 
     def _finish(self, *, rename: bool) -> None:

@@ -84,7 +84,9 @@ class PatientWriter:
         self.frames += self._holds_frame
         self.composites += not self._holds_frame
         lost = self.unkept - self._unkept_before
-        self._notice(f"The disk takes data again, and the recording goes on; {lost} frames could not be kept.")
+        self._notice(
+            f"The disk takes data again, and the recording goes on; {lost} frames could not be kept."
+        )
 
     def end(self) -> None:
         """Try a last time to write what the disk refused.
@@ -102,8 +104,8 @@ class PatientWriter:
         self._refusal, self._holds_frame = refusal, holds_frame
         self._unkept_before, self._tried_s = self.unkept, time.monotonic()
         self._notice(
-            f"{self.active_path} cannot grow ({reason(refusal)}); its {self.frames} frames are kept, and the recording"
-            " goes on once you free space or lift the limit."
+            f"{self.active_path} cannot grow ({reason(refusal)}); its {self.frames} frames are kept, and the"
+            " recording goes on once you free space or lift the limit."
         )
 
 

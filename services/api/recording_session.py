@@ -13,7 +13,6 @@ from tempfile import NamedTemporaryFile
 from threading import Lock
 from typing import Any
 
-from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services.api.child_process import ChildProcess
 from deltalight.services.api.recording_store import RecordingStore
@@ -45,8 +44,8 @@ class RecordingSession:
 class RecordingSessions:
     """Starts and stops recordings: one per node at a time, or one of whichever node is heard first.
 
-    Calls `publish(session, is_growing)` once a second for each, and once at its end, and `notice` with a sentence when
-    the disk refuses and when it takes data again. Relit pictures are those of the `room` (directory, name), whichever
+    Calls `publish(session, is_growing)` once a second for each, and once at its end, and `notice(sentence)` when the
+    disk refuses and when it takes data again. Relit pictures are those of the `room` (directory, name), whichever
     render server it has; None: of the one at the first endpoint.
     """
 

@@ -379,7 +379,8 @@ def test_a_recording_goes_on_when_the_disk_takes_data_again(
     assert status.disk == notices[1]
     found = list(open_source(out))
     assert len(found) == status.frames
-    assert found[-1].frame_id - found[0].frame_id + 1 == status.frames + status.unkept
+    lost = status.unkept + status.missing.get("color", 0)  # the latter on a busy machine
+    assert found[-1].frame_id - found[0].frame_id + 1 == status.frames + lost
     assert sum(frame.composite is not None for frame in found) == status.composites > 5
     assert found[-1].composite is not None
 
