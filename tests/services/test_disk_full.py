@@ -24,6 +24,7 @@ from deltalight.protocol.source import open_source
 from deltalight.services import ports
 from tests.services.api_samples import sentence
 from tests.services.conftest import ROOT, RunCli
+from tests.services.live_samples import event_socket, next_event
 from tests.services.record_samples import feeding
 from tests.services.storage_samples import TETRAHEDRON
 from tests.services.test_api_process import wait_for
@@ -279,9 +280,11 @@ def test_recordings_of_the_web_process_wait_for_a_full_disk_and_tell_of_it(disk:
             assert f"{name}.mcap.active cannot grow (No space left on device); {frames}" in refused["detail"]
             return refused
 
-        before = record_until_full("patient")
-        ballast.unlink()
-        reach("patient", lambda take: take["frames"] > before["frames"])
+        with event_socket(str(client.base_url.netloc, "ascii")) as events:
+            before = record_until_full("patient")
+            assert next_event(events, "notice")["text"] == before["detail"]
+            ballast.unlink()
+            assert "takes data again" in next_event(events, "notice")["text"]
         ended = client.post("/recordings/patient/stop").raise_for_status().json()
         assert ended["state"] == "finished"
         assert f"{ended['unkept']} frames could not be kept" in ended["detail"]
