@@ -4,10 +4,10 @@ import json
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import IO, Self, cast
 
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
@@ -17,6 +17,7 @@ from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import ACTIVE_SUFFIX
 from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.growing_file import PASSING_ERRORS, GrowingFile
 from deltalight.protocol.recording_format import (
     COMPOSITE_TOPIC,
     FOXGLOVE_TOPICS,
@@ -35,6 +36,10 @@ SYNC_PERIOD_S = 1.0
 NO_SCHEMA = 0  # of MCAP's channels
 
 
+class DiskRefusesError(DeltalightError):
+    """The disk is full or read-only, or a limit is reached: `RecordingWriter.resume` goes on when that has passed."""
+
+
 class RecordingWriter:
     """Writes frames to an `.mcap` file; use it as a context manager, or call `close`.
 
@@ -47,8 +52,12 @@ class RecordingWriter:
     these steps. Fish-eye pictures are stored without loss, once for all frames that share them; they are identified
     by their time. Asset paths of the attached scene are stored relative to the recording.
 
+    If the disk refuses a frame or relit picture after the first frame, the file ends with the one before, and the
+    writer holds the refused one: call `resume` until it succeeds, and only then add others.
+
     Raises:
-        DeltalightError: the name is taken or not `*.mcap`, the disk refuses, or frames are out of order.
+        DiskRefusesError: the disk is full or read-only.
+        DeltalightError: the name is taken or not `*.mcap`, the disk fails, or frames are out of order.
     """
 
     def __init__(
@@ -68,13 +77,14 @@ class RecordingWriter:
         self._scene = scene
         self._last_ns, self._count, self._is_open = -1, 0, True
         with self._disk_errors():
-            self._file = self.active_path.open("xb")
-            self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            self._file = GrowingFile(self.active_path)
+            stream = cast("IO[bytes]", self._file)  # which has what the writer calls
+            self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
             self._writer.start(library="deltalight")
             self._channels = self._register_channels()
             if scene is not None:
                 self._attach_scene(scene)
-            self._file.flush()
+            self._commit_beginning()
         self._stop = threading.Event()
         self._syncing = threading.Thread(target=self._sync_each_second, name="recording-sync", daemon=True)
         self._syncing.start()
@@ -101,26 +111,45 @@ class RecordingWriter:
             raise DeltalightError(
                 f"frame {frame.frame_id} is not later than the one before; record in order."
             )
-        with self._disk_errors():
-            if self._count == 0:
-                self._write(SESSION_TOPIC, frame.timestamp_ns, self._session.packed())
-                # In a chunk with nothing but the channels, because without these no other chunk can be read.
-                self._writer.flush()
-                if self._scene is not None:
-                    self._write(
-                        SCENE_TOPIC, frame.timestamp_ns, scene_message(self._scene, frame.timestamp_ns)
-                    )
-            for topic, data in self._messages.of(frame):
-                self._write(topic, frame.timestamp_ns, data)
+        if self._count == 0:
+            self._write(SESSION_TOPIC, frame.timestamp_ns, self._session.packed())
+            # In a chunk with nothing but the channels, because without these no other chunk can be read.
             self._writer.flush()
+            if self._scene is not None:
+                self._write(SCENE_TOPIC, frame.timestamp_ns, scene_message(self._scene, frame.timestamp_ns))
+        for topic, data in self._messages.of(frame):
+            self._write(topic, frame.timestamp_ns, data)
         self._last_ns = frame.timestamp_ns
         self._count += 1
+        self._commit()
 
     def add_composite(self, timestamp_ns: int, picture: bytes) -> None:
         """Append the relit picture, JPEG or PNG, of a frame that was added before without one."""
+        self._write(COMPOSITE_TOPIC, timestamp_ns, composite_message(picture, timestamp_ns))
+        self._commit()
+
+    def resume(self) -> None:
+        """Write what the disk refused.
+
+        Raises:
+            DiskRefusesError: it still refuses.
+            DeltalightError: the file was removed or truncated meanwhile, or the disk fails.
+        """
         with self._disk_errors():
-            self._write(COMPOSITE_TOPIC, timestamp_ns, composite_message(picture, timestamp_ns))
-            self._writer.flush()
+            self._file.commit()
+
+    def _commit(self) -> None:
+        """End the chunk in progress, so that frames are whole, and hand it to the system."""
+        self._writer.flush()
+        with self._disk_errors():
+            self._file.commit()
+
+    def _commit_beginning(self) -> None:
+        try:
+            self._file.commit()
+        except OSError:
+            self.active_path.unlink(missing_ok=True)
+            raise
 
     def _check_names(self) -> None:
         if self.path.suffix != ".mcap":
@@ -134,7 +163,8 @@ class RecordingWriter:
         try:
             yield
         except OSError as error:
-            raise DeltalightError(
+            kind = DiskRefusesError if error.errno in PASSING_ERRORS else DeltalightError
+            raise kind(
                 f"{self.active_path} cannot be written ({error.strerror}); "
                 "free the disk or choose another place."
             ) from error
@@ -168,7 +198,10 @@ class RecordingWriter:
     def _sync_each_second(self) -> None:
         """Synchronise in a separate thread, so that a slow disk does not delay the frames."""
         while not self._stop.wait(SYNC_PERIOD_S):
-            os.fsync(self._file.fileno())
+            with suppress(
+                OSError
+            ):  # the next frame, which is written anew with what may be lost, tells of it
+                self._file.sync()
 
     def _finish(self, *, rename: bool) -> None:
         if not self._is_open:
@@ -176,10 +209,10 @@ class RecordingWriter:
         self._is_open = False
         self._stop.set()
         self._syncing.join()
-        with self._disk_errors(), self._file:
+        with self._disk_errors(), closing(self._file):
             self._writer.finish()
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            self._file.commit()
+            self._file.sync()
         if self._count == 0:
             self.active_path.unlink()
         elif rename:

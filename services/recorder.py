@@ -5,7 +5,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Lock
@@ -22,6 +22,7 @@ from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.files import require_new_recording
+from deltalight.services.patient_writer import PatientWriter, reason
 from deltalight.services.raw_frames import RAW_STREAMS, RawFrameAssembler
 from deltalight.services.relit_pictures import RelitPictures
 from deltalight.services.stream_queue import StreamQueue
@@ -68,7 +69,8 @@ class RecordStatus:
     `missing` counts frames' parts that never came, by stream: `color` by gaps in the frames' numbers, `depth` and
     `pose` by the frames without. `dropped` counts what came but was left out: messages by stream because the queue
     was full, `late` frames not later than the one before, `broken` messages. `node_drops` is the node's own count of
-    drops since the recording began, which is part of `missing`.
+    drops since the recording began, which is part of `missing`. `unkept` counts frames that came while the disk
+    refused, and `disk` is the last sentence about that, empty if it never did.
     """
 
     out: Path
@@ -81,6 +83,8 @@ class RecordStatus:
     missing: dict[str, int] = field(default_factory=dict)
     dropped: Counter[str] = field(default_factory=Counter)
     node_drops: int = 0
+    unkept: int = 0
+    disk: str = ""
 
     @property
     def bytes_per_s(self) -> float:
@@ -101,6 +105,8 @@ class RecordStatus:
             "missing": self.missing,
             "dropped": dict(self.dropped),
             "node_drops": self.node_drops,
+            "unkept": self.unkept,
+            "disk": self.disk,
             "cpu_share": round(self.cpu_s / seconds, 3) if self.frames else 0.0,
         }
 
@@ -124,7 +130,7 @@ class Recorder:
         self._following = Lock()
         self._assembler = RawFrameAssembler(job.node)
         self._files = ExitStack()
-        self._writer: RecordingWriter | None = None
+        self._writer: PatientWriter | None = None
         self._relit = RelitPictures(self._write_composite)
         self._last_ns, self._idle_polls = -1, 0
         self._silent_since_s = self._checked_s = time.monotonic()
@@ -147,8 +153,11 @@ class Recorder:
     def run(self, stop: Event) -> RecordStatus:
         """Record until `stop` is set or enough was recorded; without any frame no file is left.
 
+        While the disk refuses, the recording waits, except for its first frame.
+
         Raises:
-            DeltalightError: the disk refused; the sentence says what of the recording is readable.
+            DeltalightError: the disk refused the first frame, refuses at the end, or fails; the sentence says what of
+                the recording is readable.
         """
         try:
             with closing(self._queue), self._files:
@@ -157,6 +166,8 @@ class Recorder:
                     self._check_progress()
                 self._take_rest()
                 self._measure()
+                if self._writer is not None:
+                    self._end(self._writer)
             if self._writer is not None:
                 self.status.size_bytes = self._writer.path.stat().st_size
         except DeltalightError as error:
@@ -193,13 +204,13 @@ class Recorder:
 
     def _take_rest(self) -> None:
         """Write what arrived before the end and, where relit pictures come, wait for that of the last frame."""
-        awaits = self._relit.count > 0
+        awaits = self._relit.count > 0 and not self._is_refused()
         if not awaits:
             self._queue.close()  # what it holds can still be taken
         until_s = time.monotonic() + LAST_PICTURE_S
         while not self._is_enough() and self._receive(0) and not (awaits and time.monotonic() > until_s):
             pass
-        while awaits and self._relit.last_ns < self._last_ns and time.monotonic() < until_s:
+        while awaits and self._relit.lacks_last and time.monotonic() < until_s:
             multipart = self._queue.take(POLL_S)
             self._take_followed()
             if multipart is not None and bytes(multipart[0]).startswith(b"composite."):
@@ -234,10 +245,10 @@ class Recorder:
             return
         if self._writer is None:
             self._writer = self._begin(frame)
-        self._writer.add(frame)
         self._last_ns = frame.timestamp_ns
-        self.status.frames += 1
-        self._relit.add_frame(frame.timestamp_ns)
+        if self._writer.add(frame):
+            self._relit.add_frame(frame.timestamp_ns)
+        self._count_written(self._writer)
         self._silent_since_s = time.monotonic()
         if self._is_silent:
             self._is_silent = False
@@ -246,9 +257,26 @@ class Recorder:
     def _write_composite(self, timestamp_ns: int, picture: bytes) -> None:
         assert self._writer is not None  # the frame was written
         self._writer.add_composite(timestamp_ns, picture)
-        self.status.composites += 1
+        self._count_written(self._writer)
 
-    def _begin(self, frame: SensorFrame) -> RecordingWriter:
+    def _count_written(self, writer: PatientWriter) -> None:
+        status = self.status
+        status.frames, status.composites, status.unkept = writer.frames, writer.composites, writer.unkept
+
+    def _is_refused(self) -> bool:
+        return self._writer is not None and self._writer.is_refused
+
+    def _end(self, writer: PatientWriter) -> None:
+        try:
+            writer.end()
+        finally:
+            self._count_written(writer)
+
+    def _tell_of_disk(self, sentence: str) -> None:
+        self.status.disk = sentence
+        self._notice(sentence)
+
+    def _begin(self, frame: SensorFrame) -> PatientWriter:
         job, depth = self._job, frame.depth
         if depth is not None and depth.camera != frame.camera and _lacks_place(job.extrinsics):
             self._notice(
@@ -259,7 +287,7 @@ class Recorder:
         writer = RecordingWriter(
             job.out, board=self._assembler.board, extrinsics=job.extrinsics, scene=job.scene
         )
-        return self._files.enter_context(writer)
+        return PatientWriter(self._files.enter_context(writer), self._tell_of_disk)
 
     def _is_enough(self) -> bool:
         job, status = self._job, self.status
@@ -274,11 +302,14 @@ class Recorder:
             return
         self._checked_s = now_s
         self._measure()
+        if self._writer is not None:
+            self._writer.try_again()
+            self._count_written(self._writer)
         if not self._is_silent and now_s - self._silent_since_s >= SILENCE_S:
             self._is_silent = True
             self._notice(self._silence())
         status = self.status
-        if status.seconds >= STEADY_AFTER_S and not self._warned_of_space:
+        if status.seconds >= STEADY_AFTER_S and not (self._warned_of_space or self._is_refused()):
             left_s = status.free_bytes / max(status.bytes_per_s, 1.0)
             if left_s < LEAST_SPACE_S:
                 self._warned_of_space = True
@@ -308,13 +339,14 @@ class Recorder:
         active = None if self._writer is None else self._writer.active_path
         if active is None or not self.status.frames:
             if active is not None:
-                active.unlink(missing_ok=True)
+                with suppress(OSError):  # it may have become read-only
+                    active.unlink()
             return error
-        cause = error.__cause__
-        reason = cause.strerror if isinstance(cause, OSError) else str(error)
+        unkept = f" and {self.status.unkept} frames could not be kept" if self.status.unkept else ""
         return DeltalightError(
             f"The recording ended after {self.status.frames} frames, because {active} could not be written"
-            f" ({reason}); they are readable there, and `deltalight recordings recover {active}` finishes it."
+            f" ({reason(error)}){unkept}; they are readable there, and `deltalight recordings recover {active}`"
+            " finishes it."
         )
 
 

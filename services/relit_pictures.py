@@ -36,6 +36,11 @@ class RelitPictures:
         self._waiting: deque[tuple[int, bytes]] = deque(maxlen=KEPT_PICTURES)
         self._frames: deque[int] = deque(maxlen=KEPT_FRAMES)
 
+    @property
+    def lacks_last(self) -> bool:
+        """Whether the picture of the last frame has not come, though pictures do."""
+        return self.count > 0 and self.last_ns < self._frames[-1]
+
     def add_picture(self, message: CompositeMessage, parts: Sequence[memoryview]) -> None:
         """Take a message: write its picture if its frame is recorded, else keep it for a while."""
         picture = relit_picture(message, parts)

@@ -6,6 +6,7 @@ import time
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from random import Random
@@ -141,9 +142,9 @@ class Churn(Fault):
 
     def run(self, run: Run) -> Outcome:
         """Have them do so for a while."""
-        with _compared(run, calm_s=run.profile.load_s) as outcome:
+        with _compared(run, calm_s=run.profile.churn_s) as outcome:
             leave = run.crowd.come_and_go(run.profile.viewers, run.dice.randrange(2**32))
-            time.sleep(run.profile.load_s)
+            time.sleep(run.profile.churn_s)
             leave()
         return {"viewers": run.profile.viewers, **outcome}
 
@@ -181,10 +182,23 @@ class BadLink(Fault):
 
 @dataclass(frozen=True)
 class Cut(Fault):
-    """All links are cut for 5 s: how soon after that the picture is back."""
+    """All links are cut for 5 s: how soon after that the picture is back; the links of peers are cut, too."""
 
     def run(self, run: Run) -> Outcome:
-        """Do it, and wait for a picture captured after it."""
+        """Do it, wait for a picture captured after it, and then until the peers have sent for a while."""
+        seed = run.dice.randrange(2**32)
+        with _compared(run) as outcome, ThreadPoolExecutor(1) as pool:
+            peers = pool.submit(peers_on, run.thread, None, run.profile, seed, cut_s=CUT_S)
+            back_s = self._back_s(run)
+            flows = peers.result()
+        return {
+            "cut_s": CUT_S,
+            "back_s": back_s,
+            **outcome,
+            **{name: vars(flow) for name, flow in flows.items()},
+        }
+
+    def _back_s(self, run: Run) -> float:
         links = run.station.links
         try:
             for link in links:
@@ -195,7 +209,7 @@ class Cut(Fault):
                 link.cut(False)
         mended_ns, mended_s = time.time_ns(), time.monotonic()
         _wait(run, lambda: _all_seen(run, run.crowd.cameras, mended_ns, mended_s))
-        return {"cut_s": CUT_S, "back_s": time.monotonic() - mended_s}
+        return time.monotonic() - mended_s
 
 
 @dataclass(frozen=True)

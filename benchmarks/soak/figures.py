@@ -191,6 +191,7 @@ def _links(outcomes: _Outcomes) -> list[Figure | None]:
         ("link-foxglove", "80±20 ms, 2 % lost"),
         ("link-lossy", "25 Mbit/s, 20±10 ms, 30 % lost"),
         ("link-reorder", "25 Mbit/s, 20±10 ms, 25 % overtaken"),
+        ("cut", "5 s cut and the time after it"),
     ):
         for when, how in (("during", ""), ("newest", ", no rendering"), ("queued", ", everything queued")):
             figures += _flow_figures(outcomes, (name, when), what + how)

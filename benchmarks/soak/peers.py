@@ -100,12 +100,17 @@ class Queued(_Peer):
 PEERS: dict[str, Callable[[int, int], _Peer]] = {"newest": Newest, "queued": Queued}
 
 
-def peers_on(thread: LoopThread, shape: Shape, profile: Profile, seed: int) -> dict[str, Flow]:
-    """Have both send over links of a shape for the profile's time of load; return how messages flowed, by PEERS."""
-    size, rate, seconds = message_bytes(profile.size), profile.frames_per_s, profile.load_s
+def peers_on(
+    thread: LoopThread, shape: Shape | None, profile: Profile, seed: int, *, cut_s: float = 0.0
+) -> dict[str, Flow]:
+    """Have both send over links of a shape for the profile's time of load; return how messages flowed, by PEERS.
+
+    Before that, they send for `cut_s` into links that are cut.
+    """
+    size, rate, seconds = message_bytes(profile.size), profile.frames_per_s, cut_s + profile.load_s
     with ThreadPoolExecutor(len(PEERS)) as pool:
         runs = {
-            name: pool.submit(measure_peer, peer, thread, shape, (size, rate, seconds), seed)
+            name: pool.submit(measure_peer, peer, thread, shape, (size, rate, seconds), seed, cut_s=cut_s)
             for name, peer in PEERS.items()
         }
         return {name: run.result() for name, run in runs.items()}
@@ -114,11 +119,15 @@ def peers_on(thread: LoopThread, shape: Shape, profile: Profile, seed: int) -> d
 def measure_peer(
     peer: Callable[[int, int], _Peer],
     thread: LoopThread,
-    shape: Shape,
+    shape: Shape | None,
     load: tuple[int, float, float],
     seed: int,
+    *,
+    cut_s: float,
 ) -> Flow:
     """Send messages for a while; `load` is their size in bytes, how many a second, and for how many seconds.
+
+    The link is cut for the first `cut_s` of these.
 
     Raises:
         DeltalightError: the peers did not find each other.
@@ -132,7 +141,7 @@ def measure_peer(
         _meet(pair)
         link.shape = shape
         began_s = time.monotonic()
-        with _receiving(pair, seen):
+        with _receiving(pair, seen), _cut(link, cut_s):
             for number in range(round(rate * seconds)):
                 time.sleep(max(0.0, began_s + number / rate - time.monotonic()))
                 pair.send([TOPIC, STAMP.pack(time.time_ns()), content])
@@ -152,6 +161,19 @@ def _meet(pair: _Peer) -> None:
                 pass
             return
     raise DeltalightError("the peers of a link did not find each other on loopback; run it again.")
+
+
+@contextmanager
+def _cut(link: Link, seconds: float) -> Iterator[None]:
+    """Cut a link for the first seconds of a block, which lasts longer."""
+    link.cut(seconds > 0)
+    mending = threading.Timer(seconds, link.cut, (False,))
+    mending.start()
+    try:
+        yield
+    finally:
+        mending.cancel()
+        mending.join()
 
 
 @contextmanager

@@ -14,7 +14,7 @@ class Profile:
     `nodes` sensor nodes send pictures of `size` (pixels) `frames_per_s` times a second; `output` and `method` change
     the demo's scene. `calm_s` is the time before, between and after faults, `load_s` that of faults that go on for
     a while, `stop_s` that of stopped processes, `spare_s` how long at most a fault waits until the spares of killed
-    processes are ready, `viewers` the number that joins and leaves.
+    processes are ready, `viewers` the number that joins and leaves, for `churn_s`.
     """
 
     nodes: int
@@ -27,6 +27,7 @@ class Profile:
     stop_s: float
     spare_s: float
     viewers: int
+    churn_s: float
 
     @property
     def period_ms(self) -> float:
@@ -54,6 +55,7 @@ _DESK = Profile(
     stop_s=10.0,
     spare_s=180.0,
     viewers=50,
+    churn_s=60.0,
 )
 PROFILES = {
     "station": replace(
@@ -75,6 +77,7 @@ PROFILES = {
         stop_s=2.0,
         spare_s=0.0,
         viewers=10,
+        churn_s=3.0,
     ),
 }
 

@@ -13,11 +13,10 @@ from tempfile import NamedTemporaryFile
 from threading import Lock
 from typing import Any
 
-from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services.api.child_process import ChildProcess
 from deltalight.services.api.recording_store import RecordingStore
-from deltalight.services.storage.faults import ConflictError, NotFoundError
+from deltalight.services.storage.faults import ConflictError, NotFoundError, StorageFaultError
 
 # The writer flushes, syncs the disk and closes: seconds on a slow one.
 STOP_TIMEOUT_S = 20.0
@@ -28,22 +27,26 @@ NODE_ANY = ""
 
 @dataclass
 class RecordingSession:
-    """A recording in progress; `figures` are those of `recorder.RecordStatus`, None before the first frame."""
+    """A recording in progress; `figures` are those of `recorder.RecordStatus`, None before the first frame.
+
+    `has_failed`: it ended because the disk refused, as `detail` explains.
+    """
 
     id: str
     node: str
     started: datetime
     figures: Mapping[str, Any] | None = None
     detail: str = ""
+    has_failed: bool = False
     child: ChildProcess | None = field(default=None, repr=False)
 
 
 class RecordingSessions:
     """Starts and stops recordings: one per node at a time, or one of whichever node is heard first.
 
-    Calls `publish(session, is_growing)` at the start of each, once a second from then on, and once at its end. Relit
-    pictures are those of the `room` (directory, name), whichever render server it has; None: of the one at the first
-    endpoint.
+    Calls `publish(session, is_growing)` at the start of each, once a second from then on, and once at its end, and
+    `notice(sentence)` when the disk refuses and when it takes data again. Relit pictures are those of the `room`
+    (directory, name), whichever render server it has; None: of the one at the first endpoint.
     """
 
     def __init__(
@@ -51,10 +54,11 @@ class RecordingSessions:
         store: RecordingStore,
         endpoints: Sequence[str],
         publish: Callable[[RecordingSession, bool], None],
+        notice: Callable[[str], None],
         room: tuple[str, str] | None = None,
     ) -> None:
         self._store, self._endpoints, self._publish = store, tuple(endpoints), publish
-        self._room = room
+        self._notice, self._room = notice, room
         self._running: dict[str, RecordingSession] = {}
         self._lock = Lock()
 
@@ -99,13 +103,13 @@ class RecordingSessions:
         self._publish(session, True)
         return session
 
-    def stop(self, name: str) -> None:
-        """Stop a recording and wait until its file is complete.
+    def stop(self, name: str) -> RecordingSession:
+        """Stop a recording, wait until its file is complete and return what it was.
 
         Raises:
             NotFoundError: no recording of this name is in progress.
             ConflictError: no frame arrived, so there is no recording.
-            DeltalightError: the disk refused.
+            StorageFaultError: the disk refuses; the frames so far are kept.
         """
         session = next((each for each in self.running() if each.id == name), None)
         if session is None or session.child is None:
@@ -115,8 +119,9 @@ class RecordingSessions:
             session.child.end(END_TIMEOUT_S)
         if not (session.figures or {}).get("frames"):
             raise ConflictError(session.detail or "No frame had come, so that nothing was recorded.")
-        if session.detail:
-            raise DeltalightError(session.detail)
+        if session.has_failed:
+            raise StorageFaultError(session.detail)
+        return session
 
     def close(self) -> None:
         """Stop all recordings and complete their files."""
@@ -164,18 +169,23 @@ class RecordingSessions:
     def _note(self, session: RecordingSession, child: ChildProcess, line: str) -> None:
         """Parse the recorder's output, one line a second; its standard error explains why no frame arrives."""
         with suppress(ValueError):
-            figures = json.loads(line)
+            figures, before = json.loads(line), session.figures or {}
             session.figures = figures if figures["frames"] else None
-        session.detail = self._said(child)
+            if figures["disk"] != before.get("disk", ""):
+                self._notice(self._named(figures["disk"]))
+        session.detail = self._named(child.last_sentence)
         self._publish(session, True)
 
     def _end(self, session: RecordingSession, child: ChildProcess, code: int) -> None:
-        session.detail = "" if code in ENDED_WELL and session.figures else self._said(child)
+        figures = session.figures or {}
+        session.has_failed = code not in ENDED_WELL or not figures
+        session.detail = self._named(child.last_sentence if session.has_failed else figures["disk"])
         self._forget(session)
         self._publish(session, False)
 
-    def _said(self, child: ChildProcess) -> str:
-        return child.last_sentence.replace(f"{self._store.folder}{os.sep}", "")
+    def _named(self, sentence: str) -> str:
+        """Return a sentence with the recordings' names in place of their paths."""
+        return sentence.replace(f"{self._store.folder}{os.sep}", "")
 
     def _forget(self, session: RecordingSession) -> None:
         with self._lock:

@@ -298,7 +298,8 @@ class RecordingStore:
             return known
         with self._reading:
             facts, detail = _read_facts(path)
-            write_bytes(cached, json.dumps({"key": key, "facts": facts, "detail": detail}).encode())
+            with suppress(DeltalightError):  # a full disk: it will be read again
+                write_bytes(cached, json.dumps({"key": key, "facts": facts, "detail": detail}).encode())
             return facts, detail
 
 

@@ -234,6 +234,7 @@ class _Builder:
                 self._recordings,
                 endpoints,
                 publish_recording,
+                lambda text: events.publish("notice", {"text": text}),
                 None if self._settings.rooms is None else (self._settings.rooms, room),
             ),
             replay=replay,

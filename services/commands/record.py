@@ -157,6 +157,8 @@ def _losses(status: "RecordStatus") -> str:
     if status.node_drops:
         parts.append(f"{status.node_drops} dropped by the node itself")
     parts += [f"{count} {cause} dropped here" for cause, count in status.dropped.items() if count]
+    if status.unkept:
+        parts.append(f"{status.unkept} frames that the disk refused")
     return ", ".join(parts) or "nothing"
 
 

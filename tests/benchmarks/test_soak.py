@@ -89,6 +89,39 @@ def test_over_a_narrow_link_a_queue_ages_more_than_the_newest(monkeypatch: pytes
     assert 100 < newest < queued
 
 
+def test_after_a_cut_a_queue_delivers_what_is_old_and_the_newest_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        peers, "message_bytes", lambda _size: 60_000
+    )  # what is cut fits into no socket's buffer
+    load = replace(PROFILES["small"], frames_per_s=20.0, load_s=1.0)
+    with LoopThread("peers") as thread:
+        flows = peers.peers_on(thread, None, load, seed=1, cut_s=2.0)
+    newest, queued = flows["newest"], flows["queued"]
+    assert min(newest.longest_gap_s, queued.longest_gap_s) >= 1.9
+    assert queued.frames_per_s > newest.frames_per_s > 0
+    assert queued.age_p50_ms is not None
+    assert newest.age_p50_ms is not None
+    assert queued.age_p50_ms > newest.age_p50_ms
+
+
+def test_the_rows_of_a_cut_stand_beside_those_of_a_queue() -> None:
+    flow = {"age_p50_ms": 40.0, "age_p95_ms": 90.0, "longest_gap_s": 5.2}
+    cut = FaultRecord(
+        name="cut",
+        began_s=1,
+        ended_s=30,
+        outcome={"back_s": 0.3, "during": flow, "newest": flow, "queued": {**flow, "age_p95_ms": 4600.0}},
+    )
+    figures = {(each.what, each.how): each for each in all_figures(soaked(faults=[cut]))}
+    assert figures["picture back after a cut", "5 s, all links (1)"].is_met
+    what = "5 s cut and the time after it"
+    assert figures["longest gap", f"{what} (1)"].result == "5.2 s"
+    assert figures["age, 95 of 100", f"{what}, no rendering (1)"].result == "90 ms"
+    assert figures["age, 95 of 100", f"{what}, everything queued (1)"].result == "4600 ms"
+
+
 def test_jitter_keeps_the_order() -> None:
     schedule, shape = Schedule(random.Random(1)), SHAPES["arm"]
     left_s = [schedule.leaves_s(0.001 * number, 100, shape) for number in range(500)]

@@ -5,13 +5,16 @@ What is refused is one sentence, and nothing is half-written.
 The disk is a tmpfs of a mount namespace, so it needs a Linux that lets the user make one.
 """
 
+import json
 import secrets
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 import httpx
 import psutil
@@ -21,6 +24,7 @@ from deltalight.protocol.source import open_source
 from deltalight.services import ports
 from tests.services.api_samples import sentence
 from tests.services.conftest import ROOT, RunCli
+from tests.services.live_samples import event_socket, next_event
 from tests.services.record_samples import feeding
 from tests.services.storage_samples import TETRAHEDRON
 from tests.services.test_api_process import wait_for
@@ -58,10 +62,10 @@ def disk(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def serving(disk: Path, size: str, script: str) -> Iterator[tuple[httpx.Client, int]]:
+def serving(disk: Path, size: str, script: str, *options: str) -> Iterator[tuple[httpx.Client, int]]:
     """A web process that a shell script starts, with its data on a disk of this size; and its process id."""
     (port,) = ports.private_ports(1)
-    command = on_small_disk(size, disk, script, "api", "--port", port, "--data", disk / "data")
+    command = on_small_disk(size, disk, script, "api", "--port", port, "--data", disk / "data", *options)
     with (
         httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=PATIENCE_S) as client,
         subprocess.Popen(command, cwd=ROOT) as process,
@@ -136,19 +140,166 @@ def run_to_its_end(command: list[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
-def test_a_recording_that_fills_the_disk_keeps_its_frames(disk: Path, tmp_path: Path, cli: RunCli) -> None:
+class Take:
+    """`record` of a node onto a small disk, from the first frames on; the disk is copied to `kept` at its end."""
+
+    def __init__(self, process: "subprocess.Popen[str]", disk: Path, kept: Path) -> None:
+        self.process, self._kept, self._mounted = process, kept, disk
+        self.disk = Path(f"/proc/{process.pid}/root{disk}")
+        self.until(lambda figures: figures["frames"] > 5)
+
+    @property
+    def recorder(self) -> psutil.Process:
+        return psutil.Process(self.process.pid).children()[0]
+
+    def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The first figures from now on that fulfil a condition."""
+        assert self.process.stdout is not None
+        return next(figures for figures in map(json.loads, self.process.stdout) if condition(figures))
+
+    def refused(self, reason: str) -> int:
+        """Wait until the disk refused frames, and see that the ones before can be read; how many these are."""
+        figures = self.until(lambda figures: figures["unkept"] > 0)
+        assert (
+            f"a.mcap.active cannot grow ({reason}); its {figures['frames']} frames are kept"
+            in figures["disk"]
+        )
+        assert len(open_source(self.disk / "a.mcap.active")) == figures["frames"]
+        return int(figures["frames"])
+
+    def mount(self, options: str) -> None:
+        inside = ("nsenter", "--user", "--mount", "--target", str(self.process.pid), "mount", "-o", options)
+        subprocess.run([*inside, str(self._mounted)], check=True, timeout=PATIENCE_S)
+
+    def end(self) -> tuple[int, dict[str, Any], list[str]]:
+        """Stop it; the exit code, the summary if there is one, and what it told."""
+        self.recorder.send_signal(signal.SIGINT)
+        code = self.process.wait(PATIENCE_S)
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        lines = self.process.stdout.read().splitlines()
+        told = [line for line in self.process.stderr.read().splitlines() if "has room for" not in line]
+        return code, json.loads(lines[-1]) if lines else {}, told
+
+    def goes_on_to_its_end(self, before: int) -> None:
+        """See that it goes on by itself, and that at its end all frames are there that the disk did not refuse."""
+        assert "takes data again" in self.until(lambda figures: figures["frames"] > before + 20)["disk"]
+        code, last, told = self.end()
+        assert code == 0
+        assert [line.split("; ")[1].partition(" ")[0] for line in told] == ["its", str(last["unkept"])]
+        (path,) = self._kept.glob("*.mcap*")
+        assert path.name == "a.mcap"
+        found = [frame.frame_id for frame in open_source(path)]
+        assert len(found) == last["frames"]
+        lost = last["unkept"] + last["missing"].get("color", 0)  # the latter on a busy machine
+        assert found[-1] - found[0] + 1 == last["frames"] + lost
+
+
+@pytest.fixture
+def take(disk: Path, tmp_path: Path) -> Iterator[Take]:
     kept = tmp_path / "kept"
     keep = f'"$@"; code=$?; cp -r {quote(str(disk))} {quote(str(kept))}; exit $code'
+    options = ("--progress", "--json", "--out", disk / "a.mcap")
     with feeding() as (endpoint, _):
-        done = run_to_its_end(
-            on_small_disk("1m", disk, keep, "record", "--out", disk / "a.mcap", "--subscribe", endpoint)
+        command = on_small_disk("16m", disk, keep, "record", *options, "--subscribe", endpoint)
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True) as process:
+            try:
+                yield Take(process, disk, kept)
+            finally:
+                for each in psutil.Process(process.pid).children() if process.poll() is None else ():
+                    each.kill()
+
+
+def test_a_recording_that_fills_the_disk_goes_on_when_there_is_room(take: Take) -> None:
+    fill(take.disk / "ballast")
+    before = take.refused("No space left on device")
+    (take.disk / "ballast").unlink()
+    take.goes_on_to_its_end(before)
+
+
+def test_a_recording_at_a_limit_goes_on_when_it_is_lifted(take: Take) -> None:
+    """As for a quota, the system refuses in the middle of a frame, here by RLIMIT_FSIZE."""
+    size = (take.disk / "a.mcap.active").stat().st_size
+    take.recorder.rlimit(psutil.RLIMIT_FSIZE, (size + 100_000, psutil.RLIM_INFINITY))
+    before = take.refused("File too large")
+    take.recorder.rlimit(psutil.RLIMIT_FSIZE, (psutil.RLIM_INFINITY, psutil.RLIM_INFINITY))
+    take.goes_on_to_its_end(before)
+
+
+def test_a_recording_goes_on_after_its_disk_was_read_only(take: Take) -> None:
+    """The system makes no disk read-only while a file is being written there, but the recorder closes its own."""
+    fill(take.disk / "ballast")
+    before = take.refused("No space left on device")
+    take.mount("remount,ro")
+    unkept = take.until(lambda _: True)["unkept"]
+    figures = take.until(lambda figures: figures["unkept"] > unkept + 100)  # it tried in between
+    assert figures["frames"] == before
+    take.mount("remount,rw,size=32m")
+    take.goes_on_to_its_end(before)
+
+
+def test_a_recording_that_is_stopped_on_a_full_disk_keeps_its_frames(
+    take: Take, tmp_path: Path, cli: RunCli
+) -> None:
+    fill(take.disk / "ballast")
+    before = take.refused("No space left on device")
+    code, _, told = take.end()
+    assert code == 2
+    assert len(told) == 2
+    assert f"ended after {before} frames" in told[-1]
+    assert "No space left on device" in told[-1]
+    assert cli("recordings", "recover", tmp_path / "kept" / "a.mcap.active").returncode == 0
+    assert len(open_source(tmp_path / "kept" / "a.mcap")) == before
+
+
+def test_recordings_of_the_web_process_wait_for_a_full_disk_and_tell_of_it(disk: Path) -> None:
+    with (
+        feeding() as (endpoint, _),
+        serving(disk, "32m", 'exec "$@"', "--subscribe", endpoint) as (client, process_id),
+    ):
+        ballast = Path(f"/proc/{process_id}/root{disk}/ballast")
+
+        def reach(name: str, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+            state: dict[str, Any] = {}
+
+            def has_come() -> bool:
+                state.update(client.get(f"/recordings/{name}").raise_for_status().json())
+                return condition(state)
+
+            wait_for(has_come)
+            return state
+
+        def record_until_full(name: str) -> dict[str, Any]:
+            client.post("/recordings", json={"name": name}).raise_for_status()
+            reach(name, lambda take: (take["frames"] or 0) > 5)
+            fill(ballast)
+            refused = reach(name, lambda take: take["unkept"] > 0)
+            assert refused["state"] == "recording"
+            frames = f"its {refused['frames']} frames are kept"
+            assert f"{name}.mcap.active cannot grow (No space left on device); {frames}" in refused["detail"]
+            return refused
+
+        with event_socket(str(client.base_url.netloc, "ascii")) as events:
+            before = record_until_full("patient")
+            assert next_event(events, "notice")["text"] == before["detail"]
+            ballast.unlink()
+            assert "takes data again" in next_event(events, "notice")["text"]
+        ended = client.post("/recordings/patient/stop").raise_for_status().json()
+        assert ended["state"] == "finished"
+        assert f"{ended['unkept']} frames could not be kept" in ended["detail"]
+        assert ended["unkept"] >= before["unkept"] > 0
+        before = record_until_full("stopped")
+        told = sentence(client.post("/recordings/stopped/stop"), 503)
+        assert (
+            f"ended after {before['frames']} frames, because stopped.mcap.active could not be written" in told
         )
-    assert done.returncode == 2, done.stderr
-    assert "No space left on device" in done.stderr.strip().splitlines()[-1]
-    assert "Traceback" not in done.stderr
-    (active,) = kept.iterdir()
-    assert cli("recordings", "recover", active).returncode == 0
-    assert len(open_source(kept / "a.mcap")) > 0
+        listed = {each["id"]: each for each in client.get("/recordings").raise_for_status().json()}
+        assert listed["stopped"]["state"] == "interrupted"
+        assert listed["stopped"]["frames"] == before["frames"]
+        ballast.unlink()
+        recovered = client.post("/recordings/stopped/recover").raise_for_status().json()
+        assert (recovered["state"], recovered["frames"]) == ("finished", before["frames"])
 
 
 def test_a_read_only_disk_is_one_sentence(disk: Path) -> None:

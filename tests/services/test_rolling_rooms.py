@@ -8,6 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from deltalight.benchmarks.rooms.processes import wait_for
 from deltalight.benchmarks.soak.profiles import choose_profile
 from deltalight.benchmarks.soak.station import soaked_scene, write_take
 from deltalight.protocol.receiver import Receiver
@@ -20,7 +21,6 @@ from deltalight.services.rooms.local_placer import LocalPlacer
 from deltalight.services.rooms.placer import Placement, RoomOrder
 from deltalight.services.rooms.status import RoomNode
 from tests.services.older_version import OLDER, running
-from tests.services.rooms_installation import wait_for
 
 pytestmark = pytest.mark.slow(seconds=40)
 SIZE, FRAMES_PER_S = (96, 72), 5.0

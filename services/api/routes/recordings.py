@@ -122,7 +122,7 @@ class RecordingAnswer(StrictModel):
     state: Literal["waiting", "recording", "finished", "interrupted"] = Field(
         description="`waiting` = no frame has arrived yet; `interrupted` = its recorder was killed: recover it."
     )
-    detail: str = Field(description="Why it cannot grow or be read; else empty.")
+    detail: str = Field(description="Why it cannot grow or be read, or what it lacks; else empty.")
     changed: datetime = Field(description="When it was finished; while recording, when it was started.")
     size_bytes: int
     duration_s: float | None
@@ -130,6 +130,7 @@ class RecordingAnswer(StrictModel):
     frames_per_s: float | None
     composites: int = Field(description="Number of relit pictures in it.")
     lost: dict[str, int] = Field(description="Missing messages, by stream; known while recording.")
+    unkept: int = Field(description="Frames left out because the disk refused them; known until it ends.")
     streams: dict[str, Stream]
     scene: str | None = Field(description="Title of the attached scene, empty if untitled; null = no scene.")
     checklist: list[Check] = Field(description="Requirements for relighting; empty while recording.")
@@ -150,6 +151,7 @@ class RecordingAnswer(StrictModel):
             frames_per_s=figures.get("frames_per_s"),
             composites=figures.get("composites", 0),
             lost={**figures.get("missing", {}), **figures.get("dropped", {})},
+            unkept=figures.get("unkept", 0),
             streams={},
             scene=None,
             checklist=[],
@@ -171,6 +173,7 @@ class RecordingAnswer(StrictModel):
             frames_per_s=facts.get("frames_per_s"),
             composites=facts.get("composites", 0),
             lost={},
+            unkept=0,
             streams={
                 topic: Stream(messages=figures["messages"], size_bytes=figures["bytes"])
                 for topic, figures in facts.get("streams", {}).items()
@@ -179,6 +182,13 @@ class RecordingAnswer(StrictModel):
             checklist=_checklist(facts) if facts else [],
             notes=[note.replace(str(recording.path), recording.id) for note in facts.get("notes", [])],
         )
+
+    @classmethod
+    def ended(cls, recording: StoredRecording, session: RecordingSession) -> Self:
+        """Describe a recording that has just ended."""
+        stored, figures = cls.stored(recording), session.figures or {}
+        told = {"detail": session.detail or stored.detail, "unkept": figures.get("unkept", 0)}
+        return stored.model_copy(update=told)
 
 
 class NewReplay(StrictModel):
@@ -283,12 +293,16 @@ def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
     return RecordingAnswer.stored(shared.recordings.get(recording_id)) if growing is None else growing
 
 
-@router.post("/{recording_id}/stop", responses=responses(404, 409, 422))
+@router.post("/{recording_id}/stop", responses=responses(404, 409, 422, 503))
 @in_pool("recordings")
 def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
-    """Stop a recording; 409 if no frame had arrived, so that nothing was recorded."""
-    shared.recording_sessions.stop(recording_id)
-    return RecordingAnswer.stored(shared.recordings.get(recording_id))
+    """Stop a recording.
+
+    409 if no frame had arrived, so that nothing was recorded; 503 if the disk refuses its end, so that it is
+    `interrupted` and can be recovered.
+    """
+    session = shared.recording_sessions.stop(recording_id)
+    return RecordingAnswer.ended(shared.recordings.get(recording_id), session)
 
 
 @router.post("/{recording_id}/recover", responses=responses(404, 409, 422))
@@ -393,10 +407,9 @@ def recording_event(
     if is_growing:
         return RecordingAnswer.growing(session).model_dump()
     try:
-        ended = RecordingAnswer.stored(recordings.get(session.id))
+        return RecordingAnswer.ended(recordings.get(session.id), session).model_dump()
     except DeltalightError:  # no frame arrived
         return {**RecordingAnswer.growing(session).model_dump(), "deleted": True}
-    return {**ended.model_dump(), "detail": session.detail or ended.detail}
 
 
 def _growing(shared: Context) -> dict[str, RecordingAnswer]:

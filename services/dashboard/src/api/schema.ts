@@ -547,7 +547,10 @@ export interface paths {
         readonly put?: never;
         /**
          * Stop Recording
-         * @description Stop a recording; 409 if no frame had arrived, so that nothing was recorded.
+         * @description Stop a recording.
+         *
+         *     409 if no frame had arrived, so that nothing was recorded; 503 if the disk refuses its end, so that it is
+         *     `interrupted` and can be recovered.
          */
         readonly post: operations["stop_recording"];
         readonly delete?: never;
@@ -3265,7 +3268,7 @@ export interface components {
             readonly composites: number;
             /**
              * Detail
-             * @description Why it cannot grow or be read; else empty.
+             * @description Why it cannot grow or be read, or what it lacks; else empty.
              */
             readonly detail: string;
             /** Duration S */
@@ -3309,6 +3312,11 @@ export interface components {
             readonly streams: {
                 readonly [key: string]: components["schemas"]["Stream"];
             };
+            /**
+             * Unkept
+             * @description Frames left out because the disk refused them; known until it ends.
+             */
+            readonly unkept: number;
         };
         /**
          * RectangleLight
