@@ -85,7 +85,7 @@ def soak(job: SoakJob, say: Say) -> SoakReport:
         log = _Log(time.monotonic())
         with Sampler(station) as sampler:
             _put_to_faults(job, run, log, say)
-        renderer, deaths = _renderer(station), station.deaths()
+        renderer, deaths = renderer_of(station), station.deaths()
         names, cameras = station.names, station.cameras
         seconds = time.monotonic() - log.began_s
         seen = run.crowd.between(log.began_s, float("inf"))
@@ -163,7 +163,8 @@ def _wait(station: Station, condition: Callable[[], bool], otherwise: str) -> No
         time.sleep(0.1)
 
 
-def _renderer(station: Station) -> str:
+def renderer_of(station: Station) -> str:
+    """Return what the station's render server renders with."""
     known = station.client.get("/nodes").raise_for_status().json()
     detail = next((each["detail"] for each in known if each["kind"] == "render_server"), "")
     return str(detail).partition("; ")[0]  # remarks about faults and cameras follow
