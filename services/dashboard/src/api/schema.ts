@@ -5872,7 +5872,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
+            /** @description The render server does not respond, or has too many pending requests; try again after Retry-After. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -5964,7 +5964,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
+            /** @description The render server does not respond, or has too many pending requests; try again after Retry-After. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -13295,7 +13295,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
+            /** @description The render server does not respond, or has too many pending requests; try again after Retry-After. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
