@@ -26,7 +26,8 @@ Record = dict[str, Any]
 
 def main() -> None:
     """Print what is known of the packages; exit code 1: something is, 2: the database cannot be read."""
-    components = runpy.run_path(str(Path(__file__).with_name("sbom.py")))["bill"]()["components"]
+    listed = runpy.run_path(str(Path(__file__).with_name("sbom.py")))["bill"]()["components"]
+    components = [each for each in listed if _kind(each) in ECOSYSTEMS]
     try:
         records = list(read_records(Path(sys.argv[1])))
     except (OSError, ValueError, zipfile.BadZipFile) as fault:
@@ -78,10 +79,10 @@ def weaknesses(components: list[Record], records: list[Record]) -> Iterator[str]
             key = _key(package.get("ecosystem", ""), package.get("name", ""))
             by_package.setdefault(key, []).append((record, affected))
     for component in components:
-        kind, _, rest = component["purl"].removeprefix("pkg:").partition("/")
-        name = rest.rpartition("@")[0].replace("%40", "@")
+        path = component["purl"].partition("/")[2]
+        name = path.rpartition("@")[0].replace("%40", "@")
         told = set()
-        for record, affected in by_package.get(_key(ECOSYSTEMS[kind], name), []):
+        for record, affected in by_package.get(_key(ECOSYSTEMS[_kind(component)], name), []):
             if record["id"] not in told and is_affected(component["version"], affected):
                 told.add(record["id"])
                 summary = str(record.get("summary", ""))[:LONGEST_SUMMARY]
@@ -117,6 +118,11 @@ def _is_in(version: Version, events: list[Record]) -> bool:
 def _place(event: Record) -> tuple[Version, bool]:
     kind, at = next(iter(event.items()))
     return Version(at), kind == "last_affected"
+
+
+def _kind(component: Record) -> str:
+    """Return where a package is from; images and Debian's have no version that a record could name."""
+    return str(component["purl"].removeprefix("pkg:").partition("/")[0])
 
 
 def _key(ecosystem: str, name: str) -> tuple[str, str]:

@@ -51,6 +51,13 @@ def write_bytes(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+def write_secret(path: Path, content: bytes) -> None:
+    """Write `content` to `path` atomically; nobody but the owner can read it at any time."""
+    with replacing(path) as temporary:
+        temporary.touch(mode=0o600, exist_ok=False)
+        temporary.write_bytes(content)
+
+
 def write_png(path: Path, color: UInt8[np.ndarray, "h w 3"]) -> None:
     """Write an RGB picture losslessly, at a low compression level."""
     bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)

@@ -15,6 +15,7 @@ from deltalight import __version__
 from deltalight.protocol.keys import Keys
 from deltalight.services.api.auth import AuthMiddleware, AuthRules
 from deltalight.services.api.credentials import SecretToken
+from deltalight.services.api.host_names import HostNames
 from deltalight.services.api.metrics import Meter
 from deltalight.services.api.problems import describe_problems, responses
 from deltalight.services.api.room_paths import RoomPaths
@@ -129,6 +130,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
 
     rules = AuthRules(
         needs_token=settings.leaves_host,
+        host_names=HostNames(on_loopback=not settings.leaves_host, allowed=settings.allowed_hosts),
         requests_per_s=settings.requests_per_s,
         upload_limit_bytes=settings.upload_limit_mb << 20,
         recording_limit_bytes=settings.recording_limit_mb << 20,

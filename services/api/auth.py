@@ -13,9 +13,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.api.credentials import Principal, SecretToken, Tickets, principal_of, set_principal
+from deltalight.services.api.host_names import HostNames
 from deltalight.services.api.limits import RateLimit, StreamLimits, run_while
 from deltalight.services.api.problems import ProblemError, Problems
-from deltalight.services.ports import LOOPBACK
 from deltalight.services.storage.faults import OutdatedTokenError
 from deltalight.services.storage.tokens import TokenStore
 
@@ -30,16 +30,16 @@ READ_ONLY_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
 WHEP_PATH = "/api/v1/whep"  # its sessions, below it, show pictures and change nothing
 ADDRESSES_OF_TOKEN = 4  # that may send as much as one may, all together
 WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE = 1 / 6, 10
-LOOPBACK_NAMES = frozenset({LOOPBACK, "localhost", "::1"})
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 POLICY_VIOLATION = 1008  # WebSocket close code
 
 
 @dataclass(frozen=True)
 class AuthRules:
-    """Requirements of the middleware; without `needs_token` the Host header must be that of loopback."""
+    """Requirements of the middleware."""
 
     needs_token: bool
+    host_names: HostNames
     requests_per_s: float
     upload_limit_bytes: int
     recording_limit_bytes: int
@@ -120,10 +120,7 @@ class AuthMiddleware:
 
     def _check_names(self, headers: Headers) -> None:
         host = headers.get("host", "")
-        if not self._rules.needs_token and _host_name(host) not in LOOPBACK_NAMES:
-            raise ProblemError(
-                400, "host", "This service is only reachable on loopback; open it as 127.0.0.1 or localhost."
-            )
+        self._rules.host_names.require(host)
         origin = headers.get("origin")
         if (origin is not None and (_host_of(origin) or " ") != host.lower()) or _is_embedded(headers):
             raise ProblemError(
@@ -269,11 +266,3 @@ def _host_of(origin: str) -> str:
         return urlsplit(origin).netloc.lower()
     except ValueError:
         return ""
-
-
-def _host_name(host: str) -> str | None:
-    """Return the name in a Host header, without its port."""
-    try:
-        return urlsplit(f"//{host}").hostname
-    except ValueError:
-        return None

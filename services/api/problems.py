@@ -27,6 +27,7 @@ from deltalight.services.storage.faults import (
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:deltalight:problem:"
+LOOKED_AGAIN_S = "1"  # a silent render server is asked again each second
 
 log = structlog.get_logger()
 
@@ -115,7 +116,8 @@ class Problems:
         """Return the response to a refusal by the storage or a document."""
         status, kind = next((status, kind) for each, status, kind in _KINDS if isinstance(fault, each))
         revision = fault.current if isinstance(fault, StaleRevisionError) else None
-        return self.response(status, kind, str(fault), revision=revision)
+        headers = {"Retry-After": LOOKED_AGAIN_S} if isinstance(fault, UnansweredError) else None
+        return self.response(status, kind, str(fault), headers=headers, revision=revision)
 
     def install(self, app: FastAPI) -> None:
         """Register the handlers of all errors of the application."""

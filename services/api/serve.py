@@ -3,6 +3,7 @@
 import gc
 import logging
 import socket
+import sys
 import time
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import write_secret
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.methods import PLUGINS
@@ -23,7 +25,7 @@ from deltalight.services.host_store import FIRST_SCENE, activate_first, import_s
 from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultError
 from deltalight.services.storage.store import Store, default_folder
 
-FIRST_TOKEN = "first"
+FIRST_TOKEN, FIRST_TOKEN_FILE = "first", "first_token"
 MAX_CONNECTIONS = 256
 ANSWER_TIMEOUT_S = 1.0
 DATABASE_PATIENCE_S, DATABASE_INTERVAL_S = 60.0, 2.0
@@ -36,7 +38,7 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
     """Serve until SIGINT or SIGTERM; import and activate `scene` first.
 
     Without any scene, take over that of the render server, or create an empty one. If the address leaves the host and
-    there is no token yet, create one and print it.
+    there is no token yet, create one and show it: at a terminal there, else in a file of the data folder.
 
     Raises:
         DeltalightError: the port is in use, the data folder cannot be used, or the scene is wrong.
@@ -139,8 +141,18 @@ def _announce_access(settings: ApiSettings, store: Store) -> None:
         host=settings.host,
     )
     if store.tokens.is_empty and settings.token_file is None:
-        token = store.tokens.create(FIRST_TOKEN, "control")
+        _hand_out(store.tokens.create(FIRST_TOKEN, "control"), store.folder / FIRST_TOKEN_FILE)
+
+
+def _hand_out(token: str, path: Path) -> None:
+    """Show the first token to who sits at a terminal; else keep it in a file: what is printed ends in a log."""
+    if sys.stdout.isatty():
         print(f"Token `{FIRST_TOKEN}` (role control), shown this once: {token}", flush=True)
+        return
+    write_secret(path, f"{token}\n".encode())
+    log.warning(
+        f"token `{FIRST_TOKEN}` (role control) is in a file; delete the file once you have it", file=str(path)
+    )
 
 
 def make_first_scene(store: Store, settings: ApiSettings, keys: Keys | None) -> None:

@@ -1,5 +1,6 @@
 """Settings of the REST API's process."""
 
+import re
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,10 @@ from pydantic import Field, field_validator
 from deltalight.protocol.documents import StrictModel
 from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT, endpoint
 
+HOST_NAME = re.compile(
+    r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?"
+)
+
 
 class ApiSettings(StrictModel):
     """Settings of the web process: dashboard, REST API, live video."""
@@ -16,6 +21,11 @@ class ApiSettings(StrictModel):
     host: str = Field(
         default=LOOPBACK,
         description="Address to listen on; one that other hosts can reach (0.0.0.0 for all) needs tokens.",
+    )
+    allowed_hosts: tuple[str, ...] = Field(
+        default=(),
+        description="Names under which other hosts open the page, such as that of a proxy, beside this host's own "
+        "names and IP addresses; requests for any other name are refused. On loopback, only its names are taken.",
     )
     port: int = Field(default=PAGE_PORT, ge=1, le=65535, description="Port to listen on.")
     data: Path | None = Field(
@@ -87,6 +97,14 @@ class ApiSettings(StrictModel):
         if host not in (None, "localhost"):
             ip_address(host)  # a name would be resolved, and could change its meaning
         return host
+
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _check_names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            if not HOST_NAME.fullmatch(name):
+                raise ValueError(f"{name!r:.80} is no host name; write it without scheme, port and wildcard.")
+        return tuple(name.lower().removesuffix(".") for name in names)
 
     @property
     def leaves_host(self) -> bool:

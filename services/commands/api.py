@@ -38,6 +38,13 @@ def serve(
             help="Address to listen on; any other than loopback requires tokens. Default: 127.0.0.1."
         ),
     ] = None,
+    allowed_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Name under which other hosts open the page, such as that of a proxy, beside this host's own names; "
+            "may be given more than once."
+        ),
+    ] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port. Default: 8000.")] = None,
     data: Data = None,
     database: DatabaseAddress = None,
@@ -84,6 +91,7 @@ def serve(
 
     given: dict[str, Any] = {
         "host": host,
+        "allowed_hosts": allowed_host or None,
         "port": port,
         "data": data,
         "database": database,

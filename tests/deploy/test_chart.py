@@ -140,6 +140,25 @@ def test_variables_are_settings(resources: list[Resource], monkeypatch: pytest.M
             assert settings.jobs is (container["name"] != "web")
 
 
+def test_web_processes_take_the_names_of_ingress_and_services(monkeypatch: pytest.MonkeyPatch) -> None:
+    from deltalight.services.api.settings import ApiSettings
+
+    mine = {
+        "ingress": {"enabled": True, "host": "Station.example"},
+        "web": {"allowedHosts": ["wall.example"]},
+    }
+    containers_of = {each["name"]: each for each in all_containers(rendered(mine))}
+    for name in ("web", "keeper"):
+        (hosts,) = (
+            each["value"]
+            for each in containers_of[name]["env"]
+            if each["name"] == "DELTALIGHT_API__ALLOWED_HOSTS"
+        )
+        monkeypatch.setenv("DELTALIGHT_API__ALLOWED_HOSTS", hosts)
+        taken = load_configuration().section("api", ApiSettings).allowed_hosts
+        assert {"station.example", "wall.example", "fleet-web", "fleet-keeper.museum.svc"} <= set(taken)
+
+
 def test_probes_ask_routes_that_are_there_at_ports_that_are_open(
     resources: list[Resource], paths: set[str]
 ) -> None:

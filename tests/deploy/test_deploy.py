@@ -155,6 +155,14 @@ def test_the_service_of_rooms_has_known_options_settings_and_rooms(monkeypatch: 
     assert settings.leaves_host
 
 
+def test_prometheus_asks_the_web_process_by_a_name_that_it_takes() -> None:
+    """It takes addresses, as the service of rooms is asked by, and its container's own name."""
+    jobs = yaml.safe_load((DEPLOY / "prometheus" / "prometheus.yml").read_text())["scrape_configs"]
+    asked = [target for job in jobs for each in job.get("static_configs", ()) for target in each["targets"]]
+    assert asked == [f"{compose()['services']['api']['hostname']}:8000"]
+    assert all(each["type"] == "A" for job in jobs for each in job.get("dns_sd_configs", ()))
+
+
 @contextmanager
 def running(words: list[str]) -> Iterator[None]:
     child = subprocess.Popen([sys.executable, "-m", "deltalight.services.cli", *words], cwd=ROOT)

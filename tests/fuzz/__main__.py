@@ -12,8 +12,10 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from deltalight.protocol.files import write_bytes
 from deltalight.protocol.vectors import frame_pieces
@@ -29,18 +31,25 @@ OWN_PEAK = ("sh", "-c", '"$@"; exit "$?"', "sh")
 NO_ATHERIS = "fuzzing needs atheris, which there is for Linux on x86-64 and Python up to 3.13"
 
 
+@dataclass(frozen=True)
+class Plan:
+    """How long each target is fuzzed: `minutes`, or `executions` however long they take; `seed` 0 is a new one."""
+
+    seed: int
+    minutes: float = 2.0
+    executions: int | None = None
+
+
 def main() -> None:
     """Fuzz the chosen targets one after the other and print their figures as JSON lines."""
     options = _options()
     if find_spec("atheris") is None:
         sys.exit(NO_ATHERIS)
+    plan = Plan(options.seed, options.minutes, options.executions)
     for target in options.targets or TARGETS:
-        grown = options.work / target
-        grown.mkdir(parents=True, exist_ok=True)
-        write_seeds(target, grown)
-        print(json.dumps(_fuzz(target, grown, options)), flush=True)
+        print(json.dumps(fuzzed(target, options.work, plan)), flush=True)
         if options.distil:
-            _distil(target, grown)
+            _distil(target, options.work / target)
 
 
 def _options() -> argparse.Namespace:
@@ -65,39 +74,45 @@ def write_seeds(target: str, grown: Path) -> None:
     (KEPT / target).mkdir(parents=True, exist_ok=True)
 
 
-def _fuzz(target: str, grown: Path, options: argparse.Namespace) -> dict[str, object]:
-    """Run until the time is up or enough was executed, again after each crash; return the figures."""
-    began_s, executions, crashes, peak_mb, slowest_s = time.monotonic(), 0, 0, 0, 0
+def fuzzed(target: str, work: Path, plan: Plan) -> dict[str, Any]:
+    """Run until the time is up or enough was executed, again after each crash; return the figures.
+
+    The corpus grows in the target's folder in `work`.
+    """
+    grown = work / target
+    grown.mkdir(parents=True, exist_ok=True)
+    write_seeds(target, grown)
+    began_s, executions, crashes, peak_mb, slowest_ms = time.monotonic(), 0, 0, 0, 0
     before = _contents(KEPT / target)
-    while (left := _left(options, time.monotonic() - began_s, executions)) and crashes < MOST_CRASHES:
-        seed = options.seed and options.seed + crashes
+    while (left := _left(plan, time.monotonic() - began_s, executions)) and crashes < MOST_CRASHES:
+        seed = plan.seed and plan.seed + crashes
         code, told = run_fuzzer(target, grown, KEPT / target, left, f"-seed={seed}")
         executions += told_figure(told, "number_of_executed_units")
         peak_mb = max(peak_mb, told_figure(told, "peak_rss_mb"))
-        slowest_s = max(slowest_s, told_figure(told, "slowest_unit_time_sec"))
+        slowest_ms = max(slowest_ms, told_figure(told, "slowest_input_ms"))
         if code == 0:
             break
         crashes += 1
         print(told[-3000:], file=sys.stderr, flush=True)
     return {
         "target": target,
-        "seed": options.seed,
+        "seed": plan.seed,
         "seconds": round(time.monotonic() - began_s),
         "executions": executions,
         "crashes": crashes,
         "found": sorted(_contents(KEPT / target) - before),
         "peak_mb": peak_mb,
-        "slowest_s": slowest_s,
+        "slowest_ms": slowest_ms,
         "inputs": len(list(grown.iterdir())),
     }
 
 
-def _left(options: argparse.Namespace, passed_s: float, executions: int) -> str | None:
+def _left(plan: Plan, passed_s: float, executions: int) -> str | None:
     """Return libFuzzer's option for what is left to do; None if nothing is."""
-    if options.executions is None:
-        left, option = round(60 * options.minutes - passed_s), "-max_total_time"
+    if plan.executions is None:
+        left, option = round(60 * plan.minutes - passed_s), "-max_total_time"
     else:
-        left, option = options.executions - executions, "-runs"
+        left, option = plan.executions - executions, "-runs"
     return f"{option}={left}" if left > 0 else None
 
 
@@ -130,9 +145,9 @@ def run_fuzzer(target: str, grown: Path, kept: Path, *options: str) -> tuple[int
 
 
 def told_figure(told: str, name: str) -> int:
-    """Return one of libFuzzer's closing figures, 0 if it is missing."""
-    found = re.search(rf"stat::{name}:\s+(\d+)", told)
-    return int(found.group(1)) if found else 0
+    """Return one of libFuzzer's closing figures or what the child told last, 0 if it is missing."""
+    found = re.findall(rf"stat::{name}:\s+(\d+)", told)
+    return int(found[-1]) if found else 0
 
 
 def _contents(folder: Path) -> set[str]:

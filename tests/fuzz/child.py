@@ -16,16 +16,23 @@ SLOW_S = 1.0  # of processor time
 
 def main() -> None:
     """Fuzz `sys.argv[1]`; faults that Python can catch are kept, once each by their place, and fuzzing goes on."""
-    target, seen = sys.argv.pop(1), set[str]()
+    target, seen, slowest_s = sys.argv.pop(1), set[str](), 0.0
     kept = Path(next(word for word in sys.argv if word.startswith("-artifact_prefix=")).partition("=")[2])
 
     def test_one(data: bytes) -> None:
+        nonlocal slowest_s
         began_s = time.process_time()
         try:
             attempt(target, data)
         except Exception as fault:
             _keep(kept, _place(fault), data, fault, seen)
-        if time.process_time() - began_s > SLOW_S:
+        took_s = time.process_time() - began_s
+        if took_s > slowest_s:
+            slowest_s = took_s
+            print(
+                f"stat::slowest_input_ms: {1e3 * took_s:.0f}", file=sys.stderr, flush=True
+            )  # as libFuzzer does
+        if took_s > SLOW_S:
             _keep(kept, "slow", data, None, seen)
 
     atheris.Setup(sys.argv, test_one)

@@ -7,9 +7,10 @@ server's control endpoint, each of which is answered.
 import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from random import Random
+from typing import Any
 
 import httpx
 import psutil
@@ -36,14 +37,19 @@ def main() -> None:
     parser.add_argument("--messages", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    with ExitStack() as stack:
-        thread = stack.enter_context(LoopThread("links"))
-        station = stack.enter_context(running_station(PROFILES["small"], thread, options.seed))
-        until_shown(station)
+    with small_station(options.seed) as station:
         print(json.dumps(attacked(station, options.messages, Random(options.seed))), flush=True)
 
 
-def attacked(station: Station, messages: int, dice: Random) -> dict[str, object]:
+@contextmanager
+def small_station(seed: int) -> Iterator[Station]:
+    """Run a station of profile `small`, whose first picture is there."""
+    with LoopThread("links") as thread, running_station(PROFILES["small"], thread, seed) as station:
+        until_shown(station)
+        yield station
+
+
+def attacked(station: Station, messages: int, dice: Random) -> dict[str, Any]:
     """Send so many, and tell what became of the processes, their memory (MB), and the pictures meanwhile."""
     vectors = [unframe_pieces(path.read_bytes()) for path in sorted(FOLDER.glob("*.bin"))]
     before, peaks, gaps = memory_mb(station), memory_mb(station), Gaps(station)
@@ -51,34 +57,38 @@ def attacked(station: Station, messages: int, dice: Random) -> dict[str, object]
     with ExitStack() as stack:
         publisher = stack.enter_context(closing(Publisher(ports.endpoint(station.places.stranger))))
         ask = _asking(stack, ports.endpoint(station.places.control))
-        unanswered = 0
+        unanswered, slowest_s = 0, 0.0
         for number in range(messages):
             pieces = mutated(dice, dice.choice(vectors))
             if pieces[0].startswith(COMMANDS):
+                asked_s = time.monotonic()
                 unanswered += not ask(pieces)
+                slowest_s = max(slowest_s, time.monotonic() - asked_s)
             else:
                 publisher.send(pieces)
             if number % LOOK_EVERY == 0:
-                peaks = {name: max(peaks[name], now) for name, now in memory_mb(station).items()}
+                peaks |= {name: max(peaks.get(name, 0.0), now) for name, now in memory_mb(station).items()}
                 gaps.look()
                 time.sleep(SMALLEST_PAUSE_S)
     return {
         "messages": messages,
         "seconds": round(time.monotonic() - began_s),
         "streams": len({pieces[0].partition(b".")[0] for pieces in vectors}),
-        "deaths": sum(station.deaths().values()),
+        "deaths": station.deaths(),
         "unanswered": unanswered,
+        "slowest_answer_ms": round(1e3 * slowest_s),
         "memory_mb": {name: (before[name], peaks[name]) for name in before},
         "longest_gap_s": round(gaps.longest_s, 2),
     }
 
 
 def memory_mb(station: Station) -> dict[str, float]:
-    """Resident memory of each process."""
-    return {
-        name: round(psutil.Process(station.process_id(name)).memory_info().rss / 1e6, 1)
-        for name in station.names
-    }
+    """Resident memory of each process; one that has just died is left out."""
+    found = {}
+    for name in station.names:
+        with suppress(psutil.NoSuchProcess):
+            found[name] = round(psutil.Process(station.process_id(name)).memory_info().rss / 1e6, 1)
+    return found
 
 
 class Gaps:
@@ -90,7 +100,10 @@ class Gaps:
 
     def look(self) -> None:
         """Compare the picture with that of the last look."""
-        shown, now_s = self._client.get("/live.jpg").content, time.monotonic()
+        shown = self._shown
+        with suppress(httpx.TransportError):  # the web process has just died
+            shown = self._client.get("/live.jpg").content
+        now_s = time.monotonic()
         if shown != self._shown:
             self.longest_s = max(self.longest_s, now_s - self._since_s)
             self._shown, self._since_s = shown, now_s

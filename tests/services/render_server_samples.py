@@ -86,6 +86,7 @@ class Recorder:
         self.is_busy.clear()
 
     def _snapshot(self, order: dict[str, object]) -> dict[str, object]:
+        self._wait_at_gate()
         if self.fault is not None:
             raise DeltalightError(self.fault)
         folder, files, errors = Path(str(order["folder"])), [], {}

@@ -1,7 +1,9 @@
 """`deltalight api` as a process: with a real render server, killed and started again, its tokens and faults."""
 
 import json
+import os
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -118,40 +120,59 @@ def test_tokens_are_made_listed_and_revoked(tmp_path: Path) -> None:
         run("revoke", "wall")
 
 
-@pytest.mark.slow(seconds=20)
-def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
-    (port,) = ports.private_ports(1)
-    command = [
-        sys.executable,
-        "-m",
-        "deltalight.services.cli",
-        "api",
-        "--host",
-        "0.0.0.0",
-        "--port",
-        str(port),
-    ]
-    outputs = []
-    for _ in range(2):
-        running = subprocess.Popen(
-            [*command, "--data", str(tmp_path)],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60) as client:
-            wait_for(lambda client=client: client.get("/health").status_code == 200)  # type: ignore[misc]
-            assert "token is needed" in sentence(client.get("/scenes"), 401)
-            if outputs:
-                token = outputs[0][0].split()[-1]
-                scenes = client.get("/scenes", headers={"Authorization": f"Bearer {token}"}).json()
-                assert [scene["active"] for scene in scenes] == [True]  # there is something to begin with
+@contextmanager
+def open_to_others(folder: Path, port: int, stdout: int) -> Iterator[subprocess.Popen[str]]:
+    """A web process that other hosts can reach, once it answers; it is ended with the block."""
+    words = ["api", "--host", "0.0.0.0", "--port", str(port), "--data", str(folder)]
+    command = [sys.executable, "-m", "deltalight.services.cli", *words]
+    running = subprocess.Popen(command, cwd=ROOT, stdout=stdout, stderr=subprocess.PIPE, text=True)
+    try:
+        wait_for(lambda: httpx.get(f"http://{ports.LOOPBACK}:{port}/api/v1/health").status_code == 200)
+        yield running
+    finally:
         running.terminate()
-        outputs.append(running.communicate(timeout=60))
-    assert "shown this once: deltalight-" in outputs[0][0]
-    assert outputs[1][0] == ""
-    assert "nothing is encrypted" in outputs[1][1]
+
+
+def require_lets_in(port: int, token: str) -> None:
+    with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60) as client:
+        assert "token is needed" in sentence(client.get("/scenes"), 401)
+        scenes = client.get("/scenes", headers={"Authorization": f"Bearer {token}"}).json()
+        assert [scene["active"] for scene in scenes] == [True]  # there is something to begin with
+
+
+@pytest.mark.slow(seconds=20)
+def test_leaving_loopback_makes_a_token_once_and_no_log_holds_it(tmp_path: Path) -> None:
+    (port,) = ports.private_ports(1)
+    file = tmp_path / "first_token"
+    with open_to_others(tmp_path, port, subprocess.PIPE) as first:
+        token = file.read_text().strip()
+        require_lets_in(port, token)
+    stdout, stderr = first.communicate(timeout=60)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert stdout == ""
+    assert str(file) in stderr
+    assert token not in stderr
+    file.unlink()
+    with open_to_others(tmp_path, port, subprocess.PIPE) as second:
+        require_lets_in(port, token)
+    stdout, stderr = second.communicate(timeout=60)
+    assert stdout == ""
+    assert "nothing is encrypted" in stderr
+    assert not file.exists()
+
+
+@pytest.mark.slow(seconds=10)
+def test_at_a_terminal_the_first_token_is_shown_and_in_no_file(tmp_path: Path) -> None:
+    (port,) = ports.private_ports(1)
+    seen, terminal = os.openpty()
+    with open_to_others(tmp_path, port, terminal) as running:
+        line = os.read(seen, 4096).decode()
+        assert "shown this once: deltalight-" in line
+        require_lets_in(port, line.split()[-1])
+    assert line.split()[-1] not in running.communicate(timeout=60)[1]
+    assert not (tmp_path / "first_token").exists()
+    for handle in (seen, terminal):
+        os.close(handle)
 
 
 def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from sqlalchemy import update
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.api import connections
 from deltalight.services.api.auth import ADDRESSES_OF_TOKEN, WRONG_TOKENS_AT_ONCE
@@ -136,6 +137,49 @@ def test_pages_of_other_sites_are_refused(open_api: RunningApi, origin: str) -> 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "["])
 def test_names_that_only_resolve_to_loopback_are_refused(open_api: RunningApi, host: str) -> None:
     assert "on loopback" in sentence(open_api.client.get("/scenes", headers={"Host": host}), 400)
+
+
+def test_elsewhere_names_that_only_resolve_to_this_host_are_refused(tmp_path: Path) -> None:
+    with running_api(tmp_path, host="0.0.0.0", allowed_hosts=["Station.Example."]) as running:
+        client, address = running.client, f"127.0.0.1:{running.client.base_url.port}"
+        own = (socket.gethostname(), f"{socket.gethostname().partition('.')[0]}.local", "localhost")
+        literal = ("127.0.0.1", "[::1]:8000", "192.168.1.20:80")
+        for host in (*own, *literal, "station.example", "STATION.example.:8000"):
+            assert client.get("/health", headers={"Host": host}).status_code == 200, host
+        for host in (
+            "evil.example",
+            "station.example.evil.example",
+            "127.0.0.1.evil.example",
+            "2130706433",
+            "",
+            "[",
+        ):
+            told = sentence(client.get("/health", headers={"Host": host}), 400)
+            assert "`allowed_hosts` in [api] of deltalight.toml" in told, host
+            page = client.get(f"http://{address}/", headers={"Host": host})
+            assert page.status_code == 400, host
+        token = running.store.tokens.create("me", "control")
+        for host, status in (("evil.example", 400), ("station.example", None)):
+            with socket.create_connection(("127.0.0.1", running.client.base_url.port)) as raw:
+                made = connect_as(raw, host, token)
+            assert made == status
+
+
+def connect_as(raw: socket.socket, host: str, token: str) -> int | None:
+    """Open a WebSocket under a name; the status with which that is refused, None if it is not."""
+    try:
+        with connect(f"ws://{host}/api/v1/events", sock=raw, additional_headers=bearer(token)):
+            return None
+    except InvalidStatus as refusal:
+        return refusal.response.status_code
+
+
+@pytest.mark.parametrize(
+    "name", ["https://station.example", "station.example:8000", "*", "*.example", "", "a b"]
+)
+def test_an_allowed_host_is_a_name(name: str) -> None:
+    with pytest.raises(DeltalightError, match="without scheme, port and wildcard"):
+        validate(ApiSettings, {"allowed_hosts": [name]}, "[api]")
 
 
 def test_no_answer_carries_cross_origin_rights_or_cookies(open_api: RunningApi) -> None:

@@ -35,7 +35,9 @@ _TOO_MANY_ORDERS = "change view, camera and codec less often"
 UNKNOWN_CODEC = f"there is no such codec; ask for one of {', '.join(CODECS)}"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 RETRY_AFTER_S = "1"  # pictures come many times a second, or not for a while
-NO_ANSWER = "The render server does not respond, or (with Retry-After) has too many pending requests."
+NO_ANSWER = (
+    "The render server does not respond, or has too many pending requests; try again after Retry-After."
+)
 JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
 
 WantedView = Annotated[

@@ -97,8 +97,23 @@ securityContext:
 - {name: RAY_worker_niceness, value: "0"}
 {{- end }}
 
+{{/* Names under which browsers and pods open the page; a probe uses the pod's address. */}}
+{{- define "deltalight.hosts" -}}
+{{- $hosts := .Values.web.allowedHosts }}
+{{- if .Values.ingress.enabled }}
+{{- $hosts = append $hosts .Values.ingress.host }}
+{{- end }}
+{{- range $service := list "web" "keeper" }}
+{{- $name := printf "%s-%s" $.Release.Name $service }}
+{{- $inside := printf "%s.%s" $name $.Release.Namespace }}
+{{- $hosts = concat $hosts (list $name $inside (printf "%s.svc" $inside) (printf "%s.svc.cluster.local" $inside)) }}
+{{- end }}
+{{- toJson $hosts }}
+{{- end }}
+
 {{- define "deltalight.webEnv" -}}
 - {name: DELTALIGHT_API__HOST, value: 0.0.0.0}
+- {name: DELTALIGHT_API__ALLOWED_HOSTS, value: {{ include "deltalight.hosts" . | quote }}}
 - {name: DELTALIGHT_API__TOKEN_FILE, value: /run/secrets/tokens/control_token}
 - {name: DELTALIGHT_API__VIEW_TOKEN_FILE, value: /run/secrets/tokens/view_token}
 # All requests come from the ingress controller.

@@ -5880,7 +5880,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
+            /** @description The render server does not respond, or has too many pending requests; try again after Retry-After. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -5972,7 +5972,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
+            /** @description The render server does not respond, or has too many pending requests; try again after Retry-After. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -13303,7 +13303,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The render server does not respond, or (with Retry-After) has too many pending requests. */
+            /** @description The render server does not respond, or has too many pending requests; try again after Retry-After. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
