@@ -294,8 +294,9 @@ class RenderSession:
         return commands[request.op](request)
 
     def _ping(self, _request: ControlRequest) -> dict[str, object]:
+        epoch = {} if self._epoch is None else {"epoch": self._epoch}
         shown = {"scene_id": self.scene_id, "revision": self.scene.revision, "instance": self.instance}
-        return shown if self._epoch is None else {**shown, "epoch": self._epoch}
+        return {**shown, **epoch}
 
     def _stats(self, _request: ControlRequest) -> dict[str, object]:
         is_software = is_software_renderer(self._renderer_name)
