@@ -13,7 +13,7 @@ from tests.fuzz.report import FILES, QUICK, FuzzReport, fuzz_all
 @pytest.mark.skipif(find_spec("atheris") is None, reason=NO_ATHERIS)
 def test_the_quick_form_runs_every_part_and_finds_nothing(tmp_path: Path) -> None:
     out = tmp_path / "fuzz.json"
-    report = fuzz_all(QUICK, 5, out)
+    report = fuzz_all(QUICK, 5, out, tmp_path / "kept")
     assert FuzzReport.model_validate_json(out.read_text()) == report
     assert [part.name for part in report.parts] == ["envelope", *FILES, "sockets", "openapi"]
     least = [QUICK.envelopes, *(QUICK.of_each_file for _ in FILES), QUICK.messages, 1]
