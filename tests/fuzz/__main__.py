@@ -33,11 +33,15 @@ NO_ATHERIS = "fuzzing needs atheris, which there is for Linux on x86-64 and Pyth
 
 @dataclass(frozen=True)
 class Plan:
-    """How long each target is fuzzed: `minutes`, or `executions` however long they take; `seed` 0 is a new one."""
+    """How long each target is fuzzed: `minutes`, or `executions` however long they take; `seed` 0 is a new one.
+
+    What fails is kept in the target's folder in `kept`.
+    """
 
     seed: int
     minutes: float = 2.0
     executions: int | None = None
+    kept: Path = KEPT
 
 
 def main() -> None:
@@ -79,14 +83,15 @@ def fuzzed(target: str, work: Path, plan: Plan) -> dict[str, Any]:
 
     The corpus grows in the target's folder in `work`.
     """
-    grown = work / target
-    grown.mkdir(parents=True, exist_ok=True)
+    grown, kept = work / target, plan.kept / target
+    for folder in (grown, kept):
+        folder.mkdir(parents=True, exist_ok=True)
     write_seeds(target, grown)
     began_s, executions, crashes, peak_mb, slowest_ms = time.monotonic(), 0, 0, 0, 0
-    before = _contents(KEPT / target)
+    before = _contents(kept)
     while (left := _left(plan, time.monotonic() - began_s, executions)) and crashes < MOST_CRASHES:
         seed = plan.seed and plan.seed + crashes
-        code, told = run_fuzzer(target, grown, KEPT / target, left, f"-seed={seed}")
+        code, told = run_fuzzer(target, grown, kept, left, f"-seed={seed}")
         executions += told_figure(told, "number_of_executed_units")
         peak_mb = max(peak_mb, told_figure(told, "peak_rss_mb"))
         slowest_ms = max(slowest_ms, told_figure(told, "slowest_input_ms"))
@@ -100,7 +105,7 @@ def fuzzed(target: str, work: Path, plan: Plan) -> dict[str, Any]:
         "seconds": round(time.monotonic() - began_s),
         "executions": executions,
         "crashes": crashes,
-        "found": sorted(_contents(KEPT / target) - before),
+        "found": sorted(_contents(kept) - before),
         "peak_mb": peak_mb,
         "slowest_ms": slowest_ms,
         "inputs": len(list(grown.iterdir())),

@@ -26,6 +26,7 @@ from deltalight.protocol.files import write_bytes
 from tests.fuzz.__main__ import NO_ATHERIS, Plan, fuzzed
 from tests.fuzz.over_http import requested, say
 from tests.fuzz.over_sockets import attacked, small_station
+from tests.fuzz.seeds import KEPT
 
 REPORT: Final = "python -m tests.fuzz.report"
 FILES = ("gltf", "radiance", "mcap", "archive")
@@ -106,14 +107,15 @@ class _Job:
     sizes: Sizes
     seed: int
     work: Path
+    kept: Path
     renderer: str = ""
 
 
-def fuzz_all(sizes: Sizes, seed: int, out: Path) -> FuzzReport:
-    """Run all parts one after the other; `out` is written after each."""
+def fuzz_all(sizes: Sizes, seed: int, out: Path, kept: Path = KEPT) -> FuzzReport:
+    """Run all parts one after the other; `out` is written after each. Files that fail are kept in `kept`."""
     parts, load_before = list[Part](), os.getloadavg()[0]
     with TemporaryDirectory(prefix="deltalight-fuzz-") as work:
-        job = _Job(sizes, seed, Path(work))
+        job = _Job(sizes, seed, Path(work), kept)
         runs = list(_runs(job))
         for number, (name, run) in enumerate(runs, start=1):
             say(f"{number} of {len(runs)}: {name}")
@@ -128,7 +130,10 @@ def fuzz_all(sizes: Sizes, seed: int, out: Path) -> FuzzReport:
 def _runs(job: _Job) -> Iterator[tuple[str, Callable[[], Part]]]:
     targets = {"envelope": job.sizes.envelopes, **dict.fromkeys(FILES, job.sizes.of_each_file)}
     for target, executions in targets.items():
-        yield target, partial(_decoder, target, job.work, Plan(job.seed, executions=executions))
+        yield (
+            target,
+            partial(_decoder, target, job.work, Plan(job.seed, executions=executions, kept=job.kept)),
+        )
     yield "sockets", partial(_sockets, job)
     yield "openapi", partial(_openapi, job)
 
