@@ -279,8 +279,8 @@ def soak(
     profile: Annotated[
         str,
         typer.Option(
-            help="station: four nodes, 320x240, 15 pictures a second; desk: one node, 10 a second; small: one node, "
-            "5 a second, short faults."
+            help="station: four nodes, 320x240, 15 pictures a second; desk: one node, 10 a second; synthetic: "
+            "the same of the synthetic camera; small: one node, 5 a second, short faults."
         ),
     ] = "station",
     faults: Annotated[

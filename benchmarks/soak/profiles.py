@@ -11,10 +11,12 @@ from deltalight.protocol.errors import DeltalightError
 class Profile:
     """A station and its faults.
 
-    `nodes` sensor nodes send pictures of `size` (pixels) `frames_per_s` times a second; `output` and `method` change
-    the demo's scene. `calm_s` is the time before, between and after faults, `load_s` that of faults that go on for
-    a while, `stop_s` that of stopped processes, `spare_s` how long at most a fault waits until the spares of killed
-    processes are ready, `viewers` the number that joins and leaves, for `churn_s`.
+    `nodes` sensor nodes send pictures of `size` (pixels) `frames_per_s` times a second: of a recording in which
+    nothing moves or, if `is_synthetic`, of the synthetic camera, which sways, so that pixels before and after a kill
+    differ. `output` and `method` change the demo's scene. `calm_s` is the time before, between and after faults,
+    `load_s` that of faults that go on for a while, `stop_s` that of stopped processes, `spare_s` how long at most a
+    fault waits until the spares of killed processes are ready, `viewers` the number that joins and leaves, for
+    `churn_s`.
     """
 
     nodes: int
@@ -28,6 +30,7 @@ class Profile:
     spare_s: float
     viewers: int
     churn_s: float
+    is_synthetic: bool = False
 
     @property
     def period_ms(self) -> float:
@@ -68,6 +71,7 @@ PROFILES = {
         load_s=20.0,
     ),
     "desk": _DESK,
+    "synthetic": replace(_DESK, is_synthetic=True),
     "small": replace(
         _DESK,
         frames_per_s=5.0,

@@ -23,6 +23,7 @@ from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
+from deltalight.sensor_node.cameras.drivers import SYNTHETIC
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.demo import RECORDING, demo_scene
@@ -147,8 +148,7 @@ def running_station(profile: Profile, thread: LoopThread, seed: int) -> Iterator
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="deltalight-soak-")))
-        take = folder / "take.mcap"
-        write_take(take, profile.size, profile.frames_per_s)
+        source, configuration = source_of(profile, folder)
         with Store(folder / "data") as store:
             shown = activate_document(store, soaked_scene(profile))
         session = stack.enter_context(session_file(shown))
@@ -159,7 +159,8 @@ def running_station(profile: Profile, thread: LoopThread, seed: int) -> Iterator
         ]
         for link in links:
             thread.start(link.serve())
-        specs = _specs(places, take, session, folder / "data")
+        plan = HostPlan(source, session, data=folder / "data", config=configuration)
+        specs = _specs(places, plan)
         lines: list[str] = []
         supervisor = Supervisor(specs, forward=lines.append, maximum_restarts=MOST_RESTARTS)
         stack.enter_context(supervisor)
@@ -210,15 +211,25 @@ def soaked_scene(profile: Profile) -> SceneDocument:
     return scene.replaced(method=changed.method, output=changed.output)
 
 
-def _specs(places: Ports, take: Path, session: Path, data: Path) -> list[ChildSpec]:
+def source_of(profile: Profile, folder: Path) -> tuple[str, Path]:
+    """Return what the nodes show, and the configuration file of all processes."""
+    if not profile.is_synthetic:
+        take = folder / "take.mcap"
+        write_take(take, profile.size, profile.frames_per_s)
+        return str(take), Path(os.devnull)
+    (width, height), configuration = profile.size, folder / "deltalight.toml"
+    camera = f"{{width = {width}, height = {height}, fps = {profile.frames_per_s}}}"
+    configuration.write_text(f"[node]\ncamera = {camera}\n", encoding="utf-8")
+    return SYNTHETIC, configuration
+
+
+def _specs(places: Ports, plan: HostPlan) -> list[ChildSpec]:
     """Return the nodes, the render server, which reads them all, and the web process."""
-    plan = HostPlan(
-        str(take),
-        session,
+    plan = replace(
+        plan,
         node_port=places.links[0],
         composite_port=places.composite,
         control_port=places.control,
-        data=data,
         page_port=places.page,
         allow_software=True,
         log_level="warning",

@@ -16,7 +16,7 @@ from deltalight.sensor_node.cameras.live import load_calibration
 from deltalight.sensor_node.cameras.reconnect import ReconnectingCamera
 from deltalight.sensor_node.cameras.replay import ReplayCamera
 from deltalight.sensor_node.cameras.settings import CameraSettings, FisheyeSettings
-from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_camera
 
 _DEFAULTS = CameraSettings()
 
@@ -48,13 +48,24 @@ def open_camera(
         DeltalightError: there is no such source, it cannot be read, or its calibration is missing.
     """
     if source == SYNTHETIC:
-        return SyntheticCamera(board, realtime=settings.realtime, loop=settings.loop)
+        return _synthetic(settings, board)
     if is_live(source):
         return _open_live(source, settings, board, calibrated=calibrated, depth=depth)
     path = Path(source)
     if not path.exists() and not source.endswith(RECORDING_SUFFIXES) and len(path.parts) < 2:
         raise _unknown(source)
     return ReplayCamera(open_source(path, board), realtime=settings.realtime, loop=settings.loop)
+
+
+def _synthetic(settings: CameraSettings, board: BoardSpec | None) -> SyntheticCamera:
+    usual = default_camera()
+    return SyntheticCamera(
+        board,
+        usual.resized(settings.width or usual.width, settings.height or usual.height),
+        period_ns=round(1e9 / settings.fps),
+        realtime=settings.realtime,
+        loop=settings.loop,
+    )
 
 
 def _open_live(

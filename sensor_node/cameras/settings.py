@@ -12,7 +12,10 @@ Exposure = Annotated[float, Field(ge=1e-6, le=1800)]
 
 
 class CameraSettings(StrictModel):
-    """How a camera is opened; replayed sources use `realtime` and `loop`, live ones the rest."""
+    """How a camera is opened; replayed sources use `realtime` and `loop`, live ones the rest.
+
+    The synthetic one uses both of those, and `width`, `height` and `fps`.
+    """
 
     realtime: bool = Field(default=True, description="Replay: obey the recorded times; else fast.")
     loop: bool = Field(default=True, description="Replay: begin again at the end of the source.")
@@ -23,7 +26,7 @@ class CameraSettings(StrictModel):
     )
     width: int | None = Field(default=None, ge=16, le=16384, description="Columns; null = as calibrated.")
     height: int | None = Field(default=None, ge=16, le=16384, description="Rows; null = as calibrated.")
-    fps: float = Field(default=30, gt=0, le=1000, description="Frames per second to ask a live camera for.")
+    fps: float = Field(default=30, gt=0, le=1000, description="Frames per second to ask a camera for.")
     exposure_s: Exposure | None = Field(
         default=None, description="Exposure to lock, s; null = automatic, sent with each frame where known."
     )

@@ -54,7 +54,8 @@ def default_camera() -> CameraModel:
 class SyntheticCamera(PacedCamera):
     """Frames of a `SyntheticScene`: sRGB colour, depth registered to it, and no given pose.
 
-    Marker detection should find the pose; `pose_at` returns the true one. Without `noise` depth is exact.
+    Marker detection should find the pose; `pose_at` returns the true one. Without `noise` depth is exact. A round of
+    the path has FRAMES_PER_ROUND frames, `period_ns` apart.
     """
 
     def __init__(
@@ -63,10 +64,11 @@ class SyntheticCamera(PacedCamera):
         camera: CameraModel | None = None,
         *,
         noise: SyntheticNoise | None = None,
+        period_ns: int = PERIOD_NS,
         realtime: bool = False,
         loop: bool = True,
     ) -> None:
-        times = [number * PERIOD_NS for number in range(FRAMES_PER_ROUND)]
+        times = [number * period_ns for number in range(FRAMES_PER_ROUND)]
         super().__init__(times, realtime=realtime, loop=loop)
         self.board = board or default_board()
         self.camera = camera or default_camera()
@@ -74,7 +76,7 @@ class SyntheticCamera(PacedCamera):
         self._fine = self.camera.resized(
             self.camera.width * SAMPLES_PER_EDGE, self.camera.height * SAMPLES_PER_EDGE
         )
-        self._noise = noise
+        self._noise, self._period_ns = noise, period_ns
 
     def pose_at(self, index: int) -> Float64[np.ndarray, "4 4"]:
         """Return the true world_from_camera of a frame, swaying in front of the board's middle."""
@@ -102,7 +104,7 @@ class SyntheticCamera(PacedCamera):
             depth_m += random.normal(0, self._noise.depth_sigma_m, depth_m.shape) * depth_m**2
             depth_m[random.random(depth_m.shape) < self._noise.hole_fraction] = 0
             sigma = self._noise.depth_sigma_m
-        timestamp_ns = index * PERIOD_NS
+        timestamp_ns = index * self._period_ns
         return SensorFrame(
             frame_id=index,
             timestamp_ns=timestamp_ns,

@@ -26,12 +26,15 @@ from deltalight.benchmarks.soak.plots import known_runs, nice_ceiling
 from deltalight.benchmarks.soak.profiles import PROFILES
 from deltalight.benchmarks.soak.report import Bar, FaultRecord, SoakReport, worst
 from deltalight.benchmarks.soak.samples import ProcessSample, Sample, parse_drops
-from deltalight.benchmarks.soak.station import Station
+from deltalight.benchmarks.soak.station import Station, source_of
 from deltalight.protocol.envelope import decode, encode
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.recording_reader import RecordingReader
+from deltalight.sensor_node.node import NodeConfig
 from deltalight.services import ports
 from deltalight.services.cli import run
 from deltalight.services.demo import RECORDING, SCENE
+from deltalight.services.settings import load_configuration
 
 KILLS = 20  # of each process
 SLOW_LINK = Shape(bits_per_s=8e6, delay_s=0.05, jitter_s=0.0, loss=0.0)
@@ -323,6 +326,15 @@ def test_a_spare_is_ready_once_it_works_no_more(monkeypatch: pytest.MonkeyPatch)
     assert 0.8 < ready_s < 30
     for known in (None, process.pid):  # none yet, or dead
         assert spares.wait_for_spare(cast(Station, OneSpare(known)), "server", 0.3) is None
+
+
+def test_a_synthetic_node_has_the_size_and_rate_of_its_profile(tmp_path: Path) -> None:
+    source, configuration = source_of(PROFILES["synthetic"], tmp_path)
+    camera = load_configuration(configuration).section("node", NodeConfig).camera
+    assert (source, camera.width, camera.height, camera.fps) == ("synthetic", 320, 240, 10)
+    source, configuration = source_of(PROFILES["small"], tmp_path)
+    assert RecordingReader(Path(source)).camera.width == 320
+    assert not load_configuration(configuration).sections["node"]
 
 
 def test_only_calm_samples_and_late_ones_count() -> None:

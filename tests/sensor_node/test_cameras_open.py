@@ -80,6 +80,17 @@ def test_a_folder_and_the_synthetic_scene_are_replayed_and_never_reconnected(tmp
     ]
 
 
+def test_the_synthetic_camera_has_the_size_and_rate_of_its_settings() -> None:
+    small = CameraSettings(width=64, height=48, fps=10, realtime=False)
+    with open_camera("synthetic", small) as camera:
+        first, second = camera.read(), camera.read()
+    assert first.color.shape == (48, 64, 3)
+    assert first.depth is not None
+    assert first.depth.depth_m.shape == (48, 64)
+    assert second.timestamp_ns - first.timestamp_ns == 100_000_000
+    assert open_camera("synthetic").camera.width == 640
+
+
 def test_a_board_given_by_the_caller_goes_before_the_one_of_the_source(calibration: Path) -> None:
     board = default_board().replaced(rows=7)
     assert open_camera("synthetic", board=board).board == board

@@ -371,12 +371,13 @@ def test_a_recording_goes_on_when_the_disk_takes_data_again(
         disk.error = 0
         wait_for(lambda: running.status.frames >= kept + 10)
     status = end.result()
-    assert [notice.split("; ")[1] for notice in notices] == [
+    told = [notice for notice in notices if "cannot grow" in notice or "takes data again" in notice]
+    assert [notice.split("; ")[1] for notice in told] == [
         f"its {kept} frames are kept, and the recording goes on once you free space or lift the limit.",
         f"{status.unkept} frames could not be kept.",
     ]
-    assert f"a.mcap.active cannot grow ({os.strerror(error)})" in notices[0]
-    assert status.disk == notices[1]
+    assert f"a.mcap.active cannot grow ({os.strerror(error)})" in told[0]
+    assert status.disk == told[1]
     found = list(open_source(out))
     assert len(found) == status.frames
     lost = status.unkept + status.missing.get("color", 0)  # the latter on a busy machine
@@ -402,7 +403,7 @@ def test_a_recording_that_is_stopped_while_the_disk_refuses_is_readable(
     assert f"after {frames_kept} frames" in str(caught.value)
     assert f"and {frames_lost} frames could not be kept" in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert len(notices) == 1
+    assert sum("cannot grow" in notice for notice in notices) == 1
     assert list(tmp_path.iterdir()) == [active]
     assert len(open_source(active)) == frames_kept
 
