@@ -8,10 +8,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from deltalight import __version__
-from deltalight.benchmarks.rooms.acts import ACTS, ROOM, Run, measure
+from deltalight.benchmarks.rooms.acts import ACTS, ROOM, ActRecord, Run, measure
 from deltalight.benchmarks.rooms.hosts import running_hosts
 from deltalight.benchmarks.rooms.installation import NODE, ROOMS, started
-from deltalight.benchmarks.rooms.report import ActRecord, RoomsReport, all_figures, markdown
+from deltalight.benchmarks.rooms.report import RoomsReport, all_figures, markdown
 from deltalight.benchmarks.soak.command import renderer_of
 from deltalight.benchmarks.soak.crowd import Crowd
 from deltalight.benchmarks.soak.link import LoopThread
