@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,10 +31,12 @@ from deltalight.sensor_node.frame_messages import (
     pose_multipart,
 )
 from deltalight.services.demo import RECORDING
+from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
 from deltalight.services.stream_queue import StreamQueue
 from tests.protocol.fisheye_samples import coded
 
 WIDTH, HEIGHT = 64, 48
+PATIENCE_S = 60
 STARTED_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 33_333_333
 BOARD = BoardSpec(
@@ -209,3 +212,24 @@ class Published:
             if multipart is not None:
                 header = decode(multipart)[0]
                 self.captured_ns[header.frame_id] = header.capture_ns
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+@contextmanager
+def recording(job: RecordJob) -> Iterator[tuple[Recorder, list[str], Future[RecordStatus]]]:
+    """A recorder in a thread, what it tells, and its end."""
+    notices: list[str] = []
+    stop = threading.Event()
+    with ThreadPoolExecutor(1) as thread:
+        running = Recorder(job, notices.append)
+        end = thread.submit(running.run, stop)
+        try:
+            yield running, notices, end
+        finally:
+            stop.set()

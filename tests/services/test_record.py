@@ -1,17 +1,12 @@
-"""`deltalight record`: Ctrl-C, kill -9, a full disk, nobody there; each with real processes or sockets."""
+"""`deltalight record`: Ctrl-C, kill -9, nobody there; each with real processes or sockets."""
 
-import errno
 import json
-import os
-import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +24,7 @@ from deltalight.protocol.scene import parse_scene
 from deltalight.protocol.source import open_source
 from deltalight.services import ports, recorder
 from deltalight.services.cli import app
-from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
+from deltalight.services.recorder import RecordJob
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.follower import following
 from deltalight.services.rooms.keeper import RoomKeeper
@@ -37,6 +32,7 @@ from tests.services.conftest import ROOT, RunCli
 from tests.services.record_samples import (
     BOARD,
     HEIGHT,
+    PATIENCE_S,
     WIDTH,
     Published,
     camera,
@@ -44,11 +40,12 @@ from tests.services.record_samples import (
     feeding,
     frames,
     messages,
+    recording,
+    wait_for,
     write,
 )
 from tests.services.room_samples import StandInPlacer, plans, running
 
-PATIENCE_S = 60
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
@@ -89,13 +86,6 @@ def published(take: Path, start: Start) -> str:
     endpoint = ports.endpoint(ports.private_ports(1)[0])
     start("node", "--source", take, "--loop", "--publish", endpoint)
     return endpoint
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
 
 
 @pytest.mark.slow
@@ -193,20 +183,6 @@ def test_ctrl_c_before_any_frame_leaves_no_file(start: Start, tmp_path: Path) ->
     assert process.returncode == 130
     assert "Nothing was recorded" in error
     assert not list(tmp_path.iterdir())
-
-
-@contextmanager
-def recording(job: RecordJob) -> "Iterator[tuple[Recorder, list[str], Future[RecordStatus]]]":
-    """A recorder in a thread, what it tells, and its end."""
-    notices: list[str] = []
-    stop = threading.Event()
-    with ThreadPoolExecutor(1) as thread:
-        running = Recorder(job, notices.append)
-        end = thread.submit(running.run, stop)
-        try:
-            yield running, notices, end
-        finally:
-            stop.set()
 
 
 def test_frames_and_duration_end_a_recording(tmp_path: Path) -> None:
@@ -335,117 +311,6 @@ def test_another_node_than_the_wanted_is_named(tmp_path: Path, monkeypatch: pyte
     assert "only of cam" in notices[0]
     assert end.result().frames == 0
     assert not list(tmp_path.iterdir())
-
-
-class RefusingDisk:
-    """Takes nothing more, or only the beginning of a frame, while `error` is set."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.error = 0
-        self._pwrite: Callable[[int, bytes, int], int] = os.pwrite
-        monkeypatch.setattr("deltalight.protocol.growing_file.os.pwrite", self._write)
-        monkeypatch.setattr("deltalight.services.patient_writer.RETRY_PERIOD_S", 0.2)
-
-    def _write(self, handle: int, data: bytes, position: int) -> int:
-        if not self.error:
-            return self._pwrite(handle, data, position)
-        if len(data) > 100:
-            return self._pwrite(handle, data[:100], position)
-        raise OSError(self.error, os.strerror(self.error))
-
-
-@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS])
-def test_a_recording_goes_on_when_the_disk_takes_data_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int
-) -> None:
-    disk, out = RefusingDisk(monkeypatch), tmp_path / "a.mcap"
-    with (
-        feeding(relights=True) as (endpoint, _),
-        recording(RecordJob(out, (endpoint,), composites=endpoint)) as (running, notices, end),
-    ):
-        wait_for(lambda: running.status.composites >= 5)
-        disk.error = error
-        wait_for(lambda: running.status.unkept >= 10)
-        kept = len(open_source(out.with_name("a.mcap.active")))
-        assert kept == running.status.frames
-        disk.error = 0
-        wait_for(lambda: running.status.frames >= kept + 10)
-    status = end.result()
-    told = [notice for notice in notices if "cannot grow" in notice or "takes data again" in notice]
-    assert [notice.split("; ")[1] for notice in told] == [
-        f"its {kept} frames are kept, and the recording goes on once you free space or lift the limit.",
-        f"{status.unkept} frames could not be kept.",
-    ]
-    assert f"a.mcap.active cannot grow ({os.strerror(error)})" in told[0]
-    assert status.disk == told[1]
-    found = list(open_source(out))
-    assert len(found) == status.frames
-    lost = status.unkept + status.missing.get("color", 0)  # the latter on a busy machine
-    assert found[-1].frame_id - found[0].frame_id + 1 == status.frames + lost
-    assert sum(frame.composite is not None for frame in found) == status.composites > 5
-    assert found[-1].composite is not None
-
-
-def test_a_recording_that_is_stopped_while_the_disk_refuses_is_readable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    disk, active = RefusingDisk(monkeypatch), tmp_path / "a.mcap.active"
-    with (
-        feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", (endpoint,))) as (running, notices, end),
-    ):
-        wait_for(lambda: running.status.frames >= 3)
-        disk.error = errno.ENOSPC
-        wait_for(lambda: running.status.unkept)
-    with pytest.raises(DeltalightError, match=r"No space left on device") as caught:
-        end.result(PATIENCE_S)
-    frames_kept, frames_lost = running.status.frames, running.status.unkept
-    assert f"after {frames_kept} frames" in str(caught.value)
-    assert f"and {frames_lost} frames could not be kept" in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert sum("cannot grow" in notice for notice in notices) == 1
-    assert list(tmp_path.iterdir()) == [active]
-    assert len(open_source(active)) == frames_kept
-
-
-def test_a_disk_that_refuses_the_first_frame_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    RefusingDisk(monkeypatch).error = errno.ENOSPC
-    with (
-        feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", (endpoint,))) as (_, notices, end),
-        pytest.raises(DeltalightError, match=r"cannot be written \(No space left on device\)"),
-    ):
-        end.result(PATIENCE_S)
-    assert not notices
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_file_that_somebody_removes_is_a_sentence(tmp_path: Path) -> None:
-    with (
-        feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", (endpoint,))) as (_, _, end),
-    ):
-        wait_for((tmp_path / "a.mcap.active").exists)
-        (tmp_path / "a.mcap.active").unlink()
-        with pytest.raises(DeltalightError, match=r"a\.mcap\.active no longer exists") as caught:
-            end.result(PATIENCE_S)
-    assert "\n" not in str(caught.value)
-
-
-def test_little_space_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
-    monkeypatch.setattr(recorder, "STEADY_AFTER_S", 0.1)
-    monkeypatch.setattr(recorder, "CHECK_PERIOD_S", 0.1)
-    with (
-        feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", (endpoint,), duration_s=1.0)) as (_, notices, end),
-    ):
-        end.result(PATIENCE_S)
-    assert len(notices) == 1
-    assert "room for 0 s more" in notices[0]
 
 
 def test_broken_and_late_messages_are_counted(tmp_path: Path) -> None:
