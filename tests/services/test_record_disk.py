@@ -1,4 +1,4 @@
-"""`deltalight record` on a disk that refuses, fills, or loses the file: simulated (test_disk_full.py has a real disk)."""
+"""`deltalight record` on a simulated disk that refuses, fills, or loses the file (test_disk_full.py has a real one)."""
 
 import errno
 import os
