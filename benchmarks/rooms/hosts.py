@@ -17,6 +17,7 @@ from deltalight.services.rooms.ray_cluster import (
     NO_STATISTICS,
     OBJECT_STORE_BYTES,
     SLOT_RESOURCE,
+    own_sigterm,
 )
 
 # A host that is silent for a second and a half is dead (Ray's default is 15 s).
@@ -71,10 +72,8 @@ class Hosts:
 
     def _add(self, **more: object) -> Any:  # noqa: ANN401 (Ray's)
         common = {"num_cpus": 0, "node_ip_address": LOOPBACK, "object_store_memory": OBJECT_STORE_BYTES}
-        handler = signal.getsignal(signal.SIGTERM)
-        node = self.cluster.add_node(**common, **more)
-        signal.signal(signal.SIGTERM, handler)  # Ray's own ends the process without the rest of it
-        return node
+        with own_sigterm():
+            return self.cluster.add_node(**common, **more)
 
 
 @contextmanager

@@ -5,9 +5,12 @@ Ray runs actors and knows who lives (its control plane); nothing of a frame pass
 
 import os
 import re
+import signal
 import socket
 import uuid
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,10 +56,11 @@ class RayCluster:
         namespace = f"deltalight-{uuid.uuid4().hex}"  # no other installation's actors have these names
         common = {"namespace": namespace, "log_to_driver": False, "configure_logging": False}
         try:
-            if address is None:
-                self.ray.init("local", **common, **_alone(slots))
-            else:
-                self.ray.init(address, **common)
+            with own_sigterm():
+                if address is None:
+                    self.ray.init("local", **common, **_alone(slots))
+                else:
+                    self.ray.init(address, **common)
         except (ConnectionError, RuntimeError, ValueError) as fault:
             raise DeltalightError(
                 f"the Ray cluster {address or 'of this host'} cannot be used"
@@ -80,6 +84,14 @@ class RayCluster:
     def close(self) -> None:
         """Leave the cluster, or end it if it was started here."""
         self.ray.shutdown()
+
+
+@contextmanager
+def own_sigterm() -> Iterator[None]:
+    """Let SIGTERM end this process as before the block, in which Ray takes it over (main thread)."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, handler)
 
 
 def _import_ray(*, is_alone: bool) -> Any:  # noqa: ANN401 (a module)
