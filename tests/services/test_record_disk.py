@@ -1,4 +1,4 @@
-"""`deltalight record` on a simulated disk that refuses, fills, or loses the file (test_disk_full.py has a real one)."""
+"""`deltalight record` on a simulated disk that refuses, fills, or loses the file (test_disk_full.py: a real one)."""
 
 import errno
 import os
