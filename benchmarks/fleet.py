@@ -1,8 +1,10 @@
 """A fleet of rooms on paper: placement, failures, start storms and the load of the control plane, by discrete events.
 
 `python -m deltalight.benchmarks.fleet` simulates 1 000 rooms on 200 GPUs and prints what it finds, and which resource
-is exhausted first when the fleet grows. What a start, a picture and an answer of the directory cost was measured
-(`Costs`); how often hardware fails is from the literature, everything else of `Fleet` an assumption, to be changed.
+is exhausted first when the fleet grows. Each keeper has a directory, web processes and a Ray cluster of its own: two
+keepers of one cluster would hand out the same slots. What a start, a picture, an answer of the directory and an actor
+of Ray cost was measured (`Costs`); how often hardware fails is from the literature, everything else of `Fleet` an
+assumption, to be changed.
 """
 
 import heapq
@@ -20,6 +22,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from deltalight.services.rooms.rooms_file import MAX_ROOMS
+
 RESULTS = Path(__file__).parent / "results"
 DAY_S, HOUR_S = 86_400.0, 3600.0
 FOLLOWER_POLL_S = 0.2  # of a web process, `follower.POLL_INTERVAL_S`
@@ -29,7 +33,9 @@ FOLLOWER_POLL_S = 0.2  # of a web process, `follower.POLL_INTERVAL_S`
 class Costs:
     """What was measured: starts (seconds, all that were seen), picture and answer sizes (bytes), answers (seconds).
 
-    An answer of the directory about n rooms takes `answer_s + n * answer_s_per_room`.
+    An answer of the directory about n rooms takes `answer_s + n * answer_s_per_room`. A web process takes
+    `web_share_per_room` of a core for each room that it follows, without pictures. Ray's control process (GCS) takes
+    `gcs_s_per_actor` seconds for each actor, and of a core `gcs_idle_share` and `gcs_share_per_host`.
     """
 
     warm_starts_s: tuple[float, ...]
@@ -39,6 +45,10 @@ class Costs:
     answer_s: float
     answer_s_per_room: float
     answer_bytes_per_room: float
+    web_share_per_room: float
+    gcs_s_per_actor: float
+    gcs_idle_share: float
+    gcs_share_per_host: float
 
     @classmethod
     def measured(cls, results: Path = RESULTS) -> "Costs":
@@ -79,6 +89,7 @@ class Fleet:
     frames_per_s: float = 30.0
     viewers_per_room: float = 3.0
     rooms_per_web_process: int = 40
+    rooms_per_keeper: int = MAX_ROOMS
     rack_uplink_gbit_s: float = 200.0
 
     @property
@@ -90,6 +101,24 @@ class Fleet:
     def slots(self) -> int:
         """The number of rooms that run at once."""
         return self.gpus * self.slots_per_gpu
+
+    @property
+    def keepers(self) -> int:
+        """The number of keepers; rooms and hosts are dealt out to them in turn."""
+        return -(-self.rooms // self.rooms_per_keeper)
+
+    @property
+    def rooms_of_keeper(self) -> int:
+        """The number of rooms of the keeper with the most."""
+        return -(-self.rooms // self.keepers)
+
+    @property
+    def slots_of_keeper(self) -> int:
+        """The number of slots of the keeper with the fewest: those of its hosts."""
+        gpus = [0] * self.keepers
+        for gpu in range(self.gpus):
+            gpus[gpu // self.gpus_per_host % self.keepers] += 1
+        return min(gpus) * self.slots_per_gpu
 
 
 class Events:
@@ -175,11 +204,16 @@ class FleetSimulation:
         self._events = Events()
         self._gpus = [_Gpu(number // fleet.gpus_per_host) for number in range(fleet.gpus)]
         self._starts = [Servers(self._events, fleet.starts_at_once) for _ in range(fleet.hosts)]
+        self._controls = [Servers(self._events, 1) for _ in range(fleet.keepers)]
+        self._gpus_of = [
+            [number for number, gpu in enumerate(self._gpus) if gpu.host % fleet.keepers == keeper]
+            for keeper in range(fleet.keepers)
+        ]
         self._warm = [True] * fleet.hosts
         self._place: dict[int, int] = {}
         self._placed = [0] * fleet.rooms  # how often: what happens to an earlier start of a room is void
         self._lost_s: dict[int, float] = dict.fromkeys(range(fleet.rooms), 0.0)
-        self._waiting: deque[tuple[int, float]] = deque()
+        self._waiting: list[deque[tuple[int, float]]] = [deque() for _ in range(fleet.keepers)]
         self._losses = {"crash": 0, "gpu": 0, "host": 0}
         self._gaps_s: list[float] = []
         self._waits_s: list[float] = []
@@ -242,7 +276,7 @@ class FleetSimulation:
         def repair() -> None:
             for number in gpus:
                 self._gpus[number].broken -= 1
-            self._place_waiting()
+            self._place_waiting(self._gpus[gpus[0]].host % self._fleet.keepers)
 
         self._events.after(self._fleet.repair_h * HOUR_S, repair)
         return len(rooms)
@@ -254,19 +288,21 @@ class FleetSimulation:
         self._events.after(detection_s, lambda: self._want(room))
 
     def _want(self, room: int) -> None:
-        self._waiting.append((room, self._events.now_s))
-        self._place_waiting()
+        keeper = room % self._fleet.keepers
+        self._waiting[keeper].append((room, self._events.now_s))
+        self._place_waiting(keeper)
 
-    def _place_waiting(self) -> None:
-        """Place rooms on the GPUs with the fewest, as long as there are slots."""
-        while self._waiting:
-            number = min(range(len(self._gpus)), key=self._load)
-            if self._load(number) >= self._fleet.slots_per_gpu:
+    def _place_waiting(self, keeper: int) -> None:
+        """Place a keeper's rooms on its GPUs with the fewest, as long as there are slots."""
+        waiting = self._waiting[keeper]
+        while waiting:
+            number = min(self._gpus_of[keeper], key=self._load, default=None)
+            if number is None or self._load(number) >= self._fleet.slots_per_gpu:
                 break
-            room, since_s = self._waiting.popleft()
+            room, since_s = waiting.popleft()
             self._waits_s.append(self._events.now_s - since_s)
             self._start(room, number)
-        self._most_waiting = max(self._most_waiting, len(self._waiting))
+        self._most_waiting = max(self._most_waiting, sum(map(len, self._waiting)))
 
     def _load(self, number: int) -> float:
         gpu = self._gpus[number]
@@ -284,7 +320,11 @@ class FleetSimulation:
             self._warm[gpu.host] = False
             spare_s = self._random.choice(self._costs.cold_starts_s)
             self._starts[gpu.host].ask(spare_s, lambda: self._have_spare(gpu.host))
-        self._starts[gpu.host].ask(seconds, lambda: self._shown(room, placed))
+        control = self._controls[room % self._fleet.keepers]
+        control.ask(
+            self._costs.gcs_s_per_actor,
+            lambda: self._starts[gpu.host].ask(seconds, lambda: self._shown(room, placed)),
+        )
 
     def _have_spare(self, host: int) -> None:
         self._warm[host] = True
@@ -302,9 +342,20 @@ class FleetSimulation:
 
 
 def directory_load(fleet: Fleet, costs: Costs) -> float:
-    """Return the share of the directory's one thread that web processes take which each ask five times a second."""
-    processes = -(-fleet.rooms // fleet.rooms_per_web_process)
-    return processes / FOLLOWER_POLL_S * costs.answer_for(fleet.rooms)
+    """Return the share of a directory's one thread that web processes take which each ask five times a second."""
+    processes = -(-fleet.rooms_of_keeper // fleet.rooms_per_web_process)
+    return processes / FOLLOWER_POLL_S * costs.answer_for(fleet.rooms_of_keeper)
+
+
+def web_traffic_gbit_s(fleet: Fleet, costs: Costs) -> float:
+    """Return what a web process receives (the pictures of all rooms of its keeper) and sends, Gbit/s."""
+    pictures = fleet.rooms_of_keeper + fleet.rooms_per_web_process * fleet.viewers_per_room
+    return pictures * fleet.frames_per_s * costs.picture_bytes * 8 / 1e9
+
+
+def gcs_load(fleet: Fleet, costs: Costs) -> float:
+    """Return the share of a core that the control process of a keeper's Ray cluster takes while nothing starts."""
+    return costs.gcs_idle_share + -(-fleet.hosts // fleet.keepers) * costs.gcs_share_per_host
 
 
 def rack_traffic_gbit_s(fleet: Fleet, costs: Costs) -> float:
@@ -316,14 +367,18 @@ def rack_traffic_gbit_s(fleet: Fleet, costs: Costs) -> float:
 
 def loads(fleet: Fleet, costs: Costs) -> dict[str, float]:
     """Return how much of each resource a fleet takes; above 1 it is exhausted."""
-    directory_bits = directory_load(fleet, costs) / costs.answer_for(fleet.rooms)
-    directory_bits *= fleet.rooms * costs.answer_bytes_per_room * 8
+    directory_bits = directory_load(fleet, costs) / costs.answer_for(fleet.rooms_of_keeper)
+    directory_bits *= fleet.rooms_of_keeper * costs.answer_bytes_per_room * 8
     return {
         "slots": fleet.rooms / fleet.slots,
+        "slots of the keeper with the fewest": fleet.rooms_of_keeper / max(1, fleet.slots_of_keeper),
         "slots with one rack lost": fleet.rooms
         / max(1, fleet.slots - fleet.hosts_per_rack * fleet.gpus_per_host * fleet.slots_per_gpu),
         "directory, its thread": directory_load(fleet, costs),
         "directory, a 10 Gbit/s port": directory_bits / 10e9,
+        "web process, a core for following rooms": fleet.rooms_of_keeper * costs.web_share_per_room,
+        "web process, a 10 Gbit/s port": web_traffic_gbit_s(fleet, costs) / 10,
+        "Ray's control process, a core": gcs_load(fleet, costs),
         "uplink of a rack": rack_traffic_gbit_s(fleet, costs) / fleet.rack_uplink_gbit_s,
     }
 
@@ -333,18 +388,21 @@ def simulate(
     gpus: Annotated[int, typer.Option(min=1)] = Fleet.gpus,
     *,
     slots_per_gpu: Annotated[int, typer.Option(min=1)] = Fleet.slots_per_gpu,
+    rooms_per_keeper: Annotated[int, typer.Option(min=1)] = Fleet.rooms_per_keeper,
     days: Annotated[float, typer.Option(min=0.01)] = 365.0,
     seed: int = 1,
     out: Annotated[Path | None, typer.Option(help="File for the figures as JSON.")] = None,
 ) -> None:
     """Simulate a fleet and print what is lost, for how long, and what is exhausted first."""
-    fleet, costs = Fleet(rooms=rooms, gpus=gpus, slots_per_gpu=slots_per_gpu), Costs.measured()
+    fleet = Fleet(rooms=rooms, gpus=gpus, slots_per_gpu=slots_per_gpu, rooms_per_keeper=rooms_per_keeper)
+    costs = Costs.measured()
     outcome = FleetSimulation(fleet, costs, seed).run(days)
     shares = loads(fleet, costs)
     if out is not None:
         found = {"fleet": asdict(fleet), "seed": seed, "days": days, "loads": shares}
         out.write_text(json.dumps({**found, "figures": figures(outcome)}, indent=1) + "\n")
-    table = Table("What", f"{rooms} rooms on {gpus} GPUs, {days:g} days, seed {seed}", box=None)
+    title = f"{rooms} rooms of {fleet.keepers} keepers on {gpus} GPUs, {days:g} days, seed {seed}"
+    table = Table("What", title, box=None)
     for name, value in figures(outcome).items():
         table.add_row(name, value)
     for name, share in shares.items():

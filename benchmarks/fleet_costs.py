@@ -1,18 +1,24 @@
-"""What `benchmarks.fleet` needs to know and no other report says: answers of the directory, sizes of pictures.
+"""What `benchmarks.fleet` needs to know and no other report says: the control plane's costs, sizes of pictures.
 
 `python -m deltalight.benchmarks.fleet_costs` measures them on this machine and writes `fleet-costs-2cores.json`.
 """
 
 import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from statistics import mean, median
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from deltalight.benchmarks.fleet import RESULTS
+from deltalight.benchmarks.fleet_ray_costs import measure_ray
+from deltalight.benchmarks.soak.samples import processor_time_s, read_process
 from deltalight.protocol.codecs import encode_color
 from deltalight.protocol.messages import ControlReply
 from deltalight.protocol.payloads import encode_control
@@ -20,12 +26,15 @@ from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.render_server.server.process import ServerSettings
 from deltalight.services import ports
 from deltalight.services.demo import RECORDING
+from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
 from deltalight.services.rooms.placer import Placement, PlacementEvent, RoomOrder, Slot
+from deltalight.services.rooms.rooms_file import MAX_ROOMS
 from deltalight.services.rooms.status import RoomNode
 
 ROOMS = (10, 100, 300, 1000)
 TIMES = 20
+WEB_S = 10.0  # that a web process is watched
 
 
 class Everywhere:
@@ -42,7 +51,7 @@ class Everywhere:
         """Invent a placement."""
         name = slot or f"slot-{len(self._slots) + 1}"
         self._slots.append(Slot(name, "EGL 0", order.room))
-        endpoint = ports.endpoint(ports.PRIVATE_PORTS.start + order.epoch)
+        endpoint = ports.endpoint(ports.PRIVATE_PORTS.start + len(self._slots))
         return Placement(order.room, order.epoch, name, endpoint, endpoint)
 
     def release(self, placement: Placement) -> None:
@@ -81,6 +90,46 @@ def seconds_of(work: Callable[[], object]) -> float:
     return median(taken_s)
 
 
+def web_process(rooms: int) -> dict[str, float]:
+    """Return what a web process of so many rooms takes that show nothing: threads, files, and share of a core."""
+    page, number = ports.private_ports(2)
+    directory = ports.endpoint(number)
+    words = ["api", "--config", os.devnull, "--port", str(page), "--rooms", directory]
+    command = [sys.executable, "-m", "deltalight.services.cli", *words]
+    with closing(DirectoryServer(directory, kept(rooms))), TemporaryDirectory() as folder:
+        child = subprocess.Popen([*command, "--data", folder], stderr=subprocess.DEVNULL)
+        try:
+            while not ports.answers(page):
+                time.sleep(0.2)
+            _wait_until_started(child.pid)
+            before_s, began_s = processor_time_s(child.pid), time.monotonic()
+            time.sleep(WEB_S)
+            used_s, elapsed_s = processor_time_s(child.pid) - before_s, time.monotonic() - began_s
+            files = read_process(child.pid).handles
+            return {"threads": _threads(child.pid), "files": files, "share": used_s / elapsed_s}
+        finally:
+            child.kill()
+            child.wait()
+
+
+def _wait_until_started(process_id: int) -> None:
+    """Wait until a process starts no more threads."""
+    before, threads = -1, _threads(process_id)
+    while threads != before:
+        time.sleep(WEB_S)
+        before, threads = threads, _threads(process_id)
+
+
+def _threads(process_id: int) -> int:
+    return sum(1 for _ in Path(f"/proc/{process_id}/task").iterdir())
+
+
+def measure_web() -> dict[str, float]:
+    """Return what a room costs a web process that follows it, without pictures."""
+    one, most = web_process(1), web_process(MAX_ROOMS)
+    return {f"web_{key}_per_room": (most[key] - one[key]) / (MAX_ROOMS - 1) for key in one}
+
+
 def measure() -> dict[str, float]:
     """Measure and return the costs."""
     keepers = {rooms: kept(rooms) for rooms in ROOMS}
@@ -102,5 +151,6 @@ def measure() -> dict[str, float]:
 if __name__ == "__main__":
     machine = {"cpus": os.cpu_count(), "load_before": os.getloadavg()[0]}
     path = RESULTS / f"fleet-costs-{os.cpu_count()}cores.json"
-    path.write_text(json.dumps({**machine, **measure()}, indent=1) + "\n")
+    figures = {**measure(), **measure_web(), **measure_ray()}
+    path.write_text(json.dumps({**machine, **figures}, indent=1) + "\n")
     print(path.read_text())

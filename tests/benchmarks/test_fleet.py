@@ -20,8 +20,8 @@ from deltalight.benchmarks.fleet import (
 )
 from deltalight.benchmarks.fleet_costs import kept
 
-COSTS = Costs((1.0,), (1.0,), 1e5, 5e4, 0.0, 2e-5, 350.0)
-NOTHING_FAILS = Fleet(crashes=0.0, gpu_failures=0.0, host_failures=0.0)
+COSTS = Costs((1.0,), (1.0,), 1e5, 5e4, 0.0, 2e-5, 350.0, 0.004, 0.0, 0.002, 0.001)
+NOTHING_FAILS = Fleet(crashes=0.0, gpu_failures=0.0, host_failures=0.0, rooms_per_keeper=1000)
 
 
 def queue(servers: int, arrivals_per_s: float, service_s: float, customers: int) -> tuple[Servers, float]:
@@ -88,7 +88,7 @@ def test_a_room_without_another_gpu_is_away_as_long_as_repairs_take() -> None:
 
 
 def test_rooms_wait_where_slots_are_short_and_not_where_there_are_enough() -> None:
-    scarce = replace(Fleet(), rooms=160, gpus=32, slots_per_gpu=5, host_failures=0.02)
+    scarce = replace(Fleet(), rooms=160, rooms_per_keeper=160, gpus=32, slots_per_gpu=5, host_failures=0.02)
     outcome = FleetSimulation(scarce, COSTS).run(60)
     assert outcome.most_waiting >= 40
     plenty = FleetSimulation(replace(scarce, slots_per_gpu=50), COSTS).run(60)
@@ -103,11 +103,41 @@ def test_a_seed_gives_the_same_run_and_another_seed_another() -> None:
 
 
 def test_the_directory_is_loaded_by_the_square_of_the_fleet_and_racks_are_not() -> None:
-    fleet, twice = Fleet(rooms=1000), Fleet(rooms=2000, gpus=400)
+    fleet = Fleet(rooms=1000, rooms_per_keeper=2000)
+    twice = replace(fleet, rooms=2000, gpus=400)
     assert directory_load(twice, COSTS) == pytest.approx(4 * directory_load(fleet, COSTS))
     assert directory_load(fleet, COSTS) == pytest.approx(25 * 5 * 1000 * 2e-5)
     assert rack_traffic_gbit_s(twice, COSTS) == rack_traffic_gbit_s(fleet, COSTS)
     assert loads(fleet, COSTS)["slots"] == pytest.approx(1000 / 1200)
+
+
+def test_a_keeper_without_slots_has_rooms_that_wait_although_others_have_free_ones() -> None:
+    """Three hosts of 48 slots for 128 rooms: one keeper has enough of them, of two the second has 64 for one host."""
+    together = replace(NOTHING_FAILS, rooms=128, gpus=24)
+    apart = replace(together, rooms_per_keeper=64)
+    assert [fleet.keepers for fleet in (together, apart)] == [1, 2]
+    assert [fleet.slots_of_keeper for fleet in (together, apart)] == [144, 48]
+    assert [FleetSimulation(fleet, COSTS).run(1).most_waiting for fleet in (together, apart)] == [0, 16]
+    assert loads(apart, COSTS)["slots of the keeper with the fewest"] == pytest.approx(64 / 48)
+
+
+def test_a_hundred_starts_at_once_wait_for_ray_to_create_their_actors() -> None:
+    fleet = replace(NOTHING_FAILS, rooms=100, starts_at_once=1000)
+    costs = replace(COSTS, gcs_s_per_actor=0.1)
+    assert FleetSimulation(fleet, costs).run(1).first_start_s == pytest.approx(100 * 0.1 + 1.0)
+    two_keepers = FleetSimulation(replace(fleet, rooms_per_keeper=50), costs).run(1)
+    assert two_keepers.first_start_s == pytest.approx(50 * 0.1 + 1.0)
+    assert loads(fleet, costs)["Ray's control process, a core"] == pytest.approx(0.002 + 25 * 0.001)
+
+
+def test_what_follows_rooms_grows_with_those_of_its_keeper_alone() -> None:
+    fleet = Fleet(rooms=1000)
+    assert (fleet.keepers, fleet.rooms_of_keeper) == (16, 63)
+    found = loads(fleet, COSTS)
+    assert found == loads(replace(fleet, rooms=2000, rooms_per_keeper=63), COSTS) | {
+        key: found[key] for key in found if "slots" in key
+    } | {"Ray's control process, a core": found["Ray's control process, a core"]}
+    assert found["web process, a core for following rooms"] == pytest.approx(63 * 0.004)
 
 
 def test_measured_costs_are_in_the_reports_and_of_what_they_say() -> None:
