@@ -103,6 +103,8 @@ class Placer(Protocol):
 def choose_slot(slots: Sequence[Slot], order: RoomOrder, wanted: str | None = None) -> Slot:
     """Return the slot that is wanted, or a free one of the host that has most of them.
 
+    Hosts none of whose devices is doubted come first.
+
     Raises:
         NoSlotError: there is none; says why.
     """
@@ -114,8 +116,8 @@ def choose_slot(slots: Sequence[Slot], order: RoomOrder, wanted: str | None = No
     if not free:
         raise NoSlotError(_why_none(order, fitting, usable))
     free = [slot for slot in free if (slot.host, slot.device) not in order.doubted] or free
-    of_host = Counter(slot.host for slot in free)
-    return max(free, key=lambda slot: of_host[slot.host])
+    of_host, doubted_hosts = Counter(slot.host for slot in free), {host for host, _ in order.doubted}
+    return max(free, key=lambda slot: (slot.host not in doubted_hosts, of_host[slot.host]))
 
 
 def _wanted_slot(slots: Sequence[Slot], order: RoomOrder, wanted: str) -> Slot:

@@ -157,8 +157,12 @@ class RayPlacer:
         return [f"{why[:1].upper()}{why[1:]}" for why in hosts if why is not None]
 
     def _slots_of(self, host: ClusterHost) -> list[Slot]:
-        names = [f"{host.name}/{number}" for number in range(1, host.slots + 1)]
-        return [Slot(name, "chosen there", self._room_in(name), host.name, host.labels) for name in names]
+        return [self._slot_of(host, number) for number in range(1, host.slots + 1)]
+
+    def _slot_of(self, host: ClusterHost, number: int) -> Slot:
+        """Describe a slot; its device, which its number chooses among those there, may be another one's, too."""
+        name = f"{host.name}/{number}"
+        return Slot(name, f"chosen there for slot {number}", self._room_in(name), host.name, host.labels)
 
     def _room_in(self, slot: str) -> str | None:
         placed = self._placed.get(slot)

@@ -5,7 +5,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -276,3 +276,20 @@ def test_a_room_takes_a_host_with_its_labels_that_is_not_drained() -> None:
     ):
         with pytest.raises(NoSlotError, match=sentence):
             choose_slot(slots, order, slot)
+
+
+def test_a_doubted_device_is_taken_last_and_its_host_after_others() -> None:
+    slots = [
+        Slot("a/1", "first", None, "a"),
+        Slot("a/2", "second", None, "a"),
+        Slot("b/1", "first", None, "b"),
+    ]
+
+    def chosen(doubted: set[tuple[str, str]], among: Sequence[Slot] = slots) -> str:
+        order = RoomOrder("attic", 1, (), Path("unused.json"), doubted=frozenset(doubted))
+        return choose_slot(among, order).name
+
+    assert chosen(set()) == "a/1"
+    assert chosen({("a", "first")}) == "b/1"
+    assert chosen({("a", "first")}, slots[:2]) == "a/2"
+    assert chosen({("a", "first"), ("a", "second")}, slots[:2]) == "a/1"
