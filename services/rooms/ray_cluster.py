@@ -90,8 +90,10 @@ class RayCluster:
 def own_sigterm() -> Iterator[None]:
     """Let SIGTERM end this process as before the block, in which Ray takes it over (main thread)."""
     handler = signal.getsignal(signal.SIGTERM)
-    yield
-    signal.signal(signal.SIGTERM, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _import_ray(*, is_alone: bool) -> Any:  # noqa: ANN401 (a module)
