@@ -37,7 +37,8 @@ class Material:
 
     `specular`: F0 = 0.08 specular, which `ior` overrides; `f0_tint` multiplies either. `emission` is a radiance in
     camera units. `roughness` is perceptual (alpha = roughness squared). Maps multiply the values that they are named
-    after: roughness by green, metallic by blue. `alpha` multiplies that of the base colour's map.
+    after: roughness by green, metallic by blue. `alpha` multiplies that of the base colour's map. Vertex colours
+    multiply the base colour, and the emission of what `is_unlit`.
 
     `transmission` is the fraction of the light entering the surface that goes on through it, the rest is diffuse. The
     solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
@@ -57,6 +58,7 @@ class Material:
     is_thin: bool = False
     attenuation_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.ones(3, np.float32))
     attenuation_distance_m: float = math.inf
+    is_unlit: bool = False
     double_sided: bool = False
     alpha_mode: AlphaMode = AlphaMode.OPAQUE
     alpha: float = 1.0
@@ -232,6 +234,7 @@ class Material:
             roughness=1.0,
             f0_tint=np.zeros(3, np.float32),
             emission=self.base_color,
+            is_unlit=True,
             emissive_map=self.base_color_map,
             metallic_roughness_map=None,
             normal_map=None,
@@ -307,8 +310,8 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]
     """Packs materials for a shader, five vectors each.
 
     (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, row + 1 of
-    `measured_table`, 0: not measured, a place that the GPU knows, layers of a stack), (absorption 1/m, index of
-    refraction; 0: thin).
+    `measured_table`, 0: not measured, a place that the GPU knows, layers of a stack, -1: unlit), (absorption 1/m,
+    index of refraction; 0: thin).
     """
     measured = 0
     table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
@@ -322,6 +325,8 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]
             row[13] = measured
         if isinstance(material.by_light, TextureStack):
             row[15] = len(material.by_light.layers)
+        elif material.is_unlit:
+            row[15] = -1
         row[16:20] = *material.absorption_per_m, 0.0 if material.is_thin else material.refraction_index
     return table
 

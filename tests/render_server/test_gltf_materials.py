@@ -220,6 +220,22 @@ def test_unlit_shows_its_colour_in_any_light(draw: Draw) -> None:
         assert picture == pytest.approx(expected, rel=6e-3)
 
 
+@pytest.mark.parametrize("has_texture", [False, True])
+def test_vertex_colours_tint_what_is_unlit(draw: Draw, has_texture: bool) -> None:
+    """As they tint the base colour of what is lit (KHR_materials_unlit)."""
+    made = plate()
+    made.attributes["COLOR_0"] = made.glb.floats([(0.25, 1.0, 0.5)] * 4)
+    made.material["pbrMetallicRoughness"] = {"baseColorFactor": [0.5, 1, 1, 1]}
+    texel = 1.0
+    if has_texture:
+        made.material["pbrMetallicRoughness"]["baseColorTexture"] = made.texture(even(188, 188, 188))
+        texel = LINEAR[188]
+    made.material["extensions"]["KHR_materials_unlit"] = {}
+    picture = draw(made, [directional(), ambient(1.0)])[INSIDE]
+    expected = texel * np.array([0.5, 1, 1]) * (0.25, 1.0, 0.5)
+    assert picture == pytest.approx(np.broadcast_to(expected, picture.shape), rel=0.02)
+
+
 def masked(mode: str, codes: np.ndarray, **alpha: Any) -> Plate:  # noqa: ANN401
     """A white plate, its alpha from a texture."""
     made = plate()

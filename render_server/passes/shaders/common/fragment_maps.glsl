@@ -33,7 +33,8 @@ ShownMaps fragment_maps(Fragment f, bool wanted) {
     vec2 rough_metal = map_here(data_maps, f, e.maps[METALLIC_ROUGHNESS], wanted).gb;
     float occlusion = 1.0 + e.maps[OCCLUSION].sampling.w * (map_here(data_maps, f, e.maps[OCCLUSION], wanted).r - 1.0);
     vec3 base = f.tint * map_here(color_maps, f, e.maps[BASE_COLOR], wanted).rgb;
-    return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, map_here(color_maps, f, e.maps[EMISSIVE], wanted).rgb);
+    vec3 glow = glow_tint(e, f.tint) * map_here(color_maps, f, e.maps[EMISSIVE], wanted).rgb;
+    return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, glow);
 }
 
 float fragment_opacity(Fragment f) {

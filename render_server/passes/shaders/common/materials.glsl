@@ -13,7 +13,7 @@ struct MaterialEntry {
     vec4 base_color;   // rgb linear; metallic
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
-    vec4 flags;        // double-sided; row + 1 of the measured, layer + 1 of a texture by light, 0: none; layers of a stack
+    vec4 flags;        // double-sided; row + 1 of the measured, layer + 1 of a texture by light, 0: none; layers of a stack, -1: unlit
     vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
 #ifdef MATERIAL_MAPS
     vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
@@ -21,6 +21,9 @@ struct MaterialEntry {
 #endif
 };
 layout(std430) readonly buffer Materials { MaterialEntry materials[]; };
+
+// An unlit surface glows with its base colour, which the vertex colour multiplies.
+vec3 glow_tint(MaterialEntry e, vec3 tint) { return e.flags.w < 0.0 ? tint : vec3(1.0); }
 
 // Of a Material: `passing` is the fraction of the light entering the surface that goes on through it, `diffuse` what of
 // the rest comes back.
@@ -106,7 +109,7 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     float level = level_of(e, color_maps, size);
     vec3 base = e.base_color.rgb * tint * map_level(color_maps, e.maps[BASE_COLOR], uv, level).rgb;
     vec2 rough_metal = map_level(data_maps, e.maps[METALLIC_ROUGHNESS], uv, level_of(e, data_maps, size)).gb;
-    vec3 glow = map_level(color_maps, e.maps[EMISSIVE], uv, level).rgb;
+    vec3 glow = glow_tint(e, tint) * map_level(color_maps, e.maps[EMISSIVE], uv, level).rgb;
     return mapped(e, base, rough_metal.y, rough_metal.x, 1.0, glow);
 }
 
@@ -141,7 +144,7 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     m.passing = entering * e.emission.a;
     m.f0 = mix(e.dielectric.rgb, base, e.base_color.a);
     m.roughness = e.dielectric.a;
-    m.emission = e.emission.rgb;
+    m.emission = e.emission.rgb * glow_tint(e, tint);
 #ifdef MEASURED
     m.measured = int(e.flags.y) - 1;
 #endif
