@@ -79,17 +79,11 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
         color *= (1 - material.metallic) * material.base_color
         if mesh.colors is not None:
             color *= mesh.colors[mesh.triangles]
-        if material.base_color_texture is not None and mesh.uv is not None:
-            color *= _texels(material.base_color_texture, mesh.uv[mesh.triangles])
+        texture = material.base_color_map
+        uv = mesh.second_uv if texture is not None and texture.uv_set == 1 else mesh.uv
+        if texture is not None and uv is not None:
+            color *= texture.nearest(uv[mesh.triangles])[..., :3]
     return np.concatenate([corners, color.astype(np.float32)], axis=2)
-
-
-def _texels(texture: Float16[np.ndarray, "h w 3"], uv: Float32[np.ndarray, "m 3 2"]) -> np.ndarray:
-    """Returns the nearest texels at corners; the texture repeats."""
-    rows, columns = texture.shape[:2]
-    x = np.minimum((uv[..., 0] % 1 * columns).astype(int), columns - 1)
-    y = np.minimum((uv[..., 1] % 1 * rows).astype(int), rows - 1)
-    return np.asarray(texture[y, x], np.float32)
 
 
 def compute_transfer(

@@ -54,6 +54,22 @@ class TextureMap:
         """Whether it holds colours, not data."""
         return self.texels.dtype == np.float16
 
+    def nearest(self, uv: Float32[np.ndarray, "*n 2"]) -> Float32[np.ndarray, "*n c"]:
+        """Returns the nearest texels at the vertices' coordinates."""
+        place = uv @ self.from_uv[:, :2].T + self.from_uv[:, 2]
+        size = self.texels.shape[1::-1]
+        column, row = (
+            np.clip((_wrapped(place[..., axis], wrap) * size[axis]).astype(int), 0, size[axis] - 1)
+            for axis, wrap in enumerate(self.wraps)
+        )
+        return np.asarray(self.texels[row, column], np.float32)
+
+
+def _wrapped(x: Float32[np.ndarray, "*n"], wrap: Wrap) -> Float32[np.ndarray, "*n"]:
+    if wrap == Wrap.REPEAT:
+        return np.asarray(x % 1)
+    return np.asarray(np.clip(x, 0, 1) if wrap == Wrap.CLAMP else 1 - np.abs(x % 2 - 1))
+
 
 def linear_texture(image: Image.Image, *, with_alpha: bool = False) -> Float16[np.ndarray, "h w c"]:
     """Decodes an sRGB picture to linear R G B [A], of at most MAX_TEXTURE_EDGE texels an edge.

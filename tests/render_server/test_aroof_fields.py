@@ -28,6 +28,7 @@ from deltalight.render_server.scene.occlusion_field import (
     place_shells,
 )
 from deltalight.render_server.scene.occlusion_transfer import object_surface
+from deltalight.render_server.scene.texture_maps import TextureMap, Wrap
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 SETTINGS = FieldSettings(order=4, shells=3, resolution=12, reach=4.0, rays=256, indirect=True)
@@ -42,6 +43,32 @@ def mesh_of(shape: trimesh.Trimesh, color: tuple[float, float, float] = (0.5, 0.
         None,
         Material(base_color=np.array(color, np.float32)),
     )
+
+
+@pytest.mark.parametrize(
+    ("uv_set", "shift", "wrap", "expected"),
+    [
+        (0, (0.0, 0.0), Wrap.REPEAT, [0.1, 0.2, 0.4]),
+        (1, (0.0, 0.0), Wrap.REPEAT, [0.2, 0.1, 0.3]),
+        (0, (0.5, 0.0), Wrap.REPEAT, [0.2, 0.1, 0.3]),
+        (0, (0.5, 0.5), Wrap.CLAMP, [0.4, 0.4, 0.4]),
+        (0, (1.0, 0.0), Wrap.MIRROR, [0.2, 0.1, 0.3]),
+    ],
+)
+def test_reflectance_is_that_of_the_texture_where_it_lies(
+    uv_set: int, shift: tuple[float, float], wrap: Wrap, expected: list[float]
+) -> None:
+    """On its set of coordinates, with its transform, beyond its edges as it says."""
+    texels = np.repeat(np.array([[0.1, 0.2], [0.3, 0.4]], np.float16)[..., None], 3, axis=2)
+    from_uv = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+    texture = TextureMap(texels, uv_set, from_uv, (wrap, wrap))
+    sets = np.array([[(0.2, 0.2), (0.7, 0.2), (0.7, 0.7)], [(0.7, 0.2), (0.2, 0.2), (0.2, 0.7)]], np.float32)
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0)], np.float32)
+    white = Material(base_color=np.ones(3, np.float32), base_color_map=texture)
+    up = np.tile(np.array([0, 0, 1], np.float32), (3, 1))
+    mesh = TriangleMesh(corners, up, np.array([[0, 1, 2]], np.int32), sets[0], white, second_uv=sets[1])
+    (found,) = object_surface([mesh], plain=False)
+    assert found[:, 3:] == pytest.approx(np.repeat(np.array(expected)[:, None], 3, axis=1), abs=1e-3)
 
 
 @pytest.fixture(scope="module")
