@@ -26,6 +26,7 @@ from deltalight.render_server.scene.occlusion_field import (
     direction_set,
     fill_inside,
 )
+from deltalight.render_server.scene.texture_maps import TextureMap
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh, split_triangles
 
 ORDER = 3  # SH bands of incident and reflected light: both are diffuse
@@ -76,14 +77,24 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
     color = np.ones_like(corners)
     if not plain:
         material = mesh.material
-        color *= (1 - material.metallic) * material.base_color
+        base, metal = (
+            _texels(mesh, each) for each in (material.base_color_map, material.metallic_roughness_map)
+        )
+        metallic = material.metallic * (1.0 if metal is None else metal[..., 2:] / 255)
+        color *= (1 - metallic) * material.base_color
         if mesh.colors is not None:
             color *= mesh.colors[mesh.triangles]
-        texture = material.base_color_map
-        uv = mesh.second_uv if texture is not None and texture.uv_set == 1 else mesh.uv
-        if texture is not None and uv is not None:
-            color *= texture.nearest(uv[mesh.triangles])[..., :3]
+        if base is not None:
+            color *= base[..., :3]
     return np.concatenate([corners, color.astype(np.float32)], axis=2)
+
+
+def _texels(mesh: TriangleMesh, texture: TextureMap | None) -> Float32[np.ndarray, "m 3 c"] | None:
+    """Returns the nearest texels at the triangles' corners; None without a texture, or a place on it."""
+    if texture is None:
+        return None
+    uv = mesh.second_uv if texture.uv_set == 1 else mesh.uv
+    return None if uv is None else texture.nearest(uv[mesh.triangles])
 
 
 def compute_transfer(

@@ -71,6 +71,22 @@ def test_reflectance_is_that_of_the_texture_where_it_lies(
     assert found[:, 3:] == pytest.approx(np.repeat(np.array(expected)[:, None], 3, axis=1), abs=1e-3)
 
 
+def test_a_texture_tells_which_part_is_metal() -> None:
+    """Whose factor is 1 where a glTF file does not say otherwise; metal has no diffuse reflectance."""
+    data = np.array([[(0, 128, 0), (0, 128, 51)]], np.uint8)
+    material = Material(
+        base_color=np.full(3, 0.5, np.float32), metallic=1.0, metallic_roughness_map=TextureMap(data)
+    )
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0)], np.float32)
+    up, uv = (
+        np.tile(np.array([0, 0, 1], np.float32), (3, 1)),
+        np.array([(0.2, 0), (0.7, 0), (0.7, 0)], np.float32),
+    )
+    mesh = TriangleMesh(corners, up, np.array([[0, 1, 2]], np.int32), uv, material)
+    (found,) = object_surface([mesh], plain=False)
+    assert found[:, 3] == pytest.approx([0.5, 0.4, 0.4])
+
+
 @pytest.fixture(scope="module")
 def ball() -> TriangleMesh:
     return mesh_of(trimesh.creation.icosphere(3, RADIUS))
