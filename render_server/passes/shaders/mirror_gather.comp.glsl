@@ -24,14 +24,14 @@ const float OWN = 1.5;     // voxels from a surface that may be its own
 // Unoccluded fraction of the segment between two points (voxels); both ends are left out.
 float open_fraction(vec3 from, vec3 to) {
     vec3 d = normalize(to - from);
-    Walk w = walk_from(from + OWN * d, d);
+    Walk w = walk_from(from + OWN * d, d, volume_size);
     float end = length(to - from) - 2.0 * OWN, coverage = 0.0;
     for (int i = 0; i < 1024; ++i) {
         vec3 at = sample_point(w);
         if (travelled(w) > end || coverage >= WALL) break;
         if (inside_volume(at)) coverage += slice_fraction(w) * sample_near(mipmap_mu, at, w).a;
         w.plane += 1;
-        w.ahead = vec3(0.0);
+        w.halved = false;
     }
     return 1.0 - blocked_fraction(coverage);
 }

@@ -2,7 +2,7 @@
 // both are equal, and one march is enough.
 //
 // A ray walks across the slices of cells along its main axis and samples at their faces, half into each, so that
-// every cell is counted once, and none is skipped where the level changes. The coverage met is summed, and a cone is
+// every cell is counted once, also where the level changes. The coverage met is summed, and a cone is
 // blocked when the sum reaches that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light
 // through at any step size: no furnace test could hold.)
 #include "common/volume.glsl"
@@ -58,40 +58,63 @@ struct Walk {
     float first;     // main coordinate of `from`
     vec3 slope;      // direction, 1 on the main axis
     float stretch;   // distance per cell of the main axis
+    vec3 axis;       // unit vector along the main axis
     ivec3 facing;    // slabs that the ray sees from the front
-    vec3 ahead;      // from the next face to its sample: half a cell at the start, so that nothing behind counts
-    int plane;       // main coordinate of the face
+    int end;         // main coordinate of the grid's last face
+    int plane;       // that of the face
     int level;
+    bool grows;      // whether cells are larger from the next face on
+    bool halved;     // whether the sample is of the slice ahead alone, in its middle
 };
 
-Walk walk_from(vec3 q, vec3 d) {
+// In a grid of n cells an edge. Nothing behind the start counts.
+Walk walk_from(vec3 q, vec3 d, int n) {
     vec3 a = abs(d);
-    int axis = a.x >= a.y && a.x >= a.z ? 0 : (a.y >= a.z ? 1 : 2);
-    float side = d[axis] >= 0.0 ? 1.0 : -1.0;
-    vec3 ahead = vec3(0.0);
-    ahead[axis] = 0.5 * side;
+    int main = a.x >= a.y && a.x >= a.z ? 0 : (a.y >= a.z ? 1 : 2);
+    float side = d[main] >= 0.0 ? 1.0 : -1.0;
+    vec3 axis = vec3(0.0);
+    axis[main] = side;
     ivec3 facing = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
-    return Walk(q, side * q[axis], d / a[axis], 1.0 / a[axis], facing, ahead, int(ceil(side * q[axis] - 0.5)), 0);
+    int plane = int(ceil(side * q[main] - 0.5));
+    return Walk(q, side * q[main], d / a[main], 1.0 / a[main], axis, facing, side > 0.0 ? n : 0, plane, 0, false, true);
 }
 
-float travelled(Walk w) { return max(float(w.plane) - w.first, 0.0) * w.stretch; }
+float travelled_to(Walk w, int plane) { return max(float(plane) - w.first, 0.0) * w.stretch; }
 
-vec3 sample_point(Walk w) { return w.from + (float(w.plane) - w.first) * w.slope + w.ahead; }
+float travelled(Walk w) { return travelled_to(w, w.plane); }
 
-float slice_fraction(Walk w) { return w.ahead == vec3(0.0) ? 1.0 : 0.5; }
+vec3 sample_point(Walk w) {
+    return w.from + (float(w.plane) - w.first) * w.slope + (w.halved ? 0.5 * float(1 << w.level) : 0.0) * w.axis;
+}
+
+float slice_fraction(Walk w) { return w.halved || w.plane == w.end ? 0.5 : 1.0; }
+
+// Whether a sample lies in the grid; at its last face it is of the slice behind.
+bool is_within(vec3 at, int n) { return inside_cube(at + 1e-3, float(n) + 2e-3); }
 
 // Cells grow, at most twofold per slice, to half..all of the cone's diameter, at the beginning of a slice that is
 // whole on the coarser level too. `before`: distance travelled before this walk, cells of level 0.
-void choose_level(inout Walk w, float ratio, float before, int levels) {
+bool grows_at(Walk w, int plane, float ratio, float before, int levels) {
     int wide = 2 << w.level;
-    bool whole = w.level + 1 < levels && (w.plane & (wide - 1)) == 0;
-    if (whole && ratio * (before + travelled(w)) >= float(wide)) ++w.level;
+    bool whole = w.level + 1 < levels && (plane & (wide - 1)) == 0;
+    return whole && ratio * (before + travelled_to(w, plane)) >= float(wide);
 }
 
+bool grows_next(Walk w, float ratio, float before, int levels) {
+    return grows_at(w, w.plane + (1 << w.level), ratio, before, levels);
+}
+
+void enlarge_cells(inout Walk w, float ratio, float before, int levels) {
+    for (int i = 1; i < levels; ++i) if (grows_at(w, w.plane, ratio, before, levels)) ++w.level;
+    w.grows = grows_next(w, ratio, before, levels);
+}
+
+// A face where cells grow takes half of the two slices behind it, as one; what is left of them is half of the slice ahead of
+// the face before.
 void advance(inout Walk w, float ratio, float before, int levels) {
     w.plane += 1 << w.level;
-    w.ahead = vec3(0.0);
-    choose_level(w, ratio, before, levels);
+    if (w.grows) ++w.level;
+    w.grows = w.halved = grows_next(w, ratio, before, levels);
 }
 
 #ifdef ISOTROPIC_VOXELS
@@ -147,13 +170,13 @@ bool may_be_far(vec3 q, int level) {
 // Goes on to the next cell, from that at `at` on, that may hold anything; whether there is one.
 bool find_near(inout Walk w, inout vec3 at, float before, float ratio, vec3 low, vec3 high, inout bool differs) {
     bool met = false;
-    if (inside_volume(at)) do {
+    if (is_within(at, volume_size)) do {
         vec3 reach = vec3(1.5 * float(1 << w.level));
         differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
         met = may_be_near(at, w.level);
         if (!met) advance(w, ratio, before, volume_levels);
         at = sample_point(w);
-    } while (inside_volume(at) && !met);
+    } while (is_within(at, volume_size) && !met);
     return met;
 }
 
@@ -162,11 +185,8 @@ bool find_near(inout Walk w, inout vec3 at, float before, float ratio, vec3 low,
 float march_near(
     sampler3D mipmap, vec3 q, vec3 d, float before, float ratio, inout Crossed sum, inout bool differs
 ) {
-    Walk w = walk_from(q, d);
-    if (before > 0.0) {
-        for (int i = 1; i < volume_levels; ++i) choose_level(w, ratio, before, volume_levels);
-        w.ahead *= float(1 << w.level);
-    }
+    Walk w = walk_from(q, d, volume_size);
+    if (before > 0.0) enlarge_cells(w, ratio, before, volume_levels);
     int held = 6 * volume;
     vec3 low = vec3(support[held], support[held + 1], support[held + 2]);
     vec3 high = vec3(-support[held + 3], -support[held + 4], -support[held + 5]) + 1.0;
@@ -180,9 +200,9 @@ float march_near(
 }
 
 #ifdef SEVERAL_VOLUMES
-bool in_far(vec3 at, Walk w, float end) { return inside_cube(at, float(far_size)) && travelled(w) < end; }
+bool in_far(vec3 at, Walk w, float end) { return is_within(at, far_size) && travelled(w) < end; }
 #else
-bool in_far(vec3 at, Walk w, float end) { return inside_cube(at, float(far_size)); }
+bool in_far(vec3 at, Walk w, float end) { return is_within(at, far_size); }
 #endif
 
 // The same in the coarse real scene, until a distance `end` (its voxels).
@@ -199,9 +219,8 @@ bool find_far(inout Walk w, inout vec3 at, float before, float end, float ratio)
 // Continues through the coarse real scene, from q after a distance `before`, for a distance `end` (all in its voxels) where
 // another volume is ahead.
 void march_far(vec3 q, vec3 d, float before, float end, float ratio, inout Crossed sum) {
-    Walk w = walk_from(q, d);
-    for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
-    w.ahead *= float(1 << w.level);
+    Walk w = walk_from(q, d, far_size);
+    enlarge_cells(w, ratio, before, far_levels);
     vec3 at = sample_point(w);
     if (sum.coverage < WALL && find_far(w, at, before, end, ratio)) do {
         cross_cell(slice_fraction(w) * directional_sample(mipmap_far, 0, far_size, at, w), sum);
