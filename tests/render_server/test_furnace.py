@@ -83,7 +83,9 @@ def test_radiance_and_transmittance_share_the_light(lab: VoxelLab) -> None:
 
 
 @pytest.mark.parametrize("ratio", [0.05, DIFFUSE, SHARE])
-def test_every_cell_counts_once_where_cells_grow_and_where_the_volume_ends(lab: VoxelLab, ratio: float) -> None:
+def test_every_cell_counts_once_where_cells_grow_and_where_the_volume_ends(
+    lab: VoxelLab, ratio: float
+) -> None:
     """Strips that cover 0.3 of a plane block 0.3 of the light, at any distance and in the volume's last cells."""
     rng = np.random.default_rng(7)
     starts = np.concatenate([rng.uniform(24, 40, (COUNT, 2)), np.full((COUNT, 1), 1.3)], axis=1)

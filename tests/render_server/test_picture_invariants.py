@@ -5,6 +5,8 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from deltalight.protocol.scene import parse_scene
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_objects import Pose
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.passes.composite import FILL_RADIUS, ChangeRatio
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
@@ -366,3 +370,26 @@ def test_under_lamps_alone_the_volumes_border_does_not_show(gpu: GpuContext, sta
     picture = composite(gpu, document, frame(plain(120))).astype(int)
     assert (picture != 120).any()
     assert picture[solve(gpu, document, frame(plain(120))).matte == 0].max() < 160
+
+
+def test_only_visible_changes_of_light_are_composed(gpu: GpuContext) -> None:
+    """Of 1/1024 of the irradiance an 8-bit picture shows next to nothing; of 1/256 it may show a code."""
+    width, unchanged = 40, np.full((1, 40, 4), 1.0, np.float16)
+    direct, gathered = unchanged.copy(), unchanged.copy()
+    gathered[0, 6, :3] += 2 / 1024  # of 2 in all
+    direct[0, 20, 1] -= 2 / 256
+    pixels = np.stack([np.arange(width), np.zeros(width), *np.full((2, width), -1)], axis=1).astype(np.int16)
+    made = [
+        texture_2d(gpu, (width, 1), 4, "f2", data=each.tobytes()) for each in (unchanged, direct, gathered)
+    ]
+    plain, darker, brighter = made
+    seen = texture_2d(gpu, (width, 1), 4, "i2", data=pixels.tobytes())
+    change = ChangeRatio(gpu, (width, 1))
+    cones: Any = SimpleNamespace(mu=plain, rho=brighter, specular_mu=plain, specular_rho=plain)
+    light: Any = SimpleNamespace(light=SimpleNamespace(mu=plain, rho=darker))
+    grid: Any = SimpleNamespace(size=(width, 1), pixels=seen, scale=1)
+    change.run(grid, light, cones, None)
+    listed = np.frombuffer(change.texels.read(), np.uint32)
+    assert set(listed[1 : 1 + listed[0]]) == set(range(20 - FILL_RADIUS, 21 + FILL_RADIUS))
+    for item in (*made, seen, change):
+        item.release()

@@ -1,5 +1,5 @@
-// How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed in
-// its block of pixels. Otherwise: list the texels that are within FILL_RADIUS of a change or show an object; only
+// How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed visibly
+// in its block of pixels. Otherwise: list the texels that are within FILL_RADIUS of a change or show an object; only
 // their pixels are composed.
 #ifndef RATIO
 #define APPENDS_TEXELS
@@ -23,13 +23,18 @@ uniform sampler2D reflection;   // a: fraction of a smooth surface's lobe that o
 uniform int scale;
 
 const float LEAST_IRRADIANCE = 1e-4;
+const float LEAST_CHANGE = 1.0 / 512.0;   // of the irradiance: 0.2 of a code of an 8-bit picture at most
 
-bool block_changed(ivec2 texel) {
+bool differs(vec3 mu, vec3 rho, vec3 all_mu) { return any(greaterThan(abs(rho - mu), LEAST_CHANGE * all_mu)); }
+
+// `gathered`: irradiance by cones.
+bool block_changed(ivec2 texel, vec3 gathered) {
     bool changed = false;
     ivec2 last = textureSize(direct_mu, 0) - 1;
     for (int i = 0; i < scale * scale; ++i) {
         ivec2 pixel = min(pixel_in_block(texel, i, scale), last);
-        changed = changed || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb
+        vec3 mu = texelFetch(direct_mu, pixel, 0).rgb;
+        changed = changed || differs(mu, texelFetch(direct_rho, pixel, 0).rgb, mu + gathered)
             || (has_reflection && texelFetch(reflection, pixel, 0).a > 0.0);
     }
     return changed;
@@ -42,8 +47,8 @@ vec4 value(ivec2 texel) {
     vec4 rho = texelFetch(cone_rho, texel, 0), mu = texelFetch(cone_mu, texel, 0);
     vec3 e_mu = texelFetch(direct_mu, at, 0).rgb + mu.rgb;
     vec3 e_rho = texelFetch(direct_rho, at, 0).rgb + mu.rgb + rho.a * (rho.rgb - mu.rgb);
-    bool changed = e_mu != e_rho || texelFetch(cone_specular_mu, texel, 0) != texelFetch(cone_specular_rho, texel, 0)
-        || block_changed(texel);
+    bool changed = differs(e_mu, e_rho, e_mu) || texelFetch(cone_specular_mu, texel, 0) != texelFetch(cone_specular_rho, texel, 0)
+        || block_changed(texel, mu.rgb);
     return vec4((e_rho + LEAST_IRRADIANCE) / (e_mu + LEAST_IRRADIANCE), changed ? 2.0 : 1.0);
 }
 #else
