@@ -23,6 +23,10 @@ TriangleBudget = Annotated[
     Annotated[int, Field(ge=1000, le=4_000_000)] | None,
     Field(description="Maximum triangles of the depth mesh; null = 400000 on a GPU, 40000 in software."),
 ]
+MemoryBudget = Annotated[
+    int,
+    Field(ge=16, le=65536, description="Memory limit of the volumes, MB; beyond it, rendering is refused."),
+]
 ShadowSamples = Annotated[int, Field(ge=1, le=64, description="Samples per area light, for soft shadows.")]
 
 
@@ -118,12 +122,7 @@ class VoxelConeSettings(MethodSettings):
         "voxels only.",
     )
     shadow_samples: ShadowSamples = 16
-    memory_budget_mb: int = Field(
-        default=4096,
-        ge=16,
-        le=65536,
-        description="Memory limit of the volumes, MB; beyond it, rendering is refused.",
-    )
+    memory_budget_mb: MemoryBudget = 4096
 
 
 class DvctMethod(VoxelConeSettings):
@@ -163,7 +162,7 @@ class DvctMethod(VoxelConeSettings):
         return self.composition or ("ratio" if self.operator == "exact" else "additive")
 
 
-PrintedCells = Annotated[int | None, Field(ge=16, le=64, multiple_of=8)]
+PrintedCells = Annotated[int | None, Field(ge=16, le=128, multiple_of=8)]
 
 
 class DlpvMethod(MethodSettings):
@@ -178,9 +177,9 @@ class DlpvMethod(MethodSettings):
     volume_size: int = Field(
         default=32,
         ge=16,
-        le=64,
+        le=128,
         multiple_of=8,
-        description="Cells along each edge; more cells cost more without improving the picture.",
+        description="Cells along each edge; more cells cost more and hardly improve the picture.",
     )
     volume_edge_m: VolumeEdge = None
     steps: int | None = Field(
@@ -272,6 +271,7 @@ class DlpvMethod(MethodSettings):
     rsm_size: ShadowMapSize = None
     triangle_budget: TriangleBudget = None
     shadow_samples: ShadowSamples = 16
+    memory_budget_mb: MemoryBudget = 4096
     composition: Literal["ratio", "additive"] | None = Field(
         default=None,
         description="How the change of light is applied to the picture; null = ratio, additive for paper.",

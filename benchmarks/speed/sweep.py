@@ -4,34 +4,43 @@ Published: GeForce GTX 470 to GTX 780 with scenes of their own; ours: the demo o
 grow, not the times.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
 
-from deltalight.benchmarks.speed.measure import SpeedJob, measure_speed
+from deltalight.benchmarks.speed.measure import SpeedJob, measure_speed, opened
+from deltalight.benchmarks.speed.motions import Take, prepare_take
 from deltalight.benchmarks.speed.report import MotionFigures, SpeedReport
 from deltalight.benchmarks.speed.tables import MISSING, figure_table
-from deltalight.benchmarks.variants import RENDERED, Variant, parse_variants
+from deltalight.benchmarks.variants import RENDERED, parse_variants
+from deltalight.protocol.errors import DeltalightError
 
 BUDGET_MS = 100.0
+ALL_STAGES: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Point:
-    """A row: size in words, the method with that size, published times (ms) by column, and whether 2 CPUs do it."""
+    """A row: size in words, the method with that size, published times (ms) by column, and whether 2 CPUs do it.
+
+    `method` None: this project has nothing of that size.
+    """
 
     size: str
-    method: str
+    method: str | None
     published_ms: Sequence[float | None]
     is_small: bool
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A table: columns are sums of stages, named as in the dissertation; `motion` is what makes them run."""
+    """A table: columns are sums of stages, named as in the dissertation; `motion` is what makes them run.
+
+    A column of ALL_STAGES is the sum of all.
+    """
 
     title: str
     motion: str
@@ -55,12 +64,23 @@ def _steps() -> Iterator[Point]:
         16: (0.712, 1.815),
         32: (2.342, 4.552, 8.857),
         64: (11.148, 22.021, 43.23, 85.089),
+        128: (79.96, 158.36, 304.57, 625.89, 1250.5),
     }
+    small = {16: 64, 32: 64, 64: 32, 128: 16}  # most steps that two CPUs do in seconds
     for cells, times_ms in published.items():
         for power, steps in enumerate((16, 32, 64, 128, 256)):
             known = times_ms[power] if power < len(times_ms) else None
-            method = f"dlpv-paper:volume_size={cells},steps={steps}"
-            yield Point(f"{cells}^3, {steps} steps", method, (known,), cells <= 32 and steps <= 64)
+            method = f"dlpv-paper:volume_size={cells},steps={steps},objects_steps=1,direct_steps=0"
+            yield Point(f"{cells}^3, {steps} steps", method, (known,), steps <= small[cells])
+
+
+def _lights() -> Iterator[Point]:
+    """[D] compares DLPVs, each of whose texels is a virtual light (the last row), with splatting of fewer lights."""
+    method = "dlpv-paper:steps=32,rsm_size="
+    yield Point("1024 lights", None, (5.81,), is_small=True)
+    yield Point("4096 lights", None, (9.8,), is_small=True)
+    yield Point("16384 lights", f"{method}128", (11.23,), is_small=True)
+    yield Point("262144 lights", f"{method}512", (9.6,), is_small=True)
 
 
 def _volumes() -> Iterator[Point]:
@@ -141,6 +161,12 @@ SWEEPS = (
         tuple(_steps()),
     ),
     Sweep(
+        "Pictures by DLPV beside multi-resolution splatting at 10 degrees ([D] table 5.5, figure 5.9)",
+        "lamps",
+        {"all stages": ALL_STAGES},
+        tuple(_lights()),
+    ),
+    Sweep(
         "Delta voxel cone tracing as printed, by voxels ([D] table 5.7)",
         "arm",
         {
@@ -156,73 +182,97 @@ SWEEPS = (
 
 @dataclass(frozen=True)
 class Measured:
-    """A sweep with the times found: by method, of the motion that it asks for."""
+    """A sweep with the times found: by method, of the motion that it asks for; or the sentence that refuses it."""
 
     sweep: Sweep
     points: Sequence[Point]
-    report: SpeedReport
+    reports: Mapping[str, SpeedReport]
+    refused: Mapping[str, str] = field(default_factory=dict)
 
     def column_ms(self, point: Point, stages: Sequence[str]) -> float | None:
         """Return the summed medians of the stages that ran; None if none did."""
-        ran = self.figures(point).stages
-        times = [ran[stage].ms.median for stage in stages if stage in ran]
+        found = self.figures(point)
+        if found is None:
+            return None
+        if stages == ALL_STAGES:
+            return found.stages_ms.median
+        times = [found.stages[stage].ms.median for stage in stages if stage in found.stages]
         return sum(times) if times else None
 
-    def figures(self, point: Point) -> MotionFigures:
-        """Return what was measured at a point."""
-        return self.report.methods[point.method].motions[self.sweep.motion]
+    def figures(self, point: Point) -> MotionFigures | None:
+        """Return what was measured at a point; None: nothing of that size, or refused."""
+        report = None if point.method is None else self.reports.get(point.method)
+        return None if report is None else report.methods[str(point.method)].motions[self.sweep.motion]
+
+    def frame_ms(self, point: Point) -> float | None:
+        """Return the median of the whole frames; None as in `figures`."""
+        found = self.figures(point)
+        return None if found is None else found.frame_ms.median
 
 
 def measure_sweeps(
     frames: int, size: tuple[int, int] | None, device: int | None, progress: Progress, *, full: bool
 ) -> list[Measured]:
-    """Measure the small points of every sweep, or all.
+    """Measure the small points of every sweep, or all; what this machine refuses is listed with the reason.
 
     Raises:
-        DeltalightError: no OpenGL, missing demo files, or volumes beyond the GPU's memory.
+        DeltalightError: no OpenGL, or missing demo files.
     """
-    return [_measured(sweep, frames, size, device, progress, full=full) for sweep in SWEEPS]
+    take = prepare_take(progress)
+    with opened(device):
+        pass  # what this refuses, no point could do
+    return [_measured(sweep, frames, size, device, progress, take, full=full) for sweep in SWEEPS]
 
 
-def _measured(
+def _measured(  # noqa: PLR0917 (as the command has them)
     sweep: Sweep,
     frames: int,
     size: tuple[int, int] | None,
     device: int | None,
     progress: Progress,
+    take: Take,
     *,
     full: bool,
 ) -> Measured:
     points = [point for point in sweep.points if full or point.is_small]
-    job = SpeedJob(_variants(points), [sweep.motion], frames, size, device)
-    report = measure_speed(job, BUDGET_MS, progress, lambda _: None, end_to_end=False)
-    return Measured(sweep, points, report)
-
-
-def _variants(points: Sequence[Point]) -> list[Variant]:
-    return parse_variants(",".join(point.method for point in points), RENDERED)
+    reports: dict[str, SpeedReport] = {}
+    refused: dict[str, str] = {}
+    for method in (point.method for point in points if point.method is not None):
+        job = SpeedJob(parse_variants(method, RENDERED), [sweep.motion], frames, size, device)
+        try:
+            reports[method] = measure_speed(
+                job, BUDGET_MS, progress, lambda _: None, end_to_end=False, take=take
+            )
+        except DeltalightError as error:
+            refused[method] = str(error)
+    return Measured(sweep, points, reports, refused)
 
 
 def print_sweeps(measured: Sequence[Measured], console: Console) -> None:
-    """Print a table of each sweep, ms: our times and, after them, the published ones ([D])."""
+    """Print a table of each sweep, ms: our times and, after them, the published ones ([D]); then what was refused."""
     for each in measured:
         headings = [text for name in each.sweep.columns for text in (name, "[D]")]
         table = figure_table(f"{each.sweep.title}, ms", ("Size",), (*headings, "frame"))
         for point in each.points:
-            table.add_row(point.size, *_cells(each, point), f"{each.figures(point).frame_ms.median:.1f}")
+            table.add_row(point.size, *_cells(each, point), _shown(each.frame_ms(point), 1))
         console.print(table)
+        for method, sentence in each.refused.items():
+            console.print(f"{method}: {sentence}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _cells(each: Measured, point: Point) -> Iterator[str]:
     for stages, published_ms in zip(each.sweep.columns.values(), point.published_ms, strict=True):
-        ours_ms = each.column_ms(point, stages)
-        yield MISSING if ours_ms is None else f"{ours_ms:.2f}"
+        yield _shown(each.column_ms(point, stages), 2)
         yield MISSING if published_ms is None else f"{published_ms:g}"
 
 
+def _shown(time_ms: float | None, digits: int) -> str:
+    return MISSING if time_ms is None else f"{time_ms:.{digits}f}"
+
+
 def as_data(measured: Sequence[Measured]) -> dict[str, Any]:
-    """Return the times as JSON; null where nothing was published, or no such stage ran."""
-    first = measured[0].report
+    """Return the times as JSON; null where nothing was published, no such stage ran, or the machine refused."""
+    first = next(report for each in measured for report in each.reports.values())
     return {
         "report": "deltalight bench sweep",
         "version": first.version,
@@ -243,9 +293,10 @@ def _sweep_data(each: Measured) -> dict[str, Any]:
             {
                 "size": point.size,
                 "method": point.method,
-                "frame_ms": each.figures(point).frame_ms.median,
+                "frame_ms": each.frame_ms(point),
                 "ms": {name: each.column_ms(point, stages) for name, stages in each.sweep.columns.items()},
                 "published_ms": dict(zip(names, point.published_ms, strict=True)),
+                **({"refused": reason} if (reason := each.refused.get(point.method or "")) else {}),
             }
             for point in each.points
         ],

@@ -26,6 +26,7 @@ from deltalight.render_server.methods.lighting import (
     shading_stages,
     surfel_scene,
 )
+from deltalight.render_server.methods.lpv_memory import PrintedSizes, state_memory
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from deltalight.render_server.methods.volume_placement import volume_placement
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -312,7 +313,7 @@ class PrintedVolumes:
     "n" in section 7, five in fig. 7). `shown` is what was injected of both, for debug view `volume`.
     """
 
-    def __init__(self, gpu: GpuContext, settings: DlpvMethod, sizes: "PrintedSizes") -> None:
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, sizes: PrintedSizes) -> None:
         self._gpu, self._settings = gpu, settings
         steps, own_steps = settings.steps, settings.objects_steps or settings.steps
         self._rho = Propagated(gpu, settings, sizes.objects, own_steps or sizes.objects)
@@ -394,23 +395,13 @@ def difference_stages(
     return LitCells(read, rho, c.volume, c.volume, shown)
 
 
-@dataclass(frozen=True)
-class PrintedSizes:
-    """Cells an edge of V_rho, of V_delta, and of the direct change."""
-
-    objects: int
-    indirect: int
-    direct: int
-
-
 def printed_stages(
     g: Graph, s: FrameResources, lit: LitScene, settings: DlpvMethod, cube: Resource[VolumePlacement]
 ) -> LitCells:
     """The change alone is propagated, direct light after and apart from the indirect one ([P2] 4.3)."""
-    size = settings.volume_size
-    sizes = PrintedSizes(settings.objects_volume_size or size, size, settings.direct_volume_size or size)
+    sizes = PrintedSizes.of(settings)
+    size, counts = sizes.indirect, sizes.counts
     volumes = g.shared("volumes", lambda: PrintedVolumes(g.gpu, settings, sizes))
-    counts = sorted({sizes.objects, sizes.indirect, sizes.direct})
     cells = {n: g.shared(f"cells {n}", partial(LpvCells, g.gpu, settings, n)) for n in counts}
     stages = {n: cell_stages(g, s, lit, cells[n], cube, "" if n == size else f" {n}") for n in counts}
     own, indirect, direct = stages[sizes.objects], stages[sizes.indirect], stages[sizes.direct]
@@ -465,4 +456,4 @@ def resolve(settings: DlpvMethod, defaults: ResolvedSettings) -> ResolvedSetting
     )
 
 
-DLPV = RelightingMethod(DlpvMethod, dlpv, resolve)
+DLPV = RelightingMethod(DlpvMethod, dlpv, resolve, state_memory)

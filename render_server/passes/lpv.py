@@ -17,10 +17,13 @@ from deltalight.render_server.gpu.list_groups import list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_3d
 from deltalight.render_server.passes.mesh_buffers import NO_CUTOUTS
 from deltalight.render_server.passes.volumes import VolumePlacement
-from deltalight.render_server.passes.voxels import LOWER_VOLUME, VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 
 INJECTED_SUMS = 12  # per cell: 4 coefficients x 3 channels
 COVERED_SUMS = 6  # per cell: its low faces on three axes, surfaces that face - and +
+INJECTED_BYTES, COVERED_BYTES, TRANSMITTED_BYTES = 4 * INJECTED_SUMS, 4 * COVERED_SUMS, 8  # per cell
+LIGHT_BYTES = 3 * 3 * 16  # per cell of a `LightVolume`: three textures, three channels
+LOWER_CELLS = "method.volume_size (objects_volume_size, direct_volume_size)"
 CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0 and Y_1 along its axis
 LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # of the clamped cosine in them
 FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # solid angles seen from the centre of the neighbouring cell
@@ -103,12 +106,12 @@ class LightVolume:
 
 def injected_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
     """Creates empty fixed-point sums of injected light."""
-    return _zeros(gpu, cells**3 * INJECTED_SUMS * 4)
+    return _zeros(gpu, cells**3 * INJECTED_BYTES)
 
 
 def covered_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
     """Creates empty fixed-point sums of covered faces."""
-    return _zeros(gpu, cells**3 * COVERED_SUMS * 4)
+    return _zeros(gpu, cells**3 * COVERED_BYTES)
 
 
 def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Texture3D:
@@ -117,7 +120,7 @@ def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Texture3D:
 
 
 def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
-    buffer = gpu.storage_buffer(size, LOWER_VOLUME)
+    buffer = gpu.storage_buffer(size, LOWER_CELLS)
     clear_buffer(gpu, buffer)
     return buffer
 
@@ -199,7 +202,7 @@ class LpvShow:
 
 def cells_of(sums: moderngl.Buffer) -> int:
     """Cells an edge of injected sums."""
-    return round(math.cbrt(sums.size / (INJECTED_SUMS * 4)))
+    return round(math.cbrt(sums.size / INJECTED_BYTES))
 
 
 class LpvCoverFaces:

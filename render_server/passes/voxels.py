@@ -18,6 +18,7 @@ MEGABYTE = 1_000_000
 DIRECTIONS = 6  # of an anisotropic volume; isotropic ones have 1
 TAIL_CELLS = 8  # along an edge of a volume, of the bounces' tail (shaders/common/bounce_tail.glsl)
 
+SLOT_BYTES = 4  # per voxel of a grid
 SURFEL_BYTES = 64
 SUMS_PER_SLOT = 24
 DELTA_SUMS_PER_SLOT = 18
@@ -45,10 +46,14 @@ def occupancy_bytes(size: int) -> int:
     return 4 * (first + above * size.bit_length()) if size else 0
 
 
+def mipmap_bytes(size: int, directions: int) -> int:
+    """Returns the bytes of an RGBA16F mipmap with its occupancy."""
+    return math.prod(mipmap_shape(size, directions)) * 8 + occupancy_bytes(size)
+
+
 def volume_memory_bytes(size: int, directions: int) -> int:
     """Returns the bytes of an RGBA16F mipmap and of the grids of one voxel set: its slots, and its groups."""
-    mipmap_bytes = math.prod(mipmap_shape(size, directions)) * 8 + occupancy_bytes(size)
-    return mipmap_bytes + size**3 * 4 + group_grid_bytes(size)
+    return mipmap_bytes(size, directions) + size**3 * SLOT_BYTES + group_grid_bytes(size)
 
 
 def group_grid_bytes(size: int) -> int:
@@ -72,13 +77,23 @@ def memory_statement(size: int, directions: int, budget_mb: int, far_size: int =
     size_bytes = 2 * volume_memory_bytes(size, directions) + volume_memory_bytes(far_size, DIRECTIONS)
     if directions == DIRECTIONS:
         size_bytes += bounce_tail_bytes()
+    needed = within_budget(size_bytes, f"A volume set of {size}^3 voxels", budget_mb, LOWER_VOLUME)
+    return f"volume set {size}^3: {needed} MB of a budget of {budget_mb} MB"
+
+
+def within_budget(size_bytes: int, what: str, budget_mb: int, lower: str) -> int:
+    """Returns the MB of `what`, whose settings `lower` make it smaller.
+
+    Raises:
+        DeltalightError: it exceeds the budget.
+    """
     needed = math.ceil(size_bytes / MEGABYTE)
     if needed > budget_mb:
         raise DeltalightError(
-            f"A volume set of {size}^3 voxels takes {needed} MB, beyond the budget of {budget_mb} MB: "
-            "lower method.volume_size or raise method.memory_budget_mb."
+            f"{what} takes {needed} MB, beyond the budget of {budget_mb} MB: "
+            f"lower {lower} or raise method.memory_budget_mb."
         )
-    return f"volume set {size}^3: {needed} MB of a budget of {budget_mb} MB"
+    return needed
 
 
 class VoxelMipmap:
@@ -130,7 +145,7 @@ class VoxelStore:
 
     def _allocate_grid(self, size: int, count: int) -> None:
         self.volume_size, self.volume_count = size, count
-        self.grid = self._gpu.storage_buffer(count * size**3 * 4, LOWER_VOLUME)
+        self.grid = self._gpu.storage_buffer(count * size**3 * SLOT_BYTES, LOWER_VOLUME)
         clear_buffer(self._gpu, self.grid)
 
     def resize(self, size: int, count: int) -> None:

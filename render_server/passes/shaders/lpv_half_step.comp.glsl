@@ -4,7 +4,7 @@
 #include "common/light_cells.glsl"
 #include "common/light_step.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 16) in;
 layout(rgba32f) readonly uniform image3D state;   // before the first step
 layout(rgba32f) uniform image3D total;
 uniform int colour;   // 0, 1

@@ -1,4 +1,4 @@
-// Injects reflective shadow maps ([P2] 4.3): the flux that each texel's surface reflects goes into its cell. REAL
+// Injects reflective shadow maps ([P2] 4.3): the flux that each texel's surface reflects goes into its cells. REAL
 // walks a light's map of the real scene: all that it lights. VIRTUAL walks its map of the objects: what they reflect,
 // and, negative, what the same rays lit before on the real scene. DIRECT: the light itself, as lobes along its path:
 // what now meets the objects, and, negative, what met the real scene before ([P2] 4.3.2).
@@ -9,6 +9,7 @@
 #include "common/packing.glsl"
 #include "common/volume.glsl"
 #include "common/inject_light.glsl"
+#include "common/inject_patch.glsl"
 
 #include "common/pixel_group.glsl"
 uniform sampler2D real_albedo;
@@ -27,7 +28,8 @@ vec3 lit_side(vec3 n, vec3 to_light) { return dot(n, to_light) < 0.0 ? -n : n; }
 #ifdef REAL
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
     vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
-    inject(p, lit_side(n, direction_to_light(light, p)), texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb);
+    vec3 reflected = texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb;
+    inject_patch(lit_patch(view, s, p, n), lit_side(n, direction_to_light(light, p)), reflected);
 }
 #else
 vec3 virtual_albedo(ivec2 texel) {
@@ -39,26 +41,29 @@ vec3 virtual_albedo(ivec2 texel) {
 }
 
 // A lobe that points where the light travels, in the cell half a cell in front of the surface, towards the light.
-void inject_along(vec3 p, vec3 to_light, vec3 flux) { inject(p + voxel_edge * to_light, -to_light, flux); }
+void inject_along(Patch lit, vec3 to_light, vec3 flux) {
+    lit.p += voxel_edge * to_light;
+    inject_patch(lit, -to_light, flux);
+}
 
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
     vec3 arriving = texel_light(light, view, s);
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;   // the real scene is in front of the object
-    vec3 to_light = direction_to_light(light, p);
+    vec3 to_light = direction_to_light(light, p), n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
+    Patch lit = lit_patch(view, s, p, n);
 #ifdef DIRECT
-    inject_along(p, to_light, arriving);
+    inject_along(lit, to_light, arriving);
 #else
-    vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
-    inject(p, lit_side(n, to_light), arriving * virtual_albedo(texel));
+    inject_patch(lit, lit_side(n, to_light), arriving * virtual_albedo(texel));
 #endif
     if (!real.present) return;
     vec3 real_normal = normalize(texelFetch(real_light_normal, real.texel, 0).xyz);
-    vec3 shadowed = hit_point(real, real_normal);
+    Patch shadowed = lit_patch(view, s, hit_point(real, real_normal), real_normal);
 #ifdef DIRECT
     inject_along(shadowed, to_light, -arriving);
 #else
-    inject(shadowed, lit_side(real_normal, to_light), -arriving * texelFetch(real_albedo, real.texel, 0).rgb);
+    inject_patch(shadowed, lit_side(real_normal, to_light), -arriving * texelFetch(real_albedo, real.texel, 0).rgb);
 #endif
 }
 #endif

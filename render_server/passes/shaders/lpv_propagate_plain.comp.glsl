@@ -2,7 +2,7 @@
 #include "common/light_cells.glsl"
 #include "common/light_step.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 16) in;
 layout(rgba32f) readonly uniform image3D state;
 layout(rgba32f) writeonly uniform image3D next_state;
 layout(rgba32f) uniform image3D total;
