@@ -332,7 +332,7 @@ class GpuMesh:
     material_table: Float32[np.ndarray, "k 20"]
     second_uv: Float32[np.ndarray, "n 2"] | None
 
-    @property
+    @cached_property
     def corners(self) -> Float32[np.ndarray, "m 3 3"]:
         """Positions of each triangle's corners."""
         return np.asarray(self.vertices[:, :3].take(self.triangles, axis=0))
