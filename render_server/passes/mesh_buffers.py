@@ -165,7 +165,7 @@ def rewritten(
     return before
 
 
-def bvh_texture(gpu: GpuContext, before: moderngl.Texture | None, data: bytes) -> moderngl.Texture:
+def bvh_texture(gpu: GpuContext, data: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:
     """Returns packed nodes or triangles in rows one after the other, as shaders/common/ray_mesh.glsl reads them.
 
     `before`: those before, which are overwritten or freed.
@@ -218,8 +218,8 @@ class ObjectBvh:
         if self._packed is not None:
             nodes, faces = self._packed.result()
             self._packed = None
-            self._nodes = bvh_texture(self._gpu, self._nodes, nodes)
-            self._faces = bvh_texture(self._gpu, self._faces, faces)
+            self._nodes = bvh_texture(self._gpu, nodes, self._nodes)
+            self._faces = bvh_texture(self._gpu, faces, self._faces)
         self._is_traced = True
         return {"bvh_nodes": self._nodes, "bvh_faces": self._faces, **self._mesh.storage}
 
