@@ -81,6 +81,9 @@ def counts(
         int, typer.Option(min=1, max=1000, help="Frames to count, and as many again to time without the GPU.")
     ] = 8,
     device: Device = None,
+    gpu_paths: Annotated[
+        bool, typer.Option("--gpu-paths", help="Render as on a GPU, also where there is none (slow).")
+    ] = False,
     out: ReportFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -88,7 +91,7 @@ def counts(
     job = _speed_job(methods, motions, frames, size, device)
     from deltalight.benchmarks.speed.command import run_counts
 
-    run_counts(job, out=out, as_json=as_json)
+    run_counts(job, gpu_paths=gpu_paths, out=out, as_json=as_json)
 
 
 @bench.command()

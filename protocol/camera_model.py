@@ -94,7 +94,7 @@ class CameraModel:
         assert self.distortion is not None  # set in __post_init__
         return self.distortion
 
-    @property
+    @cached_property
     def has_distortion(self) -> bool:
         """Whether rays differ from a pinhole's (`equidistant` with zeros is still a fish-eye)."""
         return self.distortion_model == "equidistant" or bool(self._coefficients.any())

@@ -38,6 +38,7 @@ class CameraHistory:
         self._motion = MotionDetector()
         self._kept = KeptWorld() if keeps_world else None
         self._has_depth, self._on_gpu = has_depth, on_gpu
+        self._expected: FrameSamples | None = None
         self._newest: FrameSamples | None = None
         self._last: FrameSamples | None = None  # in which anything moved
         self._seen: PosedFrame | None = None
@@ -48,9 +49,15 @@ class CameraHistory:
         self._measurements: dict[tuple[int, int], Measurement] = {}
         self.voxel_m: float | None = None  # of the surface that depth is fused to; None: nothing is fused
 
+    def expect(self, taken: PosedFrame) -> None:
+        """Begins to look at the frame that is taken next: at its colours, while the camera stands still."""
+        self._expected = None if self.moved else FrameSamples.with_begun_color(taken.frame)
+
     def update(self, taken: PosedFrame, *, is_unknown: bool) -> bool:
         """Takes a frame; returns whether anything moved in it. `is_unknown`: there is no real scene yet."""
-        self._newest = samples = FrameSamples(taken.frame)
+        expected, self._expected = self._expected, None
+        is_expected = expected is not None and expected.frame is taken.frame
+        self._newest = samples = expected if expected and is_expected else FrameSamples(taken.frame)
         # Depth without a surface (a camera that starts) explains nothing: the next frame counts as another scene.
         self.moved = self._motion.update(samples) or is_unknown
         if self.moved:

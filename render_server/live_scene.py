@@ -266,6 +266,8 @@ class LiveScene:
             self._apply(self._planned(self._plan.scene))
         frames, first = tuple(each.frame for each in taken), taken[0].frame
         again, self._accumulated = _same_objects(frames, self._accumulated), ()
+        if self._real is not None and not again:
+            self._real.expect(taken)
         lit = again or self.lighting.update(first)
         objects = self._objects.update(self._plan.scene.objects, first.board, first.timestamp_ns)
         if objects is None or self._real is None or not lit:
@@ -289,9 +291,7 @@ class LiveScene:
         self._accumulated = frames
         changed |= self._note_change(objects, first, moved=False)
         relit = self._relit(taken, level, changed=changed)
-        best: list[FrameGraph] = []
-        if self._is_at_rest(first):
-            best = self._refined(self._real, taken, objects, surfaces)
+        best = self._refined(self._real, taken, objects, surfaces) if self._is_at_rest(first) else []
         if not best:
             self._refined_ns = None
             return relit

@@ -90,6 +90,11 @@ class RealGeometry:
         """Whether a kept world was built from the frames in which everything came to rest."""
         return all(camera.is_settled for camera in self.cameras)
 
+    def expect(self, taken: Sequence[PosedFrame]) -> None:
+        """Begins to look at the frames that `update` is given next, on other threads."""
+        for camera, each in zip(self.cameras, taken, strict=False):
+            camera.expect(each)
+
     def update(self, taken: Sequence[PosedFrame]) -> bool:
         """Updates the geometry from a frame of each camera if something moved; returns whether it did.
 

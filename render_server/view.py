@@ -107,29 +107,12 @@ class CameraView:
 
         The camera's own, grown by whole pixels: without distortion, each pixel centre is a texel centre.
         """
-        matrix = self.camera.matrix
-        own = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-        if not self.camera.has_distortion:
-            return own, self.size
-        least, greatest = _ray_extremes(self.camera)
-        low = np.floor(least * own[:2] + own[2:]) - 1
-        high = np.ceil(greatest * own[:2] + own[2:]) + 1
-        width, height = (int(v) + 1 for v in high - low)
-        return np.array([*own[:2], *(own[2:] - low)]), (width, height)
+        return _raster_of(self.camera)
 
     @cached_property
     def clip_from_camera(self) -> Float64[np.ndarray, "4 4"]:
         """Projection of the raster pinhole; row 0 of the picture comes first in memory."""
-        (fx, fy, cx, cy), (width, height) = self.raster
-        depth = (FAR_M + NEAR_M) / (FAR_M - NEAR_M)
-        return np.array(
-            [
-                [2 * fx / width, 0, (2 * cx + 1) / width - 1, 0],
-                [0, 2 * fy / height, (2 * cy + 1) / height - 1, 0],
-                [0, 0, depth, -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)],
-                [0, 0, 1, 0],
-            ]
-        )
+        return _clip_from(self.camera)
 
     def clip_from_camera_at(self, offset: tuple[float, float]) -> Float64[np.ndarray, "4 4"]:
         """Returns the raster pinhole's projection, shifted by `offset` (x, y) pixels."""
@@ -240,6 +223,36 @@ def _ray_extremes(camera: CameraModel) -> tuple[Float64[np.ndarray, "2"], Float6
     return rays.min(axis=0), rays.max(axis=0)
 
 
+@lru_cache(maxsize=LENSES_KEPT)
+def _raster_of(camera: CameraModel) -> tuple[Float64[np.ndarray, "4"], tuple[int, int]]:
+    """Returns the raster of a lens."""
+    matrix = camera.matrix
+    own = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    if not camera.has_distortion:
+        return own, (camera.width, camera.height)
+    least, greatest = _ray_extremes(camera)
+    low = np.floor(least * own[:2] + own[2:]) - 1
+    high = np.ceil(greatest * own[:2] + own[2:]) + 1
+    width, height = (int(v) + 1 for v in high - low)
+    return np.array([*own[:2], *(own[2:] - low)]), (width, height)
+
+
+@lru_cache(maxsize=LENSES_KEPT)
+def _clip_from(camera: CameraModel) -> Float64[np.ndarray, "4 4"]:
+    """Returns the projection of a lens' raster."""
+    (fx, fy, cx, cy), (width, height) = _raster_of(camera)
+    depth = (FAR_M + NEAR_M) / (FAR_M - NEAR_M)
+    return np.array(
+        [
+            [2 * fx / width, 0, (2 * cx + 1) / width - 1, 0],
+            [0, 2 * fy / height, (2 * cy + 1) / height - 1, 0],
+            [0, 0, depth, -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)],
+            [0, 0, 1, 0],
+        ]
+    )
+
+
+@lru_cache(maxsize=LENSES_KEPT)
 def _ray_bounds(camera: CameraModel) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
     """Returns the least and greatest (x/z, y/z) that the picture shows, two pixels wider."""
     (low, high), margin = _ray_extremes(camera), 2 / camera.matrix[[0, 1], [0, 1]]

@@ -47,10 +47,10 @@ def _print_speed(report: SpeedReport, *, as_json: bool) -> None:
         print_report(report, Console())
 
 
-def run_counts(job: SpeedJob, *, out: Path | None, as_json: bool) -> None:
+def run_counts(job: SpeedJob, *, gpu_paths: bool, out: Path | None, as_json: bool) -> None:
     """Count, write the report to `out` if given, and print it."""
     with _progress() as progress:
-        report = count_frames(job, progress)
+        report = count_frames(job, progress, gpu_paths=gpu_paths)
     text = report.model_dump_json(indent=2)
     if out is not None:
         write_bytes(out, text.encode())

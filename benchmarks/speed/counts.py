@@ -1,7 +1,8 @@
 """What a frame of each motion asks of the GPU, and what Python takes for it while the GPU is left out."""
 
+import time
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Literal
 
 from rich.console import Console
@@ -29,10 +30,14 @@ ROWS = {
 
 
 class FrameCounts(StrictModel):
-    """Of one motion by one method: means per frame of `GpuCounts`' fields, and a frame's time without the GPU."""
+    """Of one motion by one method: means per frame of `GpuCounts`' fields, and a frame's time without the GPU.
+
+    `thread_ms` of `python_ms` are processor time of the frame's own thread; the rest waits for other threads.
+    """
 
     per_frame: dict[str, float]
     python_ms: Spread
+    thread_ms: Spread
 
 
 class CountsReport(StrictModel):
@@ -46,8 +51,8 @@ class CountsReport(StrictModel):
     methods: dict[str, dict[str, FrameCounts]]
 
 
-def count_frames(job: SpeedJob, progress: Progress) -> CountsReport:
-    """Count every motion by every method.
+def count_frames(job: SpeedJob, progress: Progress, *, gpu_paths: bool = False) -> CountsReport:
+    """Count every motion by every method; with `gpu_paths`, as on a GPU also where there is none.
 
     Raises:
         DeltalightError: no OpenGL, or missing demo files.
@@ -57,7 +62,7 @@ def count_frames(job: SpeedJob, progress: Progress) -> CountsReport:
     frames = WARM_UP_FRAMES + 2 * job.frames
     with opened(job.device) as gpu:
         for name, scene in scenes.items():
-            with rendering(gpu, scene) as renderer:
+            with rendering(replace(gpu, is_software=False) if gpu_paths else gpu, scene) as renderer:
                 counts = methods[name] = {}
                 for motion in progress.track(job.motions, description=f"counting {name}"):
                     steps = list(steps_of(motion, take, scene, frames))
@@ -82,8 +87,16 @@ def count_motion(renderer: SceneRenderer, steps: Sequence[Step], frames: int) ->
         for step in steps[-2 * frames : -frames]:
             time_step(renderer, step)
     with reads.without_gpu():
-        python_ms = [time_step(renderer, step).frame_ms for step in steps[-frames:]]
-    return FrameCounts(per_frame=_per_frame(counts, frames), python_ms=Spread.of(python_ms))
+        times_ms = [_python_times(renderer, step) for step in steps[-frames:]]
+    python_ms, thread_ms = (Spread.of(each) for each in zip(*times_ms, strict=True))
+    return FrameCounts(per_frame=_per_frame(counts, frames), python_ms=python_ms, thread_ms=thread_ms)
+
+
+def _python_times(renderer: SceneRenderer, step: Step) -> tuple[float, float]:
+    """Return how long a step takes, and the processor time of this thread in it, ms."""
+    started_s = time.thread_time()
+    frame_ms = time_step(renderer, step).frame_ms
+    return frame_ms, 1000 * (time.thread_time() - started_s)
 
 
 def _per_frame(counts: GpuCounts, frames: int) -> dict[str, float]:
@@ -98,8 +111,12 @@ def print_counts(report: CountsReport, console: Console) -> None:
         table = figure_table(method, ("Per frame",), tuple(motions))
         for field, name in ROWS.items():
             table.add_row(name, *(_number(field, each.per_frame[field]) for each in motions.values()))
-        table.add_row("Python, median ms", *(f"{each.python_ms.median:.1f}" for each in motions.values()))
-        table.add_row("Python, p95 ms", *(f"{each.python_ms.p95:.1f}" for each in motions.values()))
+        for name, spreads in (
+            ("Python", [each.python_ms for each in motions.values()]),
+            ("its thread", [each.thread_ms for each in motions.values()]),
+        ):
+            table.add_row(f"{name}, median ms", *(f"{each.median:.1f}" for each in spreads))
+            table.add_row(f"{name}, p95 ms", *(f"{each.p95:.1f}" for each in spreads))
         console.print(table)
 
 

@@ -131,6 +131,8 @@ BYTE_READS = tuple((owner, "read") for owner in (moderngl.Buffer, *TEXTURES))
 READS_INTO = tuple((owner, "read_into") for owner in (moderngl.Buffer, *TEXTURES))
 READS = (*BYTE_READS, *READS_INTO, (moderngl.Framebuffer, "read"))
 CLEARS = ((moderngl.Framebuffer, "clear"), (moderngl.Buffer, "clear"), (GpuContext, "clear_start"))
+# What a driver may work at when it is told: software renderers do.
+WAITS = ((moderngl.Context, "memory_barrier"), (moderngl.Query, "__enter__"), (moderngl.Query, "__exit__"))
 MIPMAPS = tuple((owner, "build_mipmaps") for owner in TEXTURES)
 
 
@@ -179,10 +181,15 @@ class ReadBacks:
 
     @contextmanager
     def without_gpu(self) -> Iterator[None]:
-        """Leaves out dispatches, draws, clears and mip levels; reads return what was remembered, else zeros."""
-        idle = [(owner, name, _idle) for owner, name in (*DISPATCHES, *DRAWS, *CLEARS, *MIPMAPS, *READS_INTO)]
+        """Leaves out dispatches, draws, clears, mip levels, barriers and timer queries.
+
+        Reads return what was remembered, else zeros.
+        """
+        left_out = (*DISPATCHES, *DRAWS, *CLEARS, *MIPMAPS, *READS_INTO, *WAITS)
+        idle = [(owner, name, _idle) for owner, name in left_out]
         reads = [(owner, name, self._recalling) for owner, name in BYTE_READS]
-        with wrapped([*idle, *reads]):
+        untimed = (moderngl.Query, "elapsed", lambda _: property(lambda _: 0))
+        with wrapped([*idle, *reads, untimed]):
             yield
 
     def _recalling(self, original: Callable[..., bytes]) -> Callable[..., bytes]:

@@ -240,8 +240,11 @@ class GpuContext:
 
     @cached_property
     def flush(self) -> Callable[[], None]:
-        """glFlush, which moderngl lacks: hands the GPU what was issued so far."""
-        return ctypes.CFUNCTYPE(None)(self.ctx.mglo._context.load("glFlush"))
+        """glFlush, which moderngl lacks: hands the GPU what was issued so far.
+
+        It does not wait, and keeps the interpreter meanwhile: another thread might hold that for milliseconds.
+        """
+        return ctypes.PYFUNCTYPE(None)(self.ctx.mglo._context.load("glFlush"))
 
     def release(self) -> None:
         """Frees the context; nothing made from it may be used afterwards."""

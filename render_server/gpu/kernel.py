@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from deltalight.render_server.gpu.buffer_images import BUFFER_IMAGES, BufferImage
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.program_slots import Slot, Value
+from deltalight.render_server.gpu.program_slots import BindingCalls, Calls, Slot, Value, values_of
 from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
 from deltalight.render_server.gpu.texel_images import with_images
 from deltalight.render_server.gpu.textures import image_format, release_all, texels_of
@@ -29,6 +30,7 @@ CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
 Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
 PLAIN = (float, int, bool, tuple, list)  # values of uniforms that moderngl takes as they are
+NUMBERS = frozenset({float, int, bool})
 Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
 Bindings = Mapping[str, Binding]
 """GLSL names and what is bound to them; None stands for nothing: a texture without texels, an empty buffer."""
@@ -102,16 +104,17 @@ class Program:
         self._shown = {
             slot.name: BufferImage(gpu.texture_calls, *declared.formats[slot.name]) for slot in self._arrays
         }
-        binders: Sequence[tuple[list[Slot], Callable[[Slot, Binding], None]]] = (
-            (self._samplers, self._bind_sampler),
-            (self._images, self._bind_image),
-            (self._arrays, self._bind_array),
-            (self._storage, self._bind_storage),
-            (self._blocks, self._bind_block),
-            (self._uniforms, self._write),
+        binders: Sequence[tuple[list[Slot], Callable[[Slot, Any], Callable[[], None]]]] = (
+            (self._samplers, self._sampler_call),
+            (self._images, self._image_call),
+            (self._storage, self._storage_call),
+            (self._blocks, self._block_call),
         )
-        self._binders = [(slot.name, slot, bind) for slots, bind in binders for slot in slots]
-        self._switches = frozenset(declared.switches)
+        self._binders = [(slot, binder) for slots, binder in binders for slot in slots]
+        self._resources = values_of([slot.name for slot, _ in self._binders])
+        self._calls = BindingCalls()
+        self._values = values_of([slot.name for slot in self._uniforms])
+        self._switch_values = values_of(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:
         slot = Slot(name, member, getattr(member, "gl_type", 0))
@@ -147,11 +150,24 @@ class Program:
             name = next(name for name in own if name not in self._declared.names)
             raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
         try:
-            for name, slot, bind in self._binders:
-                bind(slot, known[name])
+            resources, values = self._resources(known), self._values(known)
+            for slot in self._arrays:
+                self._shown[slot.name].bind(slot.place, self._buffer(slot, known[slot.name]))
         except KeyError:
-            self._require({name for name, _, _ in self._binders}, known)
+            slots = (*(slot for slot, _ in self._binders), *self._arrays, *self._uniforms)
+            self._require({slot.name for slot in slots}, known)
             raise
+        for call in self._calls.of(resources) or self._made_calls(resources):
+            call()
+        for slot, value in zip(self._uniforms, values, strict=True):
+            if type(value) not in NUMBERS or slot.last != value:
+                self._write(slot, value)
+
+    def _made_calls(self, resources: Sequence[Any]) -> Calls:
+        """Returns the calls that bind the resources, which are checked."""
+        calls = [call(slot, item) for (slot, call), item in zip(self._binders, resources, strict=True)]
+        self._calls.keep(resources, calls)
+        return calls
 
     def _require(self, names: Set[str], known: Bindings) -> None:
         if not names <= known.keys():
@@ -164,10 +180,13 @@ class Program:
         Raises:
             BindingError: one is missing.
         """
-        if not self._switches:
+        if not self._declared.switches:
             return ()
-        self._require(self._switches, known)
-        return tuple(name for name in self._declared.switches if known[name])
+        try:
+            return tuple(compress(self._declared.switches, self._switch_values(known)))
+        except KeyError:
+            self._require(frozenset(self._declared.switches), known)
+            raise
 
     def _nearest(self, name: str) -> str:
         close = get_close_matches(name, self._declared.names, 1)
@@ -176,12 +195,11 @@ class Program:
     def _wrong(self, slot: Slot, value: object, wanted: str) -> BindingError:
         return BindingError(f"Kernel {self.label}: `{slot.name}` is {wanted}, not a {type(value).__name__}.")
 
-    def _bind_sampler(self, slot: Slot, value: Binding) -> None:
+    def _sampler_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
         kind, texels = SAMPLERS[slot.kind]
         texture: Any = self._gpu.empty_texture(kind, f"{texels}1", 4) if value is None else value
-        if slot.checked() is not texture and not slot.is_known(texture):
-            self._check_sampled(slot, texture)
-        texture.use(location=slot.place)
+        self._check_sampled(slot, texture)
+        return partial(texture.mglo.use, slot.place)
 
     def _check_sampled(self, slot: Slot, texture: object) -> None:
         kind, texels = SAMPLERS[slot.kind]
@@ -193,19 +211,15 @@ class Program:
             raise BindingError(
                 f"Kernel {self.label}: `{slot.name}` samples texels of type {texels}, not {texture.dtype}."
             )
-        slot.note_fitting(texture)
 
-    def _bind_image(self, slot: Slot, value: Binding) -> None:
+    def _image_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
         texture: Any = value
         if value is None and slot.name not in self._declared.written:
             (texels,) = self._declared.formats[slot.name]
             texture = self._gpu.empty_texture(IMAGES[slot.kind], *texels_of(texels))
-        elif value is None or (slot.checked() is not value and not slot.is_known(value)):
+        else:
             self._check_image(slot, value)
-        texture.bind_to_image(slot.place)
-
-    def _bind_array(self, slot: Slot, value: Binding) -> None:
-        self._shown[slot.name].bind(slot.place, self._buffer(slot, value))
+        return partial(texture.mglo.bind, slot.place, True, True, 0, 0)  # read, write, level, its own format
 
     def _check_image(self, slot: Slot, texture: object) -> None:
         kind = IMAGES[slot.kind]
@@ -218,10 +232,10 @@ class Program:
                 f"Kernel {self.label}: `{slot.name}` is declared {' or '.join(sorted(wanted))}, "
                 f"but the texture is {found}."
             )
-        slot.note_fitting(texture)
 
-    def _bind_storage(self, slot: Slot, value: Binding) -> None:
-        self._buffer(slot, value).bind_to_storage_buffer(slot.place)
+    def _storage_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
+        mglo: Any = self._buffer(slot, value).mglo
+        return partial(mglo.bind_to_storage_buffer, slot.place, 0, -1)  # all of it
 
     def _buffer(self, slot: Slot, value: Binding) -> moderngl.Buffer:
         is_written = slot.name in self._declared.written
@@ -231,7 +245,7 @@ class Program:
             raise self._wrong(slot, value, "a storage buffer")
         return buffer
 
-    def _bind_block(self, slot: Slot, value: Binding) -> None:
+    def _block_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
         if not isinstance(value, UniformBlock):
             raise self._wrong(slot, value, "a uniform block")
         if not value.fits(slot.member.size):
@@ -239,7 +253,7 @@ class Program:
                 f"Kernel {self.label}: block `{slot.name}` takes {slot.member.size} bytes, "
                 f"{type(value.value).__name__} packs {value.size}."
             )
-        value.bind(slot.place)
+        return value.binds(slot.place)
 
     def _write(self, slot: Slot, value: Binding) -> None:
         """Writes a uniform if its value changed; 4x4 arrays are row-major here."""
@@ -385,8 +399,8 @@ class Kernel(Shader):
             BindingError: a name is undeclared or missing, or its value is of the wrong kind or format.
         """
         program, known = self._bound(own, shared)
-        counts = zip((*threads, 1, 1), self.local_size, strict=False)
-        groups = tuple([max(1, -(-count // size)) for count, size in counts])
+        (x, y, z, *_), (width, height, depth) = (*threads, 1, 1), self.local_size
+        groups = -(-x // width) or 1, -(-y // height) or 1, -(-z // depth) or 1
         program.compute.run(*groups)
         self._gpu.ctx.memory_barrier()
         if self._gpu.watchers:
@@ -400,7 +414,8 @@ class Kernel(Shader):
         program, known = self._bound(own, shared)
         program.compute.run_indirect(groups)
         self._gpu.ctx.memory_barrier()
-        program.report((), partial(program.written, known))
+        if self._gpu.watchers:
+            program.report((), partial(program.written, known))
 
 
 class RasterKernel(Shader):

@@ -1,8 +1,9 @@
 """Uniform blocks (std140): values shared by many programs, declared once in GLSL and once as a dataclass."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
@@ -28,10 +29,12 @@ STD140 = {
     "vec4": (16, 16, "4f"),
     "mat4": (16, 64, "16f"),
 }
+SCALARS = ("bool", "int", "float")
 ALIGNMENT = 16  # of blocks, bytes
 
 
 _MEMBERS: dict[type, tuple[tuple[str, str], ...]] = {}
+_LAYOUTS: dict[type, struct.Struct] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +51,26 @@ class Block:
 
     def packed(self) -> bytes:
         """Returns the block's bytes."""
-        data = bytearray()
+        values: list[float] = []
         for name, kind in self.members():
-            align, size, form = STD140[kind]
-            data.extend(bytes(-len(data) % align))
             value = getattr(self, name)
             if kind == "mat4":
-                value = np.asarray(value, np.float32).T.ravel()
-            data.extend(struct.pack("<" + form, *value) if size > 4 else struct.pack("<" + form, value))
-        return bytes(data) + bytes(-len(data) % ALIGNMENT)
+                values.extend(np.asarray(value, np.float32).T.ravel().tolist())
+            elif kind in SCALARS:
+                values.append(value)
+            else:
+                values.extend(value)
+        return self._layout().pack(*values)
+
+    @classmethod
+    def _layout(cls) -> struct.Struct:
+        """Returns the members' formats with the gaps between them and after the last."""
+        if cls not in _LAYOUTS:
+            form = "<"
+            for align, _, each in [*(STD140[kind] for _, kind in cls.members()), (ALIGNMENT, 0, "")]:
+                form += f"{-struct.calcsize(form) % align}x{each}"
+            _LAYOUTS[cls] = struct.Struct(form)
+        return _LAYOUTS[cls]
 
 
 Kind = TypeVar("Kind", bound=Block)
@@ -86,9 +100,10 @@ class UniformBlock(Generic[Kind]):
             self._buffer.write(data)
         self.value, self._data = value, data
 
-    def bind(self, place: int) -> None:
-        """Binds the buffer to a binding point."""
-        self._buffer.bind_to_uniform_block(place)
+    def binds(self, place: int) -> Callable[[], None]:
+        """Returns what binds the buffer to a binding point."""
+        mglo: Any = self._buffer.mglo
+        return partial(mglo.bind_to_uniform_block, place, 0, -1)  # all of it
 
     def release(self) -> None:
         """Frees the buffer."""

@@ -53,6 +53,7 @@ class MeshBuffers:
         self._sides = gpu.ctx.buffer(reserve=4)
         self._second_uv: moderngl.Buffer | None = None
         self._corners: moderngl.Texture | None = None
+        self._shows_corners = False  # those of the triangles that were written last
         self._written: GpuMesh | None = None  # if not by a kernel
         self._arrays: dict[int, moderngl.VertexArray] = {}
         self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
@@ -78,11 +79,12 @@ class MeshBuffers:
     def corners(self) -> moderngl.Texture:
         """Positions of the triangles' corners as shaders/common/plane.glsl reads them; of a mesh that was written."""
         assert self._written is not None
-        if self._corners is None:
+        if self._corners is None or not self._shows_corners:
             rows = max(-(-len(self.triangles) // CORNERS_ROW), 1)
             texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
             texels[: len(self.triangles), :, :3] = self._written.corners
-            self._corners = texture_2d(self._gpu, (3 * CORNERS_ROW, rows), 4, "f4", data=texels.tobytes())
+            self._corners = rewritten(self._gpu, self._corners, (3 * CORNERS_ROW, rows), "f4", texels)
+            self._shows_corners = True
         return self._corners
 
     def write(self, mesh: GpuMesh) -> None:
@@ -105,8 +107,7 @@ class MeshBuffers:
             self._indices = self._ctx.buffer(reserve=max(index_bytes, 4))
             self._sides = self._ctx.buffer(reserve=4)
         self.triangles, self.triangle_count, self._written = NO_TRIANGLES, triangle_count, None
-        release_all(self._corners)
-        self._corners = None
+        self._shows_corners = False
         if triangle_count:
             self._write_sides(materials.material_table[:, DOUBLE_SIDED])
 
@@ -149,11 +150,29 @@ def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
     return " ".join(formats), *(name for _, name in parts if name in active)
 
 
-def bvh_texture(gpu: GpuContext, data: bytes) -> moderngl.Texture:
-    """Returns packed nodes or triangles in rows one after the other, as shaders/common/ray_mesh.glsl reads them."""
+def rewritten(
+    gpu: GpuContext,
+    before: moderngl.Texture | None,
+    size: tuple[int, int],
+    dtype: str,
+    data: bytes | Float32[np.ndarray, "..."],
+) -> moderngl.Texture:
+    """Returns a texture of four components with these texels: the one before if its size (width, height) is this."""
+    if before is None or before.size != size:
+        release_all(before)
+        before = texture_2d(gpu, size, 4, dtype)
+    before.write(data, alignment=1)
+    return before
+
+
+def bvh_texture(gpu: GpuContext, data: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:
+    """Returns packed nodes or triangles in rows one after the other, as shaders/common/ray_mesh.glsl reads them.
+
+    `before`: those before, which are overwritten or freed.
+    """
     rows = max(-(-len(data) // BVH_ROW_BYTES), 1)
     size = BVH_ROW_BYTES // TEXEL_BYTES, rows
-    return texture_2d(gpu, size, 4, "u4", data=data.ljust(rows * BVH_ROW_BYTES, b"\0"))
+    return rewritten(gpu, before, size, "u4", data.ljust(rows * BVH_ROW_BYTES, b"\0"))
 
 
 class ObjectBvh:
@@ -199,8 +218,8 @@ class ObjectBvh:
         if self._packed is not None:
             nodes, faces = self._packed.result()
             self._packed = None
-            self.release()
-            self._nodes, self._faces = bvh_texture(self._gpu, nodes), bvh_texture(self._gpu, faces)
+            self._nodes = bvh_texture(self._gpu, nodes, self._nodes)
+            self._faces = bvh_texture(self._gpu, faces, self._faces)
         self._is_traced = True
         return {"bvh_nodes": self._nodes, "bvh_faces": self._faces, **self._mesh.storage}
 

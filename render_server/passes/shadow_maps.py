@@ -261,9 +261,18 @@ def _depth_range(
     local: Float64[np.ndarray, "n 3"], blocking: Float64[np.ndarray, "m 3"], half: float
 ) -> tuple[float, float]:
     """Returns a near plane in front of all that can block within the view, a far plane behind the receivers."""
-    depths = np.concatenate([points[:, 2][_tangents(points) <= half] for points in (blocking, local)])
-    near = max(float(depths.min(initial=local[:, 2].max())) * NEAR_MARGIN, NEAREST_M)
-    return near, max(float(local[:, 2].max()) * FAR_MARGIN, near + NEAREST_M)
+    inside = local[:, 2][_tangents(local) <= half]
+    return _range_around(inside, blocking, half, float(local[:, 2].max()))
+
+
+def _range_around(
+    inside: Float64[np.ndarray, " n"], blocking: Float64[np.ndarray, "m 3"], half: float, farthest: float
+) -> tuple[float, float]:
+    """Returns `_depth_range` of the depths of the receivers `inside` the view; `farthest`: of them all."""
+    blocking_depths = blocking[:, 2][_tangents(blocking) <= half]
+    nearest = min(float(depths.min(initial=farthest)) for depths in (blocking_depths, inside))
+    near = max(nearest * NEAR_MARGIN, NEAREST_M)
+    return near, max(farthest * FAR_MARGIN, near + NEAREST_M)
 
 
 def _perspective_view(
@@ -280,7 +289,8 @@ def _perspective_view(
     half = float(_tangents(local).max()) * 1.01 + 1e-4
     if half > WIDEST_SINGLE_TANGENT:
         return None
-    near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
+    depths = local[:, 2]  # all of them are inside
+    near, far = _range_around(depths, (occluders - position) @ rotation.T, half, float(depths.max()))
     return LightView(_matrix(rotation, position), half, near, far, False)
 
 

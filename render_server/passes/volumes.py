@@ -151,9 +151,10 @@ class PlacedVolume:
 
     def place(self, *placements: VolumePlacement) -> "PlacedVolume":
         """Moves the volume, or replaces it by these, and returns it."""
-        self.placements = placements
-        self._block.write(self.placement.block())
-        self._several.write(volumes_block(placements))
+        if placements != self.placements:
+            self.placements = placements
+            self._block.write(self.placement.block())
+            self._several.write(volumes_block(placements))
         return self
 
     def release(self) -> None:

@@ -94,8 +94,8 @@ def bound_points(
     They lie on a grid of pixels that begins and ends at the picture's border.
     """
     rows, columns, rays = _bound_grid(camera, most)
-    chosen = np.ix_(rows, columns)
-    metres = np.where(depth.valid[chosen], depth.depth_m[chosen], np.float32(0))
+    valid, depth_m = (each.take(rows, axis=0).take(columns, axis=1) for each in (depth.valid, depth.depth_m))
+    metres = np.where(valid, depth_m, np.float32(0))
     known = _are_among_neighbours(np.divide(1, metres, out=np.zeros_like(metres), where=metres > 0))
     local = rays[known] * metres[known][:, None]
     return np.asarray(local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])

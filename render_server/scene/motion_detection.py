@@ -42,19 +42,50 @@ class MotionThresholds:
 
 @dataclass(frozen=True, eq=False)
 class FrameSamples:
-    """A frame on a grid of GRID_STEP_PX pixels, sampled when asked: of a moving camera, poses alone tell enough."""
+    """A frame on a grid of GRID_STEP_PX pixels, sampled when asked: of a moving camera, poses alone tell enough.
+
+    `begun_color`: the colour, if it is found beside other work.
+    """
 
     frame: ViewFrame
+    begun_color: "Future[Float32[np.ndarray, 'gh gw 3']] | None" = None
+
+    @classmethod
+    def with_begun_color(cls, frame: ViewFrame) -> "FrameSamples":
+        """Begins to find the colour on another thread."""
+        return cls(frame, begun(partial(_downsampled_color, frame)))
 
     @cached_property
     def color(self) -> Float32[np.ndarray, "gh gw 3"]:
         """Mean linear colour."""
-        return _downsampled_color(self.frame)
+        return _downsampled_color(self.frame) if self.begun_color is None else self.begun_color.result()
 
     @cached_property
     def inverse_depth(self) -> Float32[np.ndarray, "gh gw"] | None:
         """Inverse depth (1/m, 0 = unknown); None if the frame has no depth."""
         return _subsampled_inverse_depth(self.frame.depth)
+
+    @cached_property
+    def _known(self) -> Float32[np.ndarray, " n"]:
+        """Inverse depths that are known."""
+        return (
+            np.zeros(0, np.float32)
+            if self.inverse_depth is None
+            else self.inverse_depth[self.inverse_depth > 0]
+        )
+
+    @cached_property
+    def mean_distance(self) -> float:
+        """The mean distance; without depth that of the world's origin."""
+        if self._known.size:
+            return float(1 / self._known.mean(dtype=np.float64))
+        assert self.frame.pose is not None
+        return max(float(np.linalg.norm(self.frame.pose.world_from_camera[:3, 3])), 0.1)
+
+    @cached_property
+    def near_distance(self) -> float | None:
+        """The nearest distance (5 % are nearer); None without depth."""
+        return float(1 / np.percentile(self._known, 95)) if self._known.size else None
 
     @cached_property
     def depth_range(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
@@ -295,7 +326,7 @@ def _image_motions(old: FrameSamples, new: FrameSamples) -> Iterator[float]:
         return
     pixels, rays = _coarse_rays(before.camera)
     new_from_old = np.linalg.inv(from_new) @ from_old
-    for distance in _distances(old.inverse_depth, from_old):
+    for distance in _distances(old):
         points = distance * rays @ new_from_old[:3, :3].T + new_from_old[:3, 3]
         shift = np.linalg.norm(before.camera.project(points) - pixels, axis=1)
         yield float(np.nan_to_num(shift, nan=np.inf).max())
@@ -309,13 +340,8 @@ def _coarse_rays(camera: CameraModel) -> tuple[Float64[np.ndarray, "25 2"], Floa
     return pixels, np.column_stack([camera.unproject(pixels), np.ones(len(pixels))])
 
 
-def _distances(
-    inverse_depth: Float32[np.ndarray, "gh gw"] | None, world_from_camera: Float64[np.ndarray, "4 4"]
-) -> Iterator[float]:
-    """Yields the mean distance and the nearest (5 % are nearer); without depth that of the world's origin."""
-    known = np.zeros(0) if inverse_depth is None else inverse_depth[inverse_depth > 0]
-    if known.size == 0:
-        yield max(float(np.linalg.norm(world_from_camera[:3, 3])), 0.1)
-        return
-    yield float(1 / known.mean(dtype=np.float64))
-    yield float(1 / np.percentile(known, 95))
+def _distances(samples: FrameSamples) -> Iterator[float]:
+    """Yields the mean distance and the nearest, if one is known."""
+    yield samples.mean_distance
+    if samples.near_distance is not None:
+        yield samples.near_distance

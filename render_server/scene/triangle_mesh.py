@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -162,8 +163,14 @@ class TriangleMesh:
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
         """Returns the least and greatest coordinates of the vertices that triangles use."""
-        used = self.positions[self.triangles.ravel()]
-        return np.stack(short_axis.bounds(used))
+        return np.stack(short_axis.bounds(self.positions.take(self._used, axis=0)))
+
+    @cached_property
+    def _used(self) -> Int64[np.ndarray, " k"]:
+        """Numbers of the vertices that triangles use."""
+        is_used = np.zeros(len(self.positions), bool)
+        is_used[self.triangles.ravel()] = True
+        return np.flatnonzero(is_used)
 
     def transformed(self, matrix: Float64[np.ndarray, "4 4"]) -> "TriangleMesh":
         """Returns the mesh in another frame; a mirroring matrix reverses the winding."""
@@ -172,12 +179,15 @@ class TriangleMesh:
         normals = self.normals @ np.linalg.inv(linear)
         normals /= np.maximum(short_axis.lengths(normals)[:, None], 1e-30)
         mirrored = np.linalg.det(linear) < 0
-        return replace(
+        moved = replace(
             self,
             positions=positions.astype(np.float32),
             normals=normals.astype(np.float32),
             triangles=np.ascontiguousarray(self.triangles[:, ::-1]) if mirrored else self.triangles,
         )
+        if "_used" in vars(self):  # the same, and it takes longer to find than to move the mesh
+            vars(moved)["_used"] = self._used
+        return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +332,7 @@ class GpuMesh:
     material_table: Float32[np.ndarray, "k 20"]
     second_uv: Float32[np.ndarray, "n 2"] | None
 
-    @property
+    @cached_property
     def corners(self) -> Float32[np.ndarray, "m 3 3"]:
         """Positions of each triangle's corners."""
         return np.asarray(self.vertices[:, :3].take(self.triangles, axis=0))

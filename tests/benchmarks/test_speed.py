@@ -252,6 +252,7 @@ def test_counted_frames_agree_with_what_the_graph_ran(
     )  # the objects' first samples, and a shadow map
     assert camera.per_frame["dispatches"] > 10
     assert 0 < camera.python_ms.median <= camera.python_ms.p95
+    assert 0 < camera.thread_ms.median <= camera.python_ms.p95
 
 
 # The commands
@@ -339,3 +340,13 @@ def test_counts_are_printed_as_table_and_as_json(capsys: pytest.CaptureFixture[s
     still = counts["still"]["per_frame"]
     assert still["dispatches"] + still["draws"] == 2
     assert counts["camera"]["per_frame"]["draws"] >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("prepared")
+def test_a_gpu_s_paths_are_counted_without_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["bench", "counts", *OPTIONS, "--gpu-paths", "--json"]) == 0
+    counts = json.loads(capsys.readouterr().out)["methods"]["paper:cone_scale=4"]
+    still = counts["still"]["per_frame"]
+    assert (still["dispatches"], still["draws"]) == (2, 0)  # in software whole pictures are drawn
+    assert counts["camera"]["per_frame"]["reads"] == 0  # where software waits

@@ -5,8 +5,9 @@ import pytest
 
 from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.camera_history import SAMPLE_STEP, CameraHistory
+from deltalight.render_server.scene.motion_detection import FrameSamples
 from deltalight.render_server.view import CameraView, PosedFrame
-from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at
+from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at, plain
 
 
 def typical_depth(depth: DepthImage) -> float:
@@ -43,3 +44,20 @@ def test_without_depth_it_is_a_metre() -> None:
     depth = floor()
     depth.valid[:] = False
     assert typical_depth(depth) == 1.0
+
+
+@pytest.mark.parametrize("expected", ["the frame", "another"])
+def test_a_still_camera_s_change_of_light_is_found_whatever_was_expected(expected: str) -> None:
+    camera = CameraHistory(keeps_world=False, has_depth=True)
+    dim, bright = (frame(plain(code)) for code in (100, 140))
+    view = CameraView(dim.camera, look_at().world_from_camera)
+    same, brighter = PosedFrame(dim, view), PosedFrame(bright, view)
+    assert camera.update(same, is_unknown=False)
+    assert not camera.update(same, is_unknown=False)
+    camera.expect(brighter if expected == "the frame" else same)
+    assert camera.update(brighter, is_unknown=False)
+
+
+def test_colour_that_is_found_beside_other_work_is_the_same() -> None:
+    taken = frame(checkered())
+    assert np.array_equal(FrameSamples.with_begun_color(taken).color, FrameSamples(taken).color)
