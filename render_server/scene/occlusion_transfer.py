@@ -81,7 +81,7 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
             _texels(mesh, each) for each in (material.base_color_map, material.metallic_roughness_map)
         )
         metallic = material.metallic * (1.0 if metal is None else metal[..., 2:] / 255)
-        color *= (1 - metallic) * material.base_color
+        color *= (1 - metallic) * (1 - material.transmission) * material.base_color
         if mesh.colors is not None:
             color *= mesh.colors[mesh.triangles]
         if base is not None:
