@@ -91,10 +91,8 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
 
 def _texels(mesh: TriangleMesh, texture: TextureMap | None) -> Float32[np.ndarray, "m 3 c"] | None:
     """Returns the nearest texels at the triangles' corners; None without a texture, or a place on it."""
-    if texture is None:
-        return None
-    uv = mesh.second_uv if texture.uv_set == 1 else mesh.uv
-    return None if uv is None else texture.nearest(uv[mesh.triangles])
+    uv = mesh.uv_of(texture)
+    return None if texture is None or uv is None else texture.nearest(uv[mesh.triangles])
 
 
 def compute_transfer(
