@@ -68,7 +68,7 @@ def sampled(shape: Shape, pattern: Float64[np.ndarray, "n 2"], edge: int = EDGE)
     """Returns the share of each pixel's samples inside; `pattern` is in pixels from its middle."""
     rows, columns = np.mgrid[:edge, :edge] - (edge - 1) / 2
     found = [shape.inside(columns + x, rows + y) for x, y in pattern]
-    return np.mean(found, axis=0)
+    return np.asarray(np.mean(found, axis=0))
 
 
 def evenly() -> Float64[np.ndarray, "n 2"]:
