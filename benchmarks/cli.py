@@ -227,7 +227,13 @@ def plot(
             help="Report of `bench speed`; may be given more than once: the first report that has a method counts."
         ),
     ],
-    quality: Annotated[Path, typer.Option(help="quality.json in a report folder of `bench quality`.")],
+    quality: Annotated[
+        list[Path],
+        typer.Option(
+            help="quality.json in a report folder of `bench quality`; may be given more than once, likewise, for the "
+            "same scenes."
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.svg", help="File for the picture.")],
     motion: Annotated[str, typer.Option(help="What moves while frames are timed.")] = "camera",
 ) -> None:

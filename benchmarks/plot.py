@@ -26,7 +26,10 @@ MARKER = 6.0
 FONT = 14.0
 GRID = "#e3e6ea"
 QUALITY = ":quality="
-COLORS = ("#1d5fd0", "#c2410c", "#1a7f4b", "#7c3aed", "#9a6700", "#be185d", "#0e7490", "#4b5563")
+COLORS = (
+    *("#1d5fd0", "#c2410c", "#1a7f4b", "#7c3aed", "#9a6700", "#be185d"),
+    *("#0e7490", "#4b5563", "#b91c1c", "#4d7c0f", "#312e81", "#78350f"),
+)
 MARKERS = {"best": "circle", "balanced": "diamond", "live": "triangle"}
 DISTANCES = (1.0, 2.2, 3.6, 5.0, 7.0, 9.0, 12.0)  # of a label from its point, in lines of text
 DIRECTIONS = ((1, 0), (0, -1), (0, 1), (-1, 0), (1, -1), (1, 1), (-1, -1), (-1, 1))
@@ -76,22 +79,29 @@ class Plot:
     lines: Sequence[str]
 
 
-def read_plot(speed: Sequence[Path], quality: Path, motion: str) -> Plot:
-    """Join reports by the methods' names; of a method that several reports of speed hold, the first counts.
+def read_plot(speed: Sequence[Path], quality: Sequence[Path], motion: str) -> Plot:
+    """Join reports by the methods' names; of a method that several reports of one kind hold, the first counts.
 
     Raises:
-        DeltalightError: a file is no such report, the reports of speed differ in machine or picture size, or no
-            method is in both kinds.
+        DeltalightError: a file is no such report, the reports of speed differ in machine or picture size, those of
+            quality in scenes, picture size or light paths, or no method is in both kinds.
     """
-    timed, means = [read_report(path) for path in speed], _read_means(quality)
+    timed, rated = [read_report(path) for path in speed], [_read_means(path) for path in quality]
     for other in timed[1:]:
         require_alike(timed[0], other)
-    times_ms = _medians(timed, motion)
-    qualities = {name: figures.get("changed_psnr_db") for name, figures in means.means.items()}
+    for rated_otherwise in rated[1:]:
+        _require_alike(rated[0], rated_otherwise)
+    times_ms, means = _medians(timed, motion), rated[0]
+    qualities = {
+        name: figures.get("changed_psnr_db")
+        for each in reversed(rated)
+        for name, figures in each.means.items()
+    }
     points = [Rated(name, ms, db) for name, ms in times_ms.items() if (db := qualities.get(name)) is not None]
     if not points:
         raise DeltalightError(
-            f"No method is both in {quality} and, moving as in `{motion}`, in {', '.join(map(str, speed))}; "
+            f"No method is both in {', '.join(map(str, quality))} and, moving as in `{motion}`, in "
+            f"{', '.join(map(str, speed))}; "
             "give both commands the same --methods."
         )
     drawn = {point.name for point in points}
@@ -115,6 +125,16 @@ def _read_means(path: Path) -> _Means:
             f"{path} is not a report of `bench quality`; give the quality.json in the folder of its --out."
         )
     return validate(_Means, data, str(path))
+
+
+def _require_alike(one: _Means, other: _Means) -> None:
+    of = [(sorted(each.scenes), each.size, each.spp) for each in (one, other)]
+    for kind, first, second in zip(("scenes", "picture sizes", "light paths"), *of, strict=True):
+        if first != second:
+            raise DeltalightError(
+                f"The reports of quality are of different {kind} ({first}; {second}), so their means cannot be "
+                "compared."
+            )
 
 
 def _captions(speed: SpeedReport, quality: _Means, motion: str) -> list[str]:

@@ -10,6 +10,9 @@ from deltalight.protocol.scene_fields import View
 PictureSize = Annotated[int, Field(ge=16, le=8192)]
 
 
+Tone = Literal["camera", "aces"]
+
+
 class Shading(StrictModel):
     """How virtual surfaces get their light."""
 
@@ -67,9 +70,7 @@ class Output(StrictModel):
 
     width: PictureSize | None = Field(default=None, description="Width, pixels; null = the camera's.")
     height: PictureSize | None = Field(default=None, description="Height, pixels; null = the camera's.")
-    tone: Literal["camera", "aces"] = Field(
-        default="camera", description="The camera's own response, or the ACES tone curve."
-    )
+    tone: Tone = Field(default="camera", description="The camera's own response, or the ACES tone curve.")
     frame_budget_ms: float | None = Field(
         default=None,
         ge=5,
@@ -102,5 +103,5 @@ class Output(StrictModel):
 
     @property
     def has_bloom(self) -> bool:
-        """Whether the view `composite` has bloom, which is put on in the camera's own response."""
-        return self.bloom > 0 and self.tone == "camera"
+        """Whether the view `composite` has bloom."""
+        return self.bloom > 0

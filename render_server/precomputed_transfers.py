@@ -17,7 +17,6 @@ from deltalight.render_server.scene.precomputed_transfer import (
     TransferSettings,
     TransferSurface,
     compute_object_transfer,
-    diffuse_reflectance,
     transfer_surface,
 )
 
@@ -76,7 +75,7 @@ class ObjectTransfers(Precomputations[TransferSettings, ObjectTransfer]):
     cache, kind, meanwhile = CACHE, "light transfer", "it keeps no light off itself"
 
     def _surface_key(self, item: PlacedObject) -> Hashable:
-        return None if item.material is None else diffuse_reflectance(item.material).tobytes()
+        return None if item.material is None else item.material.diffuse_reflectance.tobytes()
 
     def _job(self, item: PlacedObject, settings: TransferSettings) -> Job[ObjectTransfer]:
         surface = transfer_surface(item.meshes, item.material)

@@ -5,7 +5,7 @@ No sockets, no files except the scene's assets.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -27,6 +27,7 @@ from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, raster_texels
 from deltalight.render_server.post_effects.bloom import bloomed
 from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
+from deltalight.render_server.post_effects.tone import in_tone
 from deltalight.render_server.room_mesh import RoomMesh, room_mesh
 from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.started_frame import (
@@ -443,7 +444,7 @@ class SceneRenderer:
             coverage = self._readback.pop()[..., 0].astype(np.float32)
             depth_m = None if texels is None else self._readback.pop()[..., 3][texels]
             if radiance is not None:
-                color = bloomed(color, radiance, coverage, frame, output.bloom)
+                color = bloomed(color, radiance, coverage, frame, output.bloom, tone=output.tone)
             return color if artifacts is None else artifacts.applied(color, coverage, depth_m)
 
         return take
@@ -485,13 +486,14 @@ class SceneRenderer:
     def _artifacts_of(self, source: FrameSource, relit: RelitFrame, view: ShownView) -> FrameArtifacts | None:
         """Learns from the camera's frame; returns what it puts on the objects if the scene asks for that."""
         frame, output = source.frame, self.scene.output
-        if not output.camera_artifacts or view != "composite" or output.tone != "camera":
+        if not output.camera_artifacts or view != "composite":
             return None
         shown = relit.shown()
         if shown.object_coverage.size != frame.color.shape[1::-1]:
             return None
         low, high = shown.objects.bounds
-        return source.camera.artifacts.observe(frame, shown.view.world_from_camera, (low + high) / 2)
+        found = source.camera.artifacts.observe(frame, shown.view.world_from_camera, (low + high) / 2)
+        return replace(found, frame=in_tone(frame, output.tone))
 
     def release(self) -> None:
         """Frees all GL objects."""

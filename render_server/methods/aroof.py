@@ -113,7 +113,7 @@ def _standing(item: PlacedObject, found: OcclusionField | None) -> dict[str, Bin
     bounds = np.array([mesh.bounds() for mesh in item.meshes])
     around = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
     given = item.material
-    diffuse = np.ones(3) if given is None else (1 - given.metallic) * given.base_color
+    diffuse = np.ones(3) if given is None else given.diffuse_reflectance
     reflectance = tuple(float(value) for value in diffuse)
     return {**standing_uniforms(item.world_from_asset, found, around), "reflectance": reflectance}
 

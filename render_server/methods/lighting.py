@@ -117,7 +117,8 @@ class ShadingOptions:
 class Layers:
     """The layers that a method hands to composition; `voxels`, `volume`, `lights` and `error` are for debug views.
 
-    `direct_mu` and `cones_mu` are the same at real surfaces without the objects, where that takes less.
+    `direct_mu` and `cones_mu` are the same at real surfaces without the objects, where that takes less. `transmit`
+    declares the stage that adds to the objects' own `radiance` what transparent ones let through.
     """
 
     direct: Resource[DirectLight]
@@ -132,6 +133,7 @@ class Layers:
     error: Resource[Callable[[], moderngl.Texture]] | None = None
     direct_mu: Resource[DirectLight] | None = None
     cones_mu: Resource[ConeFields] | None = None
+    transmit: Callable[[Resource[moderngl.Texture]], Resource[moderngl.Texture]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -478,10 +480,19 @@ def shading_stages(
     behind = (s.objects, scene, direct, cones, bvh, s.observation, marching)
     mirrored = g.stage("mirrored objects", shading.mirror_objects, s.objects, scene, grid, bvh, marching)
     screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
-    reflected = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
-    radiance = g.stage("transmitted light", shading.add_transmitted, reflected, *behind)
+    radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
     return Layers(
-        direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps, direct_mu=own_light
+        direct,
+        cones,
+        grid,
+        change,
+        radiance,
+        reflection,
+        shown,
+        volume,
+        lit.real_maps,
+        direct_mu=own_light,
+        transmit=lambda own: g.stage("transmitted light", shading.add_transmitted, own, *behind),
     )
 
 

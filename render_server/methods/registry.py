@@ -98,14 +98,13 @@ class MethodChoice:
         size: tuple[int, int],
         transfers: ObjectTransfers,
     ) -> Layers:
-        """Declares the stages of a shading that takes the place of the method's own."""
+        """Declares a shading that takes the place of the method's own, and what transparent objects let through."""
+        radiance = layers.radiance
         if self.shading.is_image_based:
             radiance = image_based_radiance(graph, resources, self.shading, size)
         elif self.shading.is_precomputed:
             radiance = precomputed_radiance(graph, resources, self.shading, size, transfers)
-        else:
-            return layers
-        return replace(layers, radiance=radiance)
+        return replace(layers, radiance=radiance if layers.transmit is None else layers.transmit(radiance))
 
 
 def choose_method(

@@ -11,11 +11,16 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from deltalight.protocol.frames import ViewFrame, decode_lut, linear_color
+from deltalight.protocol.scene_output import Tone
+from deltalight.render_server.post_effects.tone import in_tone
 
 WIDTHS = (0.01, 0.03, 0.09)
 """Of the picture's width: standard deviations of the three parts of equal light that scattered light spreads to."""
 PASSES = 3
 """Boxes that follow each other: nearly a Gaussian, of finite reach, in a time that does not grow with its width."""
+
+ROUNDING = 1e-3
+"""Of radiance in 16 bits, at most: what differs by less from the camera's is not changed."""
 
 
 def scattered(change: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
@@ -37,17 +42,20 @@ def bloomed(
     coverage: Float32[np.ndarray, "h w"],
     frame: ViewFrame,
     share: float,
+    *,
+    tone: Tone = "camera",
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return a relit picture with bloom of its change; where none arrives it is the same to the bit.
 
     `linear` is the picture in camera units, beyond white where objects are, `coverage` what they cover; `share`
-    0..1 is the part of the light that is scattered.
+    0..1 is the part of the light that is scattered. `tone` is the curve that `color` was made with.
     """
-    changed = (color != frame.color).any(axis=2, keepdims=True) | (coverage[..., None] > 0)
+    camera = linear_color(frame, frame.color)
+    differs = color != frame.color if tone == "camera" else np.abs(linear - camera) > ROUNDING * camera
+    changed = differs.any(axis=2, keepdims=True) | (coverage[..., None] > 0)
     if not changed.any():
         return color
-    lut, scale = decode_lut(frame.response), np.float32(frame.exposure_scale)
-    camera = linear_color(frame, frame.color)
+    lut, scale = decode_lut(in_tone(frame, tone).response), np.float32(frame.exposure_scale)
     hidden = np.clip(coverage, 0, 1)[..., None]
     around = scattered(camera) / scattered(np.ones_like(camera))
     change = np.where(changed, linear - camera + hidden * (camera - around), 0).astype(np.float32)

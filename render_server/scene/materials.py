@@ -105,6 +105,11 @@ class Material:
         return mixed.astype(np.float32)
 
     @property
+    def diffuse_reflectance(self) -> Float32[np.ndarray, "3"]:
+        """What is reflected diffusely, its maps left out; the thin lobe above it counts to it."""
+        return np.asarray((1 - self.metallic) * (1 - self.transmission) * self.base_color, np.float32)
+
+    @property
     def transmits(self) -> bool:
         """Whether light passes through it."""
         return self.transmission > 0 and self.metallic < 1

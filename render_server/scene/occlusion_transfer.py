@@ -81,7 +81,7 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
             _texels(mesh, each) for each in (material.base_color_map, material.metallic_roughness_map)
         )
         metallic = material.metallic * (1.0 if metal is None else metal[..., 2:] / 255)
-        color *= (1 - metallic) * material.base_color
+        color *= (1 - metallic) * (1 - material.transmission) * material.base_color
         if mesh.colors is not None:
             color *= mesh.colors[mesh.triangles]
         if base is not None:
@@ -91,10 +91,8 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
 
 def _texels(mesh: TriangleMesh, texture: TextureMap | None) -> Float32[np.ndarray, "m 3 c"] | None:
     """Returns the nearest texels at the triangles' corners; None without a texture, or a place on it."""
-    if texture is None:
-        return None
-    uv = mesh.second_uv if texture.uv_set == 1 else mesh.uv
-    return None if uv is None else texture.nearest(uv[mesh.triangles])
+    uv = mesh.uv_of(texture)
+    return None if texture is None or uv is None else texture.nearest(uv[mesh.triangles])
 
 
 def compute_transfer(

@@ -81,7 +81,7 @@ def transfer_surface(meshes: Sequence[TriangleMesh], material: Material | None) 
     """
     surface = object_surface(meshes, plain=material is not None)
     if material is not None:
-        surface[..., 3:] *= diffuse_reflectance(material)
+        surface[..., 3:] *= material.diffuse_reflectance
     normals = np.concatenate([mesh.normals[mesh.triangles] for mesh in meshes])
     low, high = surface[..., :3].min(axis=(0, 1)), surface[..., :3].max(axis=(0, 1))
     edge = LONGEST_EDGE * max(float(np.linalg.norm(high - low)) / 2, 1e-9)
@@ -96,11 +96,6 @@ def transfer_surface(meshes: Sequence[TriangleMesh], material: Material | None) 
         index.reshape(-1, 3).astype(np.int32),
         np.ascontiguousarray(pieces[..., 6:].mean(axis=1)),
     )
-
-
-def diffuse_reflectance(material: Material) -> Float32[np.ndarray, "3"]:
-    """Returns the diffuse reflectance of a material, its maps left out; the thin lobe above it counts to it."""
-    return np.asarray((1 - material.metallic) * (1 - material.transmission) * material.base_color, np.float32)
 
 
 def compute_object_transfer(

@@ -12,6 +12,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene.asset_check import MAX_TRIANGLES
 from deltalight.render_server.scene.materials import Material, material_table
+from deltalight.render_server.scene.texture_maps import TextureMap
 
 # Scanned meshes of 100k triangles are full of edges beyond 40 degrees that nobody means to be sharp.
 CREASE_ANGLE_DEG = 60.0
@@ -160,6 +161,12 @@ class TriangleMesh:
     material: Material
     colors: Float32[np.ndarray, "n 3"] | None = None
     second_uv: Float32[np.ndarray, "n 2"] | None = None
+
+    def uv_of(self, texture: TextureMap | None) -> Float32[np.ndarray, "n 2"] | None:
+        """Returns the coordinates that a map of its material lies on; None without them, or without a map."""
+        if texture is None:
+            return None
+        return self.second_uv if texture.uv_set == 1 else self.uv
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
         """Returns the least and greatest coordinates of the vertices that triangles use."""

@@ -1,5 +1,6 @@
 """Small pictures of meshes and environment maps, drawn on the processor (in the worker)."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from deltalight.protocol.radiance_files import read_linear
 from deltalight.render_server.scene.asset_check import check_mesh_file
 from deltalight.render_server.scene.bvh import RayCaster
 from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.render_server.scene.texture_maps import TextureMap
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.services.storage.asset_kinds import Facts
 
@@ -112,16 +114,14 @@ class _Shot:
         light = np.full((len(normals), 1), AMBIENT_LIGHT, np.float32)
         for strength, direction in ((KEY_LIGHT, KEY), (FILL_LIGHT, FILL)):
             light += strength * np.maximum(normals @ (direction / np.linalg.norm(direction)), 0)[:, None]
-        color = np.broadcast_to(mesh.material.base_color, normals.shape)
+        material, tint = mesh.material, np.ones_like(normals)
         if mesh.colors is not None:
-            color = color * _mixed(mesh.colors, corners, weights)
-        if mesh.uv is not None and mesh.material.base_color_texture is not None:
-            color = color * _texels(mesh.material.base_color_texture, _mixed(mesh.uv, corners, weights))
-        glow = np.broadcast_to(mesh.material.emission, normals.shape)
-        if mesh.uv is not None and mesh.material.emissive_map is not None:
-            texels = mesh.material.emissive_map.texels[..., :3]
-            glow = glow * _texels(texels, _mixed(mesh.uv, corners, weights))
-        return np.asarray(color * light + glow, np.float32)
+            tint = _mixed(mesh.colors, corners, weights)
+        base, glow = (
+            _texels(mesh, each, corners, weights) for each in (material.base_color_map, material.emissive_map)
+        )
+        emission = material.emission * glow * (tint if material.is_unlit else 1)
+        return np.asarray(material.base_color * tint * base * light + emission, np.float32)
 
 
 _Z_FROM_Y = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
@@ -143,12 +143,20 @@ def _mixed(
     return np.asarray(np.einsum("nkc,nk->nc", values[corners], weights), np.float32)
 
 
-def _texels(texture: np.ndarray, uv: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 3"]:
-    """Return the nearest texels of a repeated texture, downsampled first if it is finer than the picture."""
-    rows, columns = (min(edge, TEXTURE_EDGE) for edge in texture.shape[:2])
-    coarse = cv2.resize(texture.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
-    column, row = (np.floor(uv * [columns, rows]).astype(np.int64) % [columns, rows]).T
-    return np.asarray(coarse[row, column])
+def _texels(
+    mesh: TriangleMesh,
+    texture: TextureMap | None,
+    corners: Int[np.ndarray, "n 3"],
+    weights: Float32[np.ndarray, "n 3"],
+) -> Float32[np.ndarray, "n 3"]:
+    """Return the nearest colours of a texture, downsampled first if it is finer than the picture; 1 without one."""
+    uv = mesh.uv_of(texture)
+    if texture is None or uv is None:
+        return np.ones((len(corners), 3), np.float32)
+    rows, columns = (min(edge, TEXTURE_EDGE) for edge in texture.texels.shape[:2])
+    colors = texture.texels[..., :3].astype(np.float32)
+    coarse = cv2.resize(colors, (columns, rows), interpolation=cv2.INTER_AREA)
+    return replace(texture, texels=coarse).nearest(_mixed(uv, corners, weights))
 
 
 def reduced(pixels: Pixels) -> Pixels:

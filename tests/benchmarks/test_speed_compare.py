@@ -121,9 +121,19 @@ def test_a_picture_has_a_point_for_each_method_of_both_kinds_of_reports(
         write(tmp_path / f"{name}.json", name, motions={"arm": motion(ms)}) for name, ms in times_ms.items()
     ]
     reports.append(write(tmp_path / "again.json", "slow", motions={"arm": motion(3)}))
-    quality = write_quality(tmp_path / "quality.json", slow=35, middle=30, fast=25, path=20, undefined=None)
+    quality = write_quality(tmp_path / "quality.json", slow=35, middle=30, path=20, undefined=None)
+    more = write_quality(tmp_path / "more.json", slow=10, fast=25)
     speed = [option for report in reports for option in ("--speed", str(report))]
-    options = ("--quality", str(quality), "--motion", "arm", "--out", str(tmp_path / "plot.svg"))
+    options = (
+        "--quality",
+        str(quality),
+        "--quality",
+        str(more),
+        "--motion",
+        "arm",
+        "--out",
+        str(tmp_path / "plot.svg"),
+    )
     assert run(["bench", "plot", *speed, *options]) == 0
     assert "path, undefined" in capsys.readouterr().err
     places = drawn(tmp_path / "plot.svg")
@@ -158,9 +168,12 @@ def test_what_cannot_be_drawn_is_refused_in_a_sentence(
     speed = write(tmp_path / "a.json", "exact")
     quality = write_quality(tmp_path / "quality.json", paper=30)
     other = write(tmp_path / "machine.json", "paper", cpus=4)
+    finer = write_quality(tmp_path / "finer.json", exact=30)
+    finer.write_text(finer.read_text().replace('"spp": 8', '"spp": 512'))
     for options, sentence in (
         (("--speed", speed, "--quality", quality), "same --methods"),
         (("--speed", speed, "--speed", other, "--quality", quality), "different machines"),
+        (("--speed", speed, "--quality", quality, "--quality", finer), "different light paths (8; 512)"),
         (("--speed", other, "--quality", quality), "moving as in `camera`"),
         (("--speed", speed, "--quality", speed), "not a report of `bench quality`"),
         (("--speed", quality, "--quality", quality), "not a report of this version's `bench speed`"),

@@ -216,6 +216,10 @@ def with_neighbours(pixels: np.ndarray) -> np.ndarray:
     return np.asarray(binary_erosion(pixels, np.ones((3, 3)), border_value=1))
 
 
+OWN_RADIANCE = ("image-based surface", "precomputed surface", "virtual surface")
+"""Stages that shade the objects; the first of them in a graph does."""
+
+
 def fields_of(renderer: SceneRenderer) -> Fields:
     """What the graph of the newest frame holds."""
     graph = renderer.graph
@@ -232,7 +236,7 @@ def fields_of(renderer: SceneRenderer) -> Fields:
         array_of(graph["object surface"].coverage.texture)[..., 0],
         array_of(real.position),
         array_of(real.normal)[..., :3],
-        array_of(graph["virtual surface"])[..., :3],
+        array_of(graph[next(name for name in OWN_RADIANCE if name in graph)])[..., :3],
     )
 
 

@@ -120,6 +120,22 @@ def test_a_lamp_on_a_white_ball_lights_the_floor_like_the_ball_that_it_sees(
     assert got.sum() == pytest.approx(expected.sum(), rel=0.08)
 
 
+def test_what_passes_through_an_object_is_not_reflected_too(gpu: GpuContext, stage: Stage) -> None:
+    sent = []
+    for transmission in (0.0, 0.75):
+        material = {"base_color": (0.8, 0.6, 0.4), "transmission": transmission}
+        item = stage.virtual(ball(RADIUS), material=material)
+        document = stage.document([item], [directional((0.0, 0.0, -1.0), 2.0)], floor())
+        renderer = SceneRenderer(gpu, aroof(document))
+        renderer.render(frame())
+        assert renderer.graph is not None
+        (placed,) = renderer.graph["object bounce light"]
+        sent.append(np.frombuffer(placed.bounce_light.read(), np.float16).reshape(-1, 4)[:, :3].astype(float))
+        renderer.release()
+    assert sent[0].max() > 0.01
+    assert sent[1] == pytest.approx(0.25 * sent[0], abs=1e-3)
+
+
 def _reflected(point: Float64[np.ndarray, "3"], toward: Float64[np.ndarray, "3"]) -> float:
     ways = even_directions(20000)
     ways = ways[ways[:, 2] > 0]

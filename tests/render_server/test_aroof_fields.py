@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,12 @@ def test_a_texture_tells_which_part_is_metal() -> None:
     mesh = TriangleMesh(corners, up, np.array([[0, 1, 2]], np.int32), uv, material)
     (found,) = object_surface([mesh], plain=False)
     assert found[:, 3] == pytest.approx([0.5, 0.4, 0.4])
+
+
+def test_what_light_passes_through_reflects_the_rest() -> None:
+    material = Material(base_color=np.full(3, 0.5, np.float32), metallic=0.2, transmission=0.75)
+    mesh = replace(mesh_of(trimesh.creation.box()), material=material)
+    assert object_surface([mesh], plain=False)[..., 3:] == pytest.approx(0.5 * 0.8 * 0.25)
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,17 @@
 """Bloom: light is scattered and none is made, and what it does not reach stays the camera's."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.scene_method import NoneMethod
+from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.post_effects.bloom import bloomed, scattered
+from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = CameraModel(WIDTH, HEIGHT, np.array([[300, 0, 160], [0, 300, 120], [0, 0, 1.0]]))
@@ -44,6 +50,37 @@ def test_a_bright_thing_glows_on_what_is_around_it() -> None:
     expected = before + 0.2 * 0.5 * scattered(change.astype(np.float32))
     around = (color == frame.color) & (expected < 0.9)
     np.testing.assert_allclose(after[around], expected[around], rtol=0.02, atol=1e-3)
+
+
+def aces(x: np.ndarray) -> np.ndarray:
+    """As Narkowicz (2015) gives it."""
+    return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
+
+
+def test_bloom_under_a_tone_curve_is_that_of_the_light(gpu: GpuContext, tmp_path: Path) -> None:
+    """A glowing cube: seen through the curve, its surroundings have the radiance that they have without it."""
+    stage = Stage(tmp_path, COARSE)
+    glowing = stage.virtual(cube(0.1), (0.0,) * 3, {"emission": (6.0, 2.0, 0.5)})
+    document = stage.document([glowing], [ambient(0.2)], floor()).replaced(method=NoneMethod())
+    shown = {}
+    for tone in ("camera", "aces"):
+        for bloom in (0.0, 0.1):
+            output = document.output.replaced(tone=tone, bloom=bloom)
+            renderer = SceneRenderer(gpu, document.replaced(output=output))
+            shown[tone, bloom] = renderer.render(frame()).color
+            covered = fields_of(renderer).matte > 0
+            renderer.release()
+    lut = LUT[:, 0].astype(float)
+    curve = np.interp(aces(lut), lut, np.arange(256))  # camera's code -> code shown
+    around = ~covered & (shown["camera", 0.1] < 250).all(axis=2)
+    reached = around & (shown["camera", 0.1] != shown["camera", 0.0]).any(axis=2)
+    assert reached.sum() > 1000
+    expected = curve[shown["camera", 0.1]]
+    assert np.abs(shown["aces", 0.1] - expected)[around].max() <= 1.5  # roundings of both
+    assert np.abs(shown["aces", 0.0] - expected)[reached].max() > 5
+    untouched = around & (shown["camera", 0.1] == shown["camera", 0.0]).all(axis=2)
+    same = (shown["aces", 0.1] == shown["aces", 0.0]).all(axis=2)
+    assert same[untouched].mean() > 0.9  # a curve that is steeper shows half a code's light in some
 
 
 def test_where_nothing_arrives_the_picture_is_the_cameras() -> None:

@@ -8,8 +8,10 @@ import pytest
 
 from deltalight.benchmarks.ground_truth.sensors import ColorSensor, srgb_bytes
 from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene_output import Tone
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.post_effects.camera_mosaic import demosaicked
+from deltalight.render_server.post_effects.tone import in_tone
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server import test_camera_defocus as lens
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame, look_at, plain
@@ -17,7 +19,8 @@ from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
 
-def test_objects_get_the_cameras_noise(gpu: GpuContext, tmp_path: Path) -> None:
+@pytest.mark.parametrize("tone", ["camera", "aces"])
+def test_objects_get_the_cameras_noise(gpu: GpuContext, tmp_path: Path, tone: Tone) -> None:
     """From the second still frame on; pixels without objects are those of the picture without it, to the bit."""
     sensor, rng = ColorSensor(3e-4, 0.01), np.random.default_rng(1)
     clean = decode_lut(None)[plain(150), np.arange(3)] * np.linspace(0.2, 1, plain().shape[1])[None, :, None]
@@ -27,6 +30,7 @@ def test_objects_get_the_cameras_noise(gpu: GpuContext, tmp_path: Path) -> None:
     ]
     stage = Stage(tmp_path, COARSE)
     document = stage.document([stage.virtual(cube(0.3))], [ambient(0.5)], floor())
+    document = document.replaced(output=document.output.replaced(tone=tone))
     noisy = document.replaced(output=document.output.replaced(camera_artifacts=True))
     pictures = {}
     for name, scene in (("off", document), ("on", noisy)):
@@ -39,7 +43,8 @@ def test_objects_get_the_cameras_noise(gpu: GpuContext, tmp_path: Path) -> None:
     assert np.array_equal(first, plain_first)
     assert np.array_equal(second[~inside], plain_second[~inside])
     assert np.array_equal(pictures["on"][1], pictures["on"][2])
-    before, after = (decode_lut(None)[each, np.arange(3)][covered] for each in (plain_second, second))
+    lut = decode_lut(in_tone(frames[0], tone).response)
+    before, after = (lut[each, np.arange(3)][covered] for each in (plain_second, second))
     expected = np.mean(0.01**2 + 3e-4 * before)
     assert np.mean((after - before) ** 2) == pytest.approx(expected, rel=0.2)
 

@@ -30,6 +30,7 @@ from tests.render_server.scenes import (
     ambient,
     array_of,
     ball,
+    checkered,
     cube,
     directional,
     fields_of,
@@ -55,6 +56,7 @@ IRRADIANCE = 2.0
 STRONG = (
     50.0  # irradiance beside which colours of the picture do not count: what objects change of light is grey
 )
+SHADINGS = ("auto", "image_based", "precomputed")
 
 
 @pytest.fixture
@@ -78,13 +80,17 @@ def rendered(
     renderer.render(frame(color))
     found, graph = fields_of(renderer), renderer.graph
     assert graph is not None
-    through = array_of(graph["transmitted light"]) - array_of(graph["virtual surface"])
+    through = array_of(graph["transmitted light"])[..., :3] - found.virtual_radiance
     beams, light = graph["caustics"], np.zeros((HEIGHT, WIDTH, 3))
     if beams is not None:
         sums = np.frombuffer(beams.bindings["CausticSums"].read(), np.int32).reshape(2, HEIGHT, WIDTH, 2, 3)
         light = sums[:, :, :, 0].sum(axis=0) / 2.0**20
     renderer.release()
-    return through[..., :3], found, light
+    return through, found, light
+
+
+def shaded_by(name: str, document: SceneDocument) -> SceneDocument:
+    return document.replaced(shading=document.shading.replaced(name=name))
 
 
 def fresnel(cosine: np.ndarray, eta: np.ndarray | float) -> Float64[np.ndarray, " n"]:
@@ -169,13 +175,18 @@ def test_slab_shifts_what_is_behind(gpu: GpuContext, stage: Stage) -> None:
     assert np.abs(off).max() < 1.0
 
 
-def test_absorption_follows_beers_law(gpu: GpuContext, stage: Stage) -> None:
+@pytest.mark.parametrize("shading", SHADINGS)
+def test_absorption_follows_beers_law(gpu: GpuContext, stage: Stage, shading: str) -> None:
     """A path l inside turns white light into color^(l / distance)."""
     thickness, color, distance_m = 0.03, (0.2, 0.5, 0.9), 0.04
     lights = [ambient(0.0)]
     tint = {"attenuation_color": color, "attenuation_distance_m": distance_m}
-    clear, found, _ = rendered(gpu, stage.document([glass(stage, pane(thickness))], lights, floor()))
-    tinted, _, _ = rendered(gpu, stage.document([glass(stage, pane(thickness), **tint)], lights, floor()))
+    clear, found, _ = rendered(
+        gpu, shaded_by(shading, stage.document([glass(stage, pane(thickness))], lights, floor()))
+    )
+    tinted, _, _ = rendered(
+        gpu, shaded_by(shading, stage.document([glass(stage, pane(thickness), **tint)], lights, floor()))
+    )
     pixel = (58, 80)
     rays = np.append(frame().camera.rays()[pixel], 1.0) @ look_at().world_from_camera[:3, :3].T
     sine = np.sqrt(1 - (rays[2] / np.linalg.norm(rays)) ** 2)
@@ -184,13 +195,14 @@ def test_absorption_follows_beers_law(gpu: GpuContext, stage: Stage) -> None:
     assert tinted[pixel] / clear[pixel] == pytest.approx(np.array(color) ** (path / distance_m), rel=0.02)
 
 
-def test_clear_objects_neither_make_nor_lose_light(gpu: GpuContext, stage: Stage) -> None:
+@pytest.mark.parametrize("shading", SHADINGS)
+def test_clear_objects_neither_make_nor_lose_light(gpu: GpuContext, stage: Stage, shading: str) -> None:
     """In surroundings of one radiance a clear ball and a clear cube show just that: R + T = 1 at all angles."""
     around = float(decode_lut(None)[GREY, 0])
     far_below = shifted(floor(0.05), 0, 0, -2.0)
     for mesh in (ball(0.1, (0, 0, 0.06), 4), cube(0.16)):
         document = stage.document([glass(stage, mesh)], [ambient(around)], far_below)
-        through, found, _ = rendered(gpu, document)
+        through, found, _ = rendered(gpu, shaded_by(shading, document))
         inside = found.matte == 1
         whole = (found.virtual_radiance[..., :3] + through)[inside] / around
         print(f"{whole.min():.3f} .. {whole.max():.3f}, mean {whole.mean():.3f}")
@@ -198,6 +210,31 @@ def test_clear_objects_neither_make_nor_lose_light(gpu: GpuContext, stage: Stage
         assert low > 0.95
         assert high < 1.03
         assert whole.mean() == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        {"name": "dvct", **COARSE, "cone_scale": 1},
+        {"name": "dlpv", "query_scale": 1},
+        {"name": "aroof", "shading_scale": 1, "resolution": 12, "rays": 64},
+    ],
+)
+def test_what_lies_behind_is_seen_whatever_shades_the_object(
+    gpu: GpuContext, stage: Stage, method: dict[str, object]
+) -> None:
+    """Refracted as with the method's own shading: of the picture, and of what is out of it."""
+    lights = [sphere_light((0.4, -0.6, 0.9), 1.0, 0.05), ambient(0.2)]
+    document = stage.document([glass(stage, ball(0.1, (0, 0, 0.15), 4))], lights, floor())
+    document = document.replaced(method=method)
+    own, found, _ = rendered(gpu, document, checkered())
+    inside = found.matte == 1
+    assert own[inside].std() > 0.2 * own[inside].mean() > 0.01
+    for shading in SHADINGS[1:]:
+        through, other, _ = rendered(gpu, shaded_by(shading, document), checkered())
+        brightest = own + np.maximum(found.virtual_radiance, other.virtual_radiance)
+        rounding = (2e-3 * brightest)[inside]  # sums with what surfaces reflect have 11 bits
+        assert (np.abs(through - own)[inside] < rounding).all()
 
 
 def test_a_pane_shows_the_lamp_behind_it(gpu: GpuContext, stage: Stage) -> None:

@@ -24,6 +24,7 @@ from deltalight.services.storage.thumbnails import (
     MARGIN,
     SIZE,
 )
+from tests.render_server.gltf_samples import Plate
 from tests.services.api_samples import UPLOAD, running_api, sentence
 from tests.services.storage_samples import TETRAHEDRON, glb, trusting_probe, upload
 from tests.services.test_gltf_zip import FILES, packed
@@ -96,6 +97,45 @@ def test_gltf_is_y_up_and_textured(tmp_path: Path) -> None:
     assert len(solid) > 0.3 * SIZE * SIZE, "the square stands upright and is seen from the front"
     assert solid[:, 2].min() > 100
     assert solid[:, :2].max() < 30
+
+
+@pytest.mark.parametrize("key", ["baseColorTexture", "emissiveTexture"])
+@pytest.mark.parametrize("how", ["plain", "transform", "second set", "mirrored"])
+def test_textures_lie_where_the_file_says(tmp_path: Path, key: str, how: str) -> None:
+    """Red on the left and green on the right; half a texture farther, turned round, or mirrored: the other way."""
+    plate, info, sampler = Plate(1.0, 1.0), {}, None
+    if how == "transform":
+        info = {"extensions": {"KHR_texture_transform": {"offset": [0.5, 0.0]}}}
+    elif how == "second set":
+        plate.attributes["TEXCOORD_1"] = plate.glb.floats([(1, 1), (0, 1), (0, 0), (1, 0)])
+        info = {"texCoord": 1}
+    elif how == "mirrored":
+        info, sampler = {"extensions": {"KHR_texture_transform": {"offset": [1.0, 0.0]}}}, {"wrapS": 33648}
+    codes = np.zeros((8, 8, 3), np.uint8)
+    codes[:, :4, 0] = codes[:, 4:, 1] = 255
+    texture = plate.texture(codes, sampler, **info)
+    if key == "emissiveTexture":
+        plate.material |= {key: texture, "emissiveFactor": [1, 1, 1]}
+        plate.material["pbrMetallicRoughness"] = {"baseColorFactor": [0, 0, 0, 1]}
+    else:
+        plate.material["pbrMetallicRoughness"] = {key: texture}
+    picture = drawn(tmp_path, "plate.glb", plate.write(tmp_path / "made.glb").read_bytes())
+    columns = np.nonzero((picture[..., 3] == 255).any(axis=0))[0]
+    is_red = picture[..., 2].astype(int) > picture[..., 1]
+    left, right = (is_red[SIZE // 2, round(np.quantile(columns, at))] for at in (0.25, 0.75))
+    assert (left, right) == ((True, False) if how == "plain" else (False, True))
+
+
+@pytest.mark.parametrize("is_unlit", [False, True])
+def test_vertex_colours_tint_what_is_lit_and_unlit(tmp_path: Path, is_unlit: bool) -> None:
+    plate = Plate(1.0, 1.0)
+    plate.attributes["COLOR_0"] = plate.glb.floats([(0.0, 1.0, 0.0)] * 4)
+    if is_unlit:
+        plate.material["extensions"]["KHR_materials_unlit"] = {}
+    picture = drawn(tmp_path, "plate.glb", plate.write(tmp_path / "made.glb").read_bytes())
+    blue, green, red, _ = picture[SIZE // 2, SIZE // 2]
+    assert green > 150
+    assert max(blue, red) < 10
 
 
 def test_a_damaged_thumbnail_is_drawn_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
