@@ -157,7 +157,8 @@ class Program:
             slots = (*(slot for slot, _ in self._binders), *self._arrays, *self._uniforms)
             self._require({slot.name for slot in slots}, known)
             raise
-        for call in self._calls.of(resources) or self._made_calls(resources):
+        calls = self._calls.of(resources)
+        for call in self._made_calls(resources) if calls is None else calls:
             call()
         for slot, value in zip(self._uniforms, values, strict=True):
             if type(value) not in NUMBERS or slot.last != value:
