@@ -13,6 +13,7 @@ from deltalight.protocol.scene_fields import (
     ASSET_TEXT,
     Asset,
     Colour,
+    Coordinate,
     Direction,
     Fraction,
     Point,
@@ -20,6 +21,7 @@ from deltalight.protocol.scene_fields import (
     Radiance,
 )
 
+SheetEdge = Annotated[float, Field(gt=0, le=100)]
 GLTF_SUFFIXES = (".gltf", ".glb")
 # Rotates an asset whose y is up so that its z is up: +90 degrees about x.
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -228,11 +230,24 @@ class BoxRegion(StrictModel):
         return self
 
 
+class SheetRegion(StrictModel):
+    """A rectangle on the board's plane (world z = 0), thinner than depth shows: paper, a cloth, a mat."""
+
+    middle_m: tuple[Coordinate, Coordinate] = Field(description="Its middle, world x and y, metres.")
+    size_m: tuple[SheetEdge, SheetEdge] = Field(description="Lengths of its edges, metres.")
+    turn_deg: float = Field(
+        default=0.0, ge=-360, le=360, description="Turn of its first edge from world x towards y, degrees."
+    )
+
+
 class Region(StrictModel):
-    """Where a real surface is: exactly one of plane, box, material; without any, the board's plane."""
+    """Where a real surface is: exactly one of plane, box, sheet, material; without any, the board's plane."""
 
     plane: PlaneRegion | None = Field(default=None, description="Points near a plane.")
     box: BoxRegion | None = Field(default=None, description="Points in a box.")
+    sheet: SheetRegion | None = Field(
+        default=None, description="A diffuse sheet on the board's plane; it lies on every declared surface."
+    )
     material: str | None = Field(
         default=None, min_length=1, description="Name of a material of the given model."
     )
@@ -244,8 +259,8 @@ class Region(StrictModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if sum(part is not None for part in (self.plane, self.box, self.material)) != 1:
-            raise ValueError("a region has exactly one of plane, box, material")
+        if sum(part is not None for part in (self.plane, self.box, self.sheet, self.material)) != 1:
+            raise ValueError("a region has exactly one of plane, box, sheet, material")
         return self
 
 
@@ -259,6 +274,15 @@ class Surface(StrictModel):
     albedo: Colour | None = Field(
         default=None, description="Linear RGB, 0..1 (F0 where metallic); null = measured from the picture."
     )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        shine = type(self).model_fields.keys() - {"region"}
+        if self.region.sheet and any(
+            getattr(self, key) != type(self).model_fields[key].default for key in shine
+        ):
+            raise ValueError("a sheet is diffuse: leave out roughness, metallic, specular and albedo")
+        return self
 
 
 class RealScene(StrictModel):

@@ -23,12 +23,12 @@ BUDGETS_S = {
     "doctor": 15,
     "shaders": 110,
     "pictures": 80,
-    "speed": 110,
+    "speed": 90,
     "leaks": 30,
     "memory": 20,
     "tests": 80,
     "slow-tests": 15,
-    "quality": 5,
+    "quality": 25,
 }
 """In the order in which they are taken: first what the driver compiles for all, then by worth."""
 STEPS = [

@@ -23,9 +23,11 @@ METHODS = ("exact", "paper", "dlpv", "differential", "dlpv-paper", "aroof")
 `none` is left out: it draws the objects as `exact` does, so each of its stages runs, and leaves its light on the real
 scene out of the composition.
 """
+RATED = METHODS[:-1]  # `aroof` would compute longest before its picture
 NEEDLESS_CHECKS = ("packages to serve",)  # of doctor: what rendering does without
 SIZES = {"640x480, 64^3": ((640, 480), 64), "1280x720, 256^3": ((1280, 720), 256)}
 SPEED_FRAMES = 12  # of each motion, after those that warm up
+QUALITY_LOSS_DB = 1.0  # beside software, whose cones and shadow maps are coarser
 LEAK_ROUNDS = 3
 LEAK_FRAMES = 4
 
@@ -194,9 +196,21 @@ def _tests(findings: Findings, marked: str) -> str:
     return run_tests(findings, marked)
 
 
-def quality(findings: Findings) -> str:  # noqa: ARG001
-    """Leave the comparison with truth to machines that can render truth: none is part of the project."""
-    raise Skipped("no truth beside this machine; `deltalight bench quality` renders it with Mitsuba")
+def quality(findings: Findings) -> str:
+    """Compare methods' pictures of a stored scene with path-traced truth, on what the objects change."""
+    from deltalight.benchmarks.gpu_check.stored_truth import StoredTruth
+
+    truth = StoredTruth.unpacked(findings.scratch / "truth")
+    measured = dict[str, float]()
+    with opened_context() as gpu:
+        for number, method in enumerate(RATED, start=1):
+            with _noting(findings, method):
+                measured[method] = round(truth.psnr_db(gpu, method), 2)
+                expected = truth.about["psnr_db"][method]
+                if measured[method] < expected - QUALITY_LOSS_DB:
+                    findings.fault(f"{method}: {measured[method]} dB, in software {expected}")
+            findings.keep(_not_yet(RATED[number:]), changed_psnr_db=measured)
+    return f"{truth.about['scene']}: " + ", ".join(f"{name} {db:.1f} dB" for name, db in measured.items())
 
 
 def _rendered(gpu: "GpuContext", method: str, folder: Path) -> "SceneRenderer":

@@ -10,7 +10,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
-from deltalight.protocol.scene_objects import Region, Surface
+from deltalight.protocol.scene_objects import Region, SheetRegion, Surface
 from deltalight.render_server.scene.depth_surface import DepthSurface
 
 MAX_SURFACES = 16
@@ -33,8 +33,8 @@ class SurfaceTable:
     (roughness, 0, 0, 0); (albedo R G B, 1 if declared); and two for the region, whose kind is the last component of
     the first. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper corner, 0); 2
     material of the given model: (its index, 0, 0, kind), zeros; 3 diffuse sheet in the plane z = 0: (centre x, y,
-    tolerance, kind), (unit direction of an edge x, y, half the edge, half the other edge). The board's paper and its
-    grey cards are sheets, and come first.
+    tolerance, kind), (unit direction of an edge x, y, half the edge, half the other edge). The board's paper, its
+    grey cards and declared sheets come first.
     """
 
     packed: Float32[np.ndarray, "n 5 4"]
@@ -110,7 +110,8 @@ def build_surface_table(
             f"real.surfaces has {len(surfaces)} entries; declare at most {MAX_SURFACES}, no diffuse ones."
         )
     rows = [] if board is None else [_sheet_row(quad) for quad in _sheets(board)]
-    rows += [_row(surface, material_names) for surface in surfaces]
+    rows += [_sheet_row(_outline(each.region.sheet)) for each in surfaces if each.region.sheet is not None]
+    rows += [_row(surface, material_names) for surface in surfaces if surface.region.sheet is None]
     return SurfaceTable(np.array(rows, np.float32).reshape(-1, 5, 4))
 
 
@@ -202,6 +203,15 @@ def _plane_fit(row: Float64[np.ndarray, "5 4"], seen: _Seen, noise_sigma: float)
 def _sheets(board: BoardSpec) -> list[Float64[np.ndarray, "4 3"]]:
     """Returns the outlines of the board's paper and of the grey cards."""
     return [board.paper_outline(), *(card.outline() for card in board.grey_cards)]
+
+
+def _outline(sheet: SheetRegion) -> Float64[np.ndarray, "4 3"]:
+    """Returns the corners of a declared sheet, world, m."""
+    turn = np.radians(sheet.turn_deg)
+    edge = np.array([np.cos(turn), np.sin(turn), 0.0]) * sheet.size_m[0] / 2
+    other = np.array([-np.sin(turn), np.cos(turn), 0.0]) * sheet.size_m[1] / 2
+    middle = np.array([*sheet.middle_m, 0.0])
+    return middle + np.stack([-edge - other, edge - other, edge + other, other - edge])
 
 
 def _sheet_row(outline: Float64[np.ndarray, "4 3"]) -> list[list[float]]:

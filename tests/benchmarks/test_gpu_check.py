@@ -28,7 +28,10 @@ from deltalight.benchmarks.gpu_check.plan import BUDGETS_S, MACHINE, STEPS, Step
 from deltalight.benchmarks.gpu_check.processes import spread
 from deltalight.benchmarks.gpu_check.record import Findings, Record, State
 from deltalight.benchmarks.gpu_check.report import Report
+from deltalight.benchmarks.gpu_check.steps import RATED
+from deltalight.benchmarks.gpu_check.stored_truth import FILE, REFERENCE_FILE, StoredTruth
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.pictures import decode_rgb
 from deltalight.render_server.gpu.context import GpuContext, SharedPrograms
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.services.cli import run
@@ -180,9 +183,33 @@ def test_the_command_takes_chosen_steps_in_software(tmp_path: Path) -> None:
     assert done.stdout.startswith("gpu-check: no step failed on llvmpipe")
     steps = written(tmp_path)["steps"]
     assert steps["doctor"]["figures"]["checks"][0]["name"] == "python"
-    assert steps["quality"]["state"] == "skipped"
-    assert "no truth beside this machine" in steps["quality"]["sentence"]
+    assert steps["quality"]["state"] == "passed"
+    assert steps["quality"]["sentence"].startswith("two_lights: exact ")
     assert {path.name for path in tmp_path.iterdir()} == {"report.json", "report.md", "output.log"}
+
+
+def test_stored_truth_tells_how_good_a_picture_is(tmp_path: Path) -> None:
+    """Truth itself is perfect, the camera's picture far off, and a shift by two codes what it is."""
+    truth = StoredTruth.unpacked(tmp_path)
+    reference = decode_rgb((tmp_path / REFERENCE_FILE).read_bytes(), REFERENCE_FILE)
+    assert truth.psnr_of(reference) > 100
+    assert truth.psnr_of(truth.view.color) < 25
+    off = np.where(reference > 127, reference - 2, reference + 2).astype(np.uint8)
+    assert truth.psnr_of(off) == pytest.approx(20 * np.log10(255 / 2))
+    assert 0.02 < truth.changed.mean() < 0.5
+    assert FILE.stat().st_size < 1_000_000
+    assert set(truth.about["psnr_db"]) == set(RATED)
+
+
+def test_a_method_that_became_worse_fails_the_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = {"exact": 37.0, "paper": 12.0}
+    monkeypatch.setattr(StoredTruth, "psnr_db", lambda _self, _gpu, method: measured.get(method, 99.0))
+    step = findings(tmp_path)
+    take_step("deltalight.benchmarks.gpu_check.steps:quality", step)
+    assert step.record.state is State.FAILED
+    (fault,) = step.record.faults
+    assert fault.startswith("paper: 12.0 dB, in software 29.")
+    assert step.record.figures["changed_psnr_db"]["exact"] == 37.0
 
 
 @pytest.mark.usefixtures("one_picture")

@@ -62,6 +62,15 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
         {"real": {"surfaces": [{"region": {"plane": {}, "box": {}}}]}},
         r"real\.surfaces\[0\]\.region.*exactly one",
     ),
+    (
+        {
+            "real": {
+                "surfaces": [{"region": {"sheet": {"middle_m": [0, 0], "size_m": [1, 1]}}, "specular": 1}]
+            }
+        },
+        r"real\.surfaces\[0\].*a sheet is diffuse: leave out roughness, metallic, specular and albedo",
+    ),
+    ({"real": {"surfaces": [{"region": {"sheet": {"middle_m": [0, 0], "size_m": [1, 0]}}}]}}, "size_m"),
     ({"real": {"surfaces": [{"region": {"box": {"min_m": [1, 0, 0], "max_m": [0, 1, 1]}}}]}}, "min_m"),
     ({"method": {"volume_size": 65}}, r"method\.volume_size.*multiple of 8"),
     ({"method": {"name": "dvct", "volume_size": 520}}, r"method\.volume_size.*512"),

@@ -138,6 +138,27 @@ def test_the_boards_paper_and_its_cards_are_as_without_the_declared_table(
     assert (declared[~paper] != undeclared[~paper]).any()
 
 
+@pytest.mark.parametrize("noise_m", [0.0005, 0.004])
+def test_a_declared_sheet_is_no_mirror(gpu: GpuContext, stage: Stage, noise_m: float) -> None:
+    """Thinner than depth shows and turned on the table: by its outline alone; beside it the table mirrors."""
+    bare = silver(glowing_ball(stage))
+    sheet = {"middle_m": [0.05, -0.2], "size_m": [0.12, 0.07], "turn_deg": 30.0}
+    declared = Surface.model_validate({"region": {"sheet": sheet}})
+    document = bare.replaced(real=bare.real.replaced(surfaces=(*bare.real.surfaces, declared)))
+    turn = np.radians(30)
+    edge, other = np.array([np.cos(turn), np.sin(turn), 0]), np.array([-np.sin(turn), np.cos(turn), 0])
+    corners = [
+        np.array([0.05, -0.2, 0]) + a * 0.06 * edge + b * 0.035 * other
+        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    covered = inside(np.array(corners))
+    view = measured(floor_depth(look_at()), noise_m)
+    without, with_sheet = (mirrored(gpu, each, view) for each in (bare, document))
+    assert (without[covered] > 0.5).sum() > 50
+    assert not with_sheet[covered].any()
+    np.testing.assert_allclose(with_sheet[~covered], without[~covered], rtol=HALF_FLOAT_STEP)
+
+
 def test_a_flat_thing_on_the_table_is_no_mirror(gpu: GpuContext, stage: Stage) -> None:
     """12 mm high within a tolerance of 20 mm, which noise of 1 mm does not explain; the table around it mirrors."""
     document = silver(glowing_ball(stage))

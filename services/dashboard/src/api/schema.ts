@@ -3394,7 +3394,7 @@ export interface components {
         };
         /**
          * Region
-         * @description Where a real surface is: exactly one of plane, box, material; without any, the board's plane.
+         * @description Where a real surface is: exactly one of plane, box, sheet, material; without any, the board's plane.
          */
         readonly Region: {
             /** @description Points in a box. */
@@ -3406,6 +3406,8 @@ export interface components {
             readonly material?: string | null;
             /** @description Points near a plane. */
             readonly plane?: components["schemas"]["PlaneRegion"] | null;
+            /** @description A diffuse sheet on the board's plane; it lies on every declared surface. */
+            readonly sheet?: components["schemas"]["SheetRegion"] | null;
         };
         /**
          * ReplayAnswer
@@ -3820,6 +3822,34 @@ export interface components {
              * @default 40
              */
             readonly samples: number;
+        };
+        /**
+         * SheetRegion
+         * @description A rectangle on the board's plane (world z = 0), thinner than depth shows: paper, a cloth, a mat.
+         */
+        readonly SheetRegion: {
+            /**
+             * Middle M
+             * @description Its middle, world x and y, metres.
+             */
+            readonly middle_m: readonly [
+                number,
+                number
+            ];
+            /**
+             * Size M
+             * @description Lengths of its edges, metres.
+             */
+            readonly size_m: readonly [
+                number,
+                number
+            ];
+            /**
+             * Turn Deg
+             * @description Turn of its first edge from world x towards y, degrees.
+             * @default 0
+             */
+            readonly turn_deg: number;
         };
         /**
          * ShelfAnswer
@@ -4362,6 +4392,7 @@ export type SceneObject = components['schemas']['SceneObject'];
 export type SceneSummary = components['schemas']['SceneSummary'];
 export type Settings = components['schemas']['Settings'];
 export type Shading = components['schemas']['Shading'];
+export type SheetRegion = components['schemas']['SheetRegion'];
 export type ShelfAnswer = components['schemas']['ShelfAnswer'];
 export type ShownScene = components['schemas']['ShownScene'];
 export type SlotStatus = components['schemas']['SlotStatus'];

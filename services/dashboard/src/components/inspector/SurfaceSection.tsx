@@ -16,7 +16,7 @@ interface SurfaceSectionProps {
 
 /** One declared surface of the real scene: where it is and how it shines. */
 export function SurfaceSection({ index, surface, onChange, disabled }: SurfaceSectionProps) {
-  const { plane, box, material } = surface.region ?? {};
+  const { plane, box, sheet, material } = surface.region ?? {};
   const set = (values: Partial<Surface>): void => void onChange({ ...surface, ...values });
   const setPlane = (values: { point_m?: Vector; normal?: Vector; tolerance_m?: number }): void => {
     if (plane) set({ region: { plane: { ...plane, ...values } } });
@@ -80,17 +80,19 @@ export function SurfaceSection({ index, surface, onChange, disabled }: SurfaceSe
         </>
       )}
       {material && <p class="quiet small">Material “{material}” of the given model</p>}
-      {(["roughness", "metallic", "specular"] as const).map((key) => (
-        <SliderField
-          key={key}
-          label={key.charAt(0).toUpperCase() + key.slice(1)}
-          value={surface[key]}
-          onChange={(value) => set({ [key]: value })}
-          min={0}
-          max={1}
-          disabled={disabled}
-        />
-      ))}
+      {sheet && <p class="quiet small">A matte sheet on the board's plane</p>}
+      {!sheet &&
+        (["roughness", "metallic", "specular"] as const).map((key) => (
+          <SliderField
+            key={key}
+            label={key.charAt(0).toUpperCase() + key.slice(1)}
+            value={surface[key]}
+            onChange={(value) => set({ [key]: value })}
+            min={0}
+            max={1}
+            disabled={disabled}
+          />
+        ))}
     </Section>
   );
 }

@@ -120,6 +120,7 @@ function LightItems() {
 }
 
 function regionText({ region }: Surface): string {
+  if (region?.sheet) return "sheet";
   return region?.material ?? (region?.box ? "box" : "plane");
 }
 
