@@ -1,5 +1,7 @@
 """Geometry buffers: what a camera sees of a mesh at each texel of a raster."""
 
+import moderngl
+
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Drawable, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
@@ -9,7 +11,8 @@ from deltalight.render_server.view import CameraView, Rectangle
 class GeometryBuffer:
     """World position + depth (RGBA32F, w = 0: nothing), normal + material (RGBA16F), uv, vertex colour.
 
-    Of materials with maps, what these give stands in place of uv and vertex colour (common/shown_maps.glsl).
+    Of materials with maps, what these give stands in place of uv and vertex colour (common/shown_maps.glsl), and if
+    any of them is coated, `coating` (RGBA32F) holds what they give of coats and sheens.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
@@ -21,6 +24,9 @@ class GeometryBuffer:
         self._depth = gpu.ctx.depth_renderbuffer(size)
         self.framebuffer = gpu.ctx.framebuffer([self.position, self.normal, self.uv, self.tint], self._depth)
         self._places = gpu.ctx.framebuffer([self.position], self._depth)
+        self._gpu = gpu
+        self.coating: moderngl.Texture | None = None
+        self._coated: moderngl.Framebuffer | None = None
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -30,7 +36,16 @@ class GeometryBuffer:
             "virtual_raster_normal": self.normal,
             "virtual_raster_uv": self.uv,
             "virtual_raster_tint": self.tint,
+            "virtual_raster_coating": self.coating,
         }
+
+    def coated(self) -> moderngl.Framebuffer:
+        """Returns its framebuffer with `coating`."""
+        if self._coated is None:
+            self.coating = texture_2d(self._gpu, self.size, 4, "f4")
+            textures = [self.position, self.normal, self.uv, self.tint, self.coating]
+            self._coated = self._gpu.ctx.framebuffer(textures, self._depth)
+        return self._coated
 
     def clear(self) -> None:
         """Clears it."""
@@ -46,7 +61,9 @@ class GeometryBuffer:
         """Frees the GL objects."""
         release_target(self.framebuffer)
         release_target(self._places)
-        release_all(self._depth, self.position, self.normal, self.uv, self.tint)
+        if self._coated is not None:
+            release_target(self._coated)
+        release_all(self._depth, self.position, self.normal, self.uv, self.tint, self.coating)
 
 
 class RasterGeometry:
@@ -75,7 +92,7 @@ class RasterGeometry:
         else:
             target.clear_positions(rectangle)
         self._kernel.draw(
-            target.framebuffer,
+            target.coated() if scene["PACKS_COATING"] else target.framebuffer,
             mesh,
             scene,
             clip_from_camera=view.clip_from_camera_at(offset),

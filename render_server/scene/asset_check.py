@@ -27,8 +27,10 @@ _INDEX_TYPES = (5121, 5123, 5125)
 DRAWN_EXTENSIONS = frozenset(
     {
         "EXT_texture_webp",
+        "KHR_materials_clearcoat",
         "KHR_materials_emissive_strength",
         "KHR_materials_ior",
+        "KHR_materials_sheen",
         "KHR_materials_specular",
         "KHR_materials_transmission",
         "KHR_materials_unlit",
@@ -42,11 +44,9 @@ LEFT_OUT_EXTENSIONS = frozenset(
     {
         "KHR_lights_punctual",
         "KHR_materials_anisotropy",
-        "KHR_materials_clearcoat",
         "KHR_materials_diffuse_transmission",
         "KHR_materials_dispersion",
         "KHR_materials_iridescence",
-        "KHR_materials_sheen",
         "KHR_materials_variants",
     }
 )

@@ -1,6 +1,7 @@
 """glTF materials as they are drawn: closed forms of plates with textures."""
 
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +57,11 @@ Draw = Callable[..., np.ndarray]
 def draw(objects: ObjectsRenderer, tmp_path: Path) -> Draw:
     """Draws a plate under some lights; returns the linear picture."""
 
+    numbers = count()  # of files: renderers keep an asset that they loaded
+
     def drawn(plate: Plate, lights: list[dict[str, Any]] | None = None) -> np.ndarray:
         stage = Stage(tmp_path)
-        asset = {"asset": str(plate.write(tmp_path / "plate.glb")), "up_axis": "z"}
+        asset = {"asset": str(plate.write(tmp_path / f"plate{next(numbers)}.glb")), "up_axis": "z"}
         return objects.linear(unlit(stage.document([asset], lights or [])), seen_from_above())
 
     return drawn
@@ -369,4 +372,4 @@ def test_users_read_what_of_a_file_is_left_out(objects: ObjectsRenderer, draw: D
     made = plate()
     made.glb.document["extensionsUsed"] = ["KHR_lights_punctual"]
     draw(made, [directional()])
-    assert objects.renderer.notices[-1].endswith("plate.glb is shown without KHR_lights_punctual.")
+    assert objects.renderer.notices[-1].endswith("plate0.glb is shown without KHR_lights_punctual.")

@@ -14,6 +14,9 @@ layout(location = 0) out vec4 out_position;
 layout(location = 1) out vec4 out_normal;
 layout(location = 2) out vec2 out_uv;
 layout(location = 3) out vec4 out_tint;
+#ifdef PACKS_COATING
+layout(location = 4) out vec4 out_coating;
+#endif
 
 Fragment interpolated() {
     vec3 right = dFdx(world), down = dFdy(world), across = cross(right, down), view = camera_position - world;
@@ -47,4 +50,7 @@ void main() {
     out_normal = s.normal;
     out_uv = s.uv;
     out_tint = s.tint;
+#ifdef PACKS_COATING
+    out_coating = s.coating;
+#endif
 }

@@ -37,6 +37,14 @@ ShownMaps fragment_maps(Fragment f, bool wanted) {
     return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, glow);
 }
 
+#ifdef COATED
+Coating fragment_coating(Fragment f, bool wanted) {
+    MaterialEntry e = materials[f.material];
+    return mapped_coating(e, map_here(data_maps, f, e.maps[COAT], wanted).r, map_here(data_maps, f, e.maps[COAT_ROUGHNESS], wanted).g,
+        map_here(color_maps, f, e.maps[SHEEN], wanted).rgb, map_here(color_maps, f, e.maps[SHEEN_ROUGHNESS], wanted).a);
+}
+#endif
+
 float fragment_opacity(Fragment f) {
     MaterialEntry e = materials[f.material];
     return e.alpha.y * map_here(color_maps, f, e.maps[BASE_COLOR], true).a;
