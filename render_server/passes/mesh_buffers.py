@@ -34,7 +34,7 @@ BVH_ROW_BYTES = 1024 * TEXEL_BYTES
 # hierarchy may become half as expensive again before it is rebuilt.
 WORN = 1.5
 
-BASE_MAPS, ALL_MAPS = 5, 10  # of a material, as materials.glsl has them
+BASE_MAPS, ALL_MAPS = 5, 13  # of a material, as materials.glsl has them
 
 NO_CUTOUTS: Bindings = {"CUTOUTS": False}
 NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
@@ -255,16 +255,16 @@ class MaterialTable:
         self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
         self.smoothest = _smoothest(mesh)
         self.smoothest_coat = _smoothest_coat(mesh)
-        self._is_coated = draws_maps and any(material.is_coated for material in mesh.materials)
+        self._is_extended = draws_maps and any(material.is_extended for material in mesh.materials)
         self.transmits = any(material.transmits for material in mesh.materials)
         self._colors = self._data = None
         table = mesh.material_table
-        if self._is_coated:
+        if self._is_extended:
             table = np.hstack([table, coating_table(mesh.materials)])
         if self._has_maps:
             self._colors = MapArray(gpu, [each for each in maps if each.is_color], "f2")
             self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
-            count = ALL_MAPS if self._is_coated else BASE_MAPS
+            count = ALL_MAPS if self._is_extended else BASE_MAPS
             table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer, count)])
             for row, material in zip(table, mesh.materials, strict=True):
                 if material.maps_by_light:
@@ -287,8 +287,8 @@ class MaterialTable:
             "data_maps": None if self._data is None else self._data.texture,
             "MATERIAL_MAPS": self._has_maps,
             "CUTOUTS": self._has_cutouts,
-            "COATED": self._is_coated,
-            "PACKS_COATING": self._is_coated and self._has_maps,
+            "EXTENDED": self._is_extended,
+            "PACKS_EXTENDED": self._is_extended and self._has_maps,
             "TRANSMISSION": self.transmits,
             "Transmittances": self._transmittances,
             "MEASURED": self._measured is not None,

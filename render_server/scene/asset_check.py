@@ -51,12 +51,6 @@ LEFT_OUT_EXTENSIONS = frozenset(
     }
 )
 
-_LEFT_OUT_TEXTURES = {
-    "KHR_materials_specular": ("specularTexture", "specularColorTexture"),
-    "KHR_materials_transmission": ("transmissionTexture",),
-    "KHR_materials_volume": ("thicknessTexture",),
-}
-
 
 def check_mesh_file(path: Path) -> str:
     """Returns the suffix of a mesh file that exists, is of a known type and not too large.
@@ -103,10 +97,6 @@ def read_gltf(path: Path) -> GltfDocument:
 def left_out(gltf: GltfDocument) -> str | None:
     """Returns a sentence about what a document uses and no picture shows; None if that is nothing."""
     names = [str(name) for name in gltf.root.get("extensionsUsed", []) if name not in DRAWN_EXTENSIONS]
-    used = [each.get("extensions", {}) for each in gltf.entries("materials")]
-    for extension, textures in _LEFT_OUT_TEXTURES.items():
-        if any(texture in each.get(extension, {}) for each in used for texture in textures):
-            names.append(f"the textures of {extension}")
     if any(_has_vertex_alpha(gltf, part) for mesh in gltf.entries("meshes") for part in mesh["primitives"]):
         names.append("the alpha of its vertex colours")
     return f"{gltf.path} is shown without {', '.join(dict.fromkeys(names))}." if names else None

@@ -79,13 +79,16 @@ class Material:
     coat_normal_map: TextureMap | None = None
     sheen_map: TextureMap | None = None
     sheen_roughness_map: TextureMap | None = None
+    specular_map: TextureMap | None = None
+    specular_color_map: TextureMap | None = None
+    transmission_map: TextureMap | None = None
     measured: GaussianBrdf | None = None
     by_light: TextureByLight | None = None
     name: str = ""
 
     @property
     def maps(self) -> tuple[TextureMap | None, ...]:
-        """Its maps, in the order of the shaders' table; those of what lies over the base come last."""
+        """Its maps, in the order of the shaders' table; those of extensions come last."""
         return (
             self.base_color_map,
             self.metallic_roughness_map,
@@ -97,12 +100,21 @@ class Material:
             self.coat_normal_map,
             self.sheen_map,
             self.sheen_roughness_map,
+            self.specular_map,
+            self.specular_color_map,
+            self.transmission_map,
         )
 
     @property
     def is_coated(self) -> bool:
         """Whether a coat or a sheen lies over its base."""
         return self.coat > 0 or bool(np.any(self.sheen > 0))
+
+    @property
+    def is_extended(self) -> bool:
+        """Whether it is coated, or has maps of what its dielectric part reflects and lets through."""
+        of_dielectric = self.specular_map, self.specular_color_map, self.transmission_map
+        return self.is_coated or any(each is not None for each in of_dielectric)
 
     @property
     def has_second_uv(self) -> bool:
@@ -149,7 +161,10 @@ class Material:
 
     def mean_transmittance(self, path_m: float) -> Float32[np.ndarray, "3"]:
         """Returns what passes of light at normal incidence: two surfaces and a path between, or a thin one; R G B."""
-        entered = (1 - self.dielectric_f0) * self.base_color * (self.transmission * (1 - self.metallic))
+        through = self.transmission * (1 - self.metallic)
+        if self.transmission_map is not None:
+            through *= float(self.transmission_map.texels[..., 0].mean()) / 255
+        entered = (1 - self.dielectric_f0) * self.base_color * np.float32(through)
         return np.asarray(
             entered ** (1 if self.is_thin else 2) * np.exp(-self.absorption_per_m * np.float32(path_m)),
             np.float32,
@@ -208,7 +223,7 @@ class Material:
         extensions = description.get("extensions", {})
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         specular = extensions.get("KHR_materials_specular", {})
-        transmission = extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0)
+        transmission = extensions.get("KHR_materials_transmission", {})
         volume = extensions.get("KHR_materials_volume", {})
         coat = extensions.get("KHR_materials_clearcoat", {})
         sheen = extensions.get("KHR_materials_sheen", {})
@@ -220,7 +235,7 @@ class Material:
             ior=extensions.get("KHR_materials_ior", {}).get("ior"),
             f0_tint=_f0_tint(specular),
             emission=np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
-            transmission=float(transmission),
+            transmission=float(transmission.get("transmissionFactor", 0.0)),
             is_thin=not volume.get("thicknessFactor", 0.0),
             attenuation_color=np.array(volume.get("attenuationColor", [1, 1, 1]), np.float32),
             attenuation_distance_m=float(volume.get("attenuationDistance", math.inf)),
@@ -238,6 +253,9 @@ class Material:
             coat_normal_map=textures.data(coat.get("clearcoatNormalTexture"), "scale"),
             sheen_map=textures.color(sheen.get("sheenColorTexture"), with_alpha=True),
             sheen_roughness_map=textures.color(sheen.get("sheenRoughnessTexture"), with_alpha=True),
+            specular_map=textures.color(specular.get("specularTexture"), with_alpha=True),
+            specular_color_map=textures.color(specular.get("specularColorTexture"), with_alpha=True),
+            transmission_map=textures.data(transmission.get("transmissionTexture")),
             name=str(description.get("name", "")),
         )
         mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
@@ -275,6 +293,9 @@ class Material:
         """Returns the material that glows with its base colour instead of being lit (KHR_materials_unlit)."""
         return replace(
             self._bare(),
+            specular_map=None,
+            specular_color_map=None,
+            transmission_map=None,
             base_color=np.zeros(3, np.float32),
             coat=0.0,
             sheen=np.zeros(3, np.float32),

@@ -69,7 +69,7 @@ MEASURED = (
     Case("paper", "depth", "mirror"),
     Case("dlpv", "model", "mirror"),
 )
-COATED: dict[Case, dict[str, Any]] = {
+EXTENDED: dict[Case, dict[str, Any]] = {
     Case("exact", "depth", "mirror"): {},
     Case("exact", "depth", "antialiased"): {"quality": "live"},
     Case("paper", "depth", "mirror"): {},
@@ -82,7 +82,7 @@ SEVERAL = [Case(method, "depth", "plain") for method in ("exact", "paper", "diff
 SURFACES = [  # what materials are shaded by maps of light
     dict.fromkeys(switches, 1)
     for count in range(4)
-    for switches in combinations(("COATED", "MATERIAL_MAPS", "MEASURED"), count)
+    for switches in combinations(("EXTENDED", "MATERIAL_MAPS", "MEASURED"), count)
 ]
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
@@ -255,7 +255,7 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
     **{f"{case} measured": partial(render_measured, case, {}) for case in MEASURED},
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
-    **{f"{case} coated": partial(render_coated, case, changes) for case, changes in COATED.items()},
+    **{f"{case} coated": partial(render_coated, case, changes) for case, changes in EXTENDED.items()},
     **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
     "objects far apart": render_apart,
     "objects far apart, live": partial(render_apart, quality="live"),

@@ -24,7 +24,7 @@ UNREAD: Bindings = {
     "Materials": None,
     "MATERIAL_MAPS": False,
     "CUTOUTS": False,
-    "COATED": False,
+    "EXTENDED": False,
 }  # what the surface at a hit is like
 
 

@@ -56,8 +56,8 @@ def reflected(
     ]
     surfaces = np.array(rows, np.float32)
     given, found = gpu.ctx.buffer(surfaces.tobytes()), gpu.ctx.buffer(reserve=16 * len(surfaces))
-    kernel = Kernel(gpu, Path(__file__).with_name("coated_furnace"), COATED=1)
-    switches = {"COATED": True, "MATERIAL_MAPS": False, "MEASURED": False}
+    kernel = Kernel(gpu, Path(__file__).with_name("coated_furnace"), EXTENDED=1)
+    switches = {"EXTENDED": True, "MATERIAL_MAPS": False, "MEASURED": False}
     kernel.run((len(surfaces),), Surfaces=given, Found=found, count=len(surfaces), **switches)
     values = np.frombuffer(found.read(), np.float32).reshape(-1, 4)[:, :3].copy()
     for item in (given, found, kernel):

@@ -115,6 +115,39 @@ def test_a_texture_of_roughness_and_metal_is_as_the_factors(draw: Draw) -> None:
     assert pictures[0].max() > 1.5 * np.median(pictures[0]), "a highlight is seen"
 
 
+SPECULAR: dict[str, tuple[dict[str, Any], dict[str, tuple[int, ...]]]] = {
+    "specular": (
+        {
+            "specularFactor": 0.8 * 128 / 255,
+            "specularColorFactor": [float(LINEAR[code]) for code in (200, 150, 90)],
+        },
+        {"specularTexture": (0, 0, 0, 128), "specularColorTexture": (200, 150, 90)},
+    ),
+    "transmission": ({"transmissionFactor": 0.8 * 128 / 255}, {"transmissionTexture": (128, 0, 0)}),
+}
+
+
+@pytest.mark.parametrize("name", SPECULAR)
+def test_textures_of_specular_and_transmission_are_as_the_factors(draw: Draw, name: str) -> None:
+    """A dark plate under a lamp, whose highlight is seen; a pale one, whose diffuse part is what does not pass."""
+    lights = [directional((0.05, 0.02, -1.0), 4.0, 2.0), ambient(0.3)]
+    factors, textures = SPECULAR[name]
+    color = 0.0 if name == "specular" else 0.8
+    pictures = []
+    for is_texture in (True, False):
+        made = plate()
+        pbr = {"baseColorFactor": [color] * 3 + [1], "metallicFactor": 0, "roughnessFactor": 0.4}
+        given = {f"{name}Factor": 0.8, **{key: made.texture(even(*code)) for key, code in textures.items()}}
+        extension = {f"KHR_materials_{name}": given if is_texture else factors}
+        made.material = {
+            "pbrMetallicRoughness": pbr,
+            "extensions": {"KHR_materials_ior": {"ior": 1.8}, **extension},
+        }
+        pictures.append(draw(made, lights)[INSIDE])
+    assert pictures[0] == pytest.approx(pictures[1], rel=0.02, abs=1e-3)
+    assert pictures[1].max() > 0.05
+
+
 def lambert(normal: Any) -> float:  # noqa: ANN401
     """Radiance of a white plate of that normal in the oblique light."""
     normal = np.array(normal) / np.linalg.norm(normal)

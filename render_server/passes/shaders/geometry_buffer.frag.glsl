@@ -14,8 +14,8 @@ layout(location = 0) out vec4 out_position;
 layout(location = 1) out vec4 out_normal;
 layout(location = 2) out vec2 out_uv;
 layout(location = 3) out vec4 out_tint;
-#ifdef PACKS_COATING
-layout(location = 4) out vec4 out_coating;
+#ifdef PACKS_EXTENDED
+layout(location = 4) out uvec4 out_extended;
 #endif
 
 Fragment interpolated() {
@@ -50,7 +50,7 @@ void main() {
     out_normal = s.normal;
     out_uv = s.uv;
     out_tint = s.tint;
-#ifdef PACKS_COATING
-    out_coating = s.coating;
+#ifdef PACKS_EXTENDED
+    out_extended = s.extended;
 #endif
 }

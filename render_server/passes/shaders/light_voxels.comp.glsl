@@ -31,7 +31,7 @@
 #endif
 #ifdef VIRTUAL
 #include "common/materials.glsl"
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/coating.glsl"
 #endif
 #endif
@@ -157,7 +157,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 diffuse = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness);
     vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(WHITEST));
     bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
-#ifdef COATED
+#ifdef EXTENDED
     albedo = min(mean_coated_reflectance(m, albedo), vec3(WHITEST));
 #endif
     vec3 carried = in_beams ? (albedo - min(diffuse, albedo)) * surfel_light(own, DIRECT_RHO).rgb : vec3(0.0);

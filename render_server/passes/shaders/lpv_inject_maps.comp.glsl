@@ -5,7 +5,7 @@
 #include "common/light_rays.glsl"
 #ifndef REAL
 #include "common/materials.glsl"
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/coating.glsl"
 #endif
 #endif
@@ -39,7 +39,7 @@ vec3 virtual_albedo(ivec2 texel) {
     bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // beams carry these
     vec3 lobe = in_beams ? vec3(0.0) : mean_specular_reflectance(m.f0, m.roughness);
     vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + lobe;
-#ifdef COATED
+#ifdef EXTENDED
     albedo = mean_coated_reflectance(m, albedo);
 #endif
     return albedo;

@@ -11,7 +11,7 @@
 #include "common/shown_pixels.glsl"
 #include "common/walk.glsl"
 #include "common/surface_change.glsl"
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/shown_coating.glsl"
 #endif
 
@@ -85,7 +85,7 @@ vec4 lobe_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, b
     return seen;
 }
 
-#ifdef COATED
+#ifdef EXTENDED
 // The same of a rougher lobe too, by one cone through voxels.
 vec4 any_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bool of_coat, bool wanted) {
     if (roughness < ROUGHEST) return lobe_reflection(pixel, position, normal, roughness, of_coat, wanted ? CONE_COUNT : 1);

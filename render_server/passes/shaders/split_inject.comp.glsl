@@ -8,7 +8,7 @@
 #include "common/even_noise.glsl"
 #ifdef VIRTUAL
 #include "common/materials.glsl"
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/coating.glsl"
 #endif
 #endif
@@ -95,7 +95,7 @@ vec3 virtual_albedo(ivec2 texel) {
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z), 0.0);
     vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
-#ifdef COATED
+#ifdef EXTENDED
     albedo = mean_coated_reflectance(m, albedo);
 #endif
     return albedo;

@@ -68,7 +68,7 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
 #endif
 
 #ifndef REAL
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/shown_coating.glsl"
 
 // A cone for the base's lobe and one for the coat's, weighted by what they reflect.
@@ -107,7 +107,7 @@ void trace(ivec2 texel) {
     }
 #endif
 #ifndef REAL
-#ifdef COATED
+#ifdef EXTENDED
     if (s.roughness >= 0.0) {
         c_rho = coated_specular(texel, s, q);
         s.roughness = -1.0;

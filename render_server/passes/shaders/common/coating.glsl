@@ -1,4 +1,4 @@
-// A clear coat over a sheen over a base (docs/method.md 4.12). Needs brdf.glsl, and materials.glsl with COATED.
+// A clear coat over a sheen over a base (docs/method.md 4.12). Needs brdf.glsl, and materials.glsl with EXTENDED.
 const vec3 COAT_F0 = vec3(0.04);            // of index 1.5
 const float LEAST_SHEEN_ROUGHNESS = 0.1;    // smoother fibres show at outlines only, and would reflect more light than there is
 

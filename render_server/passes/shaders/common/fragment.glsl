@@ -3,7 +3,7 @@
 #include "common/shown_maps.glsl"
 #include "common/camera.glsl"
 #pragma switch CUTOUTS
-#pragma switch PACKS_COATING
+#pragma switch PACKS_EXTENDED
 #pragma switch MEASURED
 
 struct Fragment {
@@ -27,8 +27,8 @@ struct Fragment {
 
 struct Surface {   // as the geometry buffer's textures
     vec4 position; vec4 normal; vec2 uv; vec4 tint;
-#ifdef PACKS_COATING
-    vec4 coating;
+#ifdef PACKS_EXTENDED
+    uvec4 extended;
 #endif
 };
 
@@ -68,9 +68,9 @@ Surface surface_at(Fragment f, bool shows) {
     vec3 view = camera_position - f.world, n = facing_normal(f, view);
     vec2 uv = f.uv;
     vec4 tint = vec4(f.tint, 1.0);
-#ifdef PACKS_COATING
-    Coating over = fragment_coating(f, shows);
-    over.normal = bent_normal(f, materials[f.material].maps[COAT_NORMAL], n, normalize(view));
+#ifdef PACKS_EXTENDED
+    Extended extended = fragment_extended(f, shows);
+    extended.over.normal = bent_normal(f, materials[f.material].maps[COAT_NORMAL], n, normalize(view));
 #endif
 #ifdef MATERIAL_MAPS
     n = bent_normal(f, materials[f.material].maps[NORMAL], n, normalize(view));
@@ -84,8 +84,8 @@ Surface surface_at(Fragment f, bool shows) {
     s.normal = vec4(n, float(f.material));
     s.uv = uv;
     s.tint = tint;
-#ifdef PACKS_COATING
-    s.coating = pack_coating(over);
+#ifdef PACKS_EXTENDED
+    s.extended = pack_extended(extended);
 #endif
     return s;
 }

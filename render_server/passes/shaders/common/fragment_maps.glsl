@@ -37,11 +37,13 @@ ShownMaps fragment_maps(Fragment f, bool wanted) {
     return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, glow);
 }
 
-#ifdef COATED
-Coating fragment_coating(Fragment f, bool wanted) {
+#ifdef EXTENDED
+Extended fragment_extended(Fragment f, bool wanted) {
     MaterialEntry e = materials[f.material];
-    return mapped_coating(e, map_here(data_maps, f, e.maps[COAT], wanted).r, map_here(data_maps, f, e.maps[COAT_ROUGHNESS], wanted).g,
+    vec3 f0 = map_here(color_maps, f, e.maps[SPECULAR_COLOR], wanted).rgb * map_here(color_maps, f, e.maps[SPECULAR], wanted).a;
+    Coating over = mapped_coating(e, map_here(data_maps, f, e.maps[COAT], wanted).r, map_here(data_maps, f, e.maps[COAT_ROUGHNESS], wanted).g,
         map_here(color_maps, f, e.maps[SHEEN], wanted).rgb, map_here(color_maps, f, e.maps[SHEEN_ROUGHNESS], wanted).a);
+    return Extended(over, f0, map_here(data_maps, f, e.maps[TRANSMITTED], wanted).r);
 }
 #endif
 

@@ -1,6 +1,6 @@
 // What a virtual object's surface makes of light that was gathered for it (docs/method.md 4.7). Needs brdf.glsl.
 #include "common/materials.glsl"
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/coating.glsl"
 #endif
 #pragma switch MEASURED
@@ -22,7 +22,7 @@ vec3 with_gathered(vec3 radiance, Material m, vec3 n, vec3 v, Indirect indirect)
     indirect.irradiance *= m.occlusion;
     indirect.specular *= m.occlusion;
 #endif
-#ifdef COATED
+#ifdef EXTENDED
     Reflected r = reflected_towards(m, n, v);
     vec3 matt = r.sheen + m.diffuse * (r.below - r.lobe);
     return radiance + matt / PI * indirect.irradiance + (r.coat + r.lobe) * indirect.specular;
@@ -34,7 +34,7 @@ vec3 with_gathered(vec3 radiance, Material m, vec3 n, vec3 v, Indirect indirect)
 
 // What a surface sends of its own towards v.
 vec3 emitted(Material m, vec3 n, vec3 v) {
-#ifdef COATED
+#ifdef EXTENDED
     return reflected_towards(m, n, v).below * m.emission;
 #else
     return m.emission;

@@ -1,7 +1,7 @@
 // Materials of meshes. MATERIAL_MAPS: some have maps or alpha (scene/materials.py): two arrays of textures with mip levels.
-// COATED: a coat or a sheen lies over some (common/coating.glsl).
+// EXTENDED: a coat or a sheen lies over some (common/coating.glsl), or maps tell what their dielectric part reflects and lets through.
 #include "common/even_noise.glsl"
-#pragma switch COATED
+#pragma switch EXTENDED
 #ifndef MATERIAL_MAPS
 #pragma switch MATERIAL_MAPS
 #else
@@ -11,8 +11,8 @@ struct MapEntry {
     vec4 sampling;   // wraps (across + 3 down); columns, rows of an unfiltered texture, else 0; strength
 };
 #endif
-#ifdef COATED
-const int MAP_COUNT = 10;
+#ifdef EXTENDED
+const int MAP_COUNT = 13;
 
 // What lies over a base; `normal` is the coat's own, zero if it has the surface's.
 struct Coating { float coat; float roughness; vec3 normal; vec3 sheen; float sheen_roughness; };
@@ -25,7 +25,7 @@ struct MaterialEntry {
     vec4 emission;     // rgb radiance, camera units; transmission
     vec4 flags;        // double-sided; row + 1 of the measured, layer + 1 of a texture by light, 0: none; layers of a stack, -1: unlit
     vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
-#ifdef COATED
+#ifdef EXTENDED
     vec4 coat;         // fraction under the coat, its roughness; the sheen's
     vec4 sheen;        // rgb
 #endif
@@ -39,7 +39,7 @@ layout(std430) readonly buffer Materials { MaterialEntry materials[]; };
 // An unlit surface glows with its base colour, which the vertex colour multiplies.
 vec3 glow_tint(MaterialEntry e, vec3 tint) { return e.flags.w < 0.0 ? tint : vec3(1.0); }
 
-#ifdef COATED
+#ifdef EXTENDED
 Coating plain_coating(MaterialEntry e) { return Coating(e.coat.x, e.coat.y, vec3(0.0), e.sheen.rgb, e.coat.z); }
 #endif
 
@@ -50,8 +50,9 @@ uniform sampler2DArray color_maps;   // linear; a: alpha, of a mask the fraction
 uniform sampler2DArray data_maps;
 
 const int BASE_COLOR = 0, METALLIC_ROUGHNESS = 1, NORMAL = 2, OCCLUSION = 3, EMISSIVE = 4;
-#ifdef COATED
+#ifdef EXTENDED
 const int COAT = 5, COAT_ROUGHNESS = 6, COAT_NORMAL = 7, SHEEN = 8, SHEEN_ROUGHNESS = 9;
+const int SPECULAR = 10, SPECULAR_COLOR = 11, TRANSMITTED = 12;
 #endif
 const int CLAMPED = 1, MIRRORED = 2;   // wraps; 0 repeats
 const float MASKED = 1.0, BLENDED = 2.0;   // modes of alpha
@@ -60,7 +61,7 @@ const float COARSEST = 32.0;   // mip level: a texture's mean
 
 struct Material {
     vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; vec3 passing;
-#ifdef COATED
+#ifdef EXTENDED
     Coating over;
 #endif
 #ifdef MEASURED
@@ -85,7 +86,7 @@ Material mapped(MaterialEntry e, vec3 base, float metallic, float roughness, flo
     m.emission = e.emission.rgb * glow;
     m.occlusion = occlusion;
     m.passing = entering * e.emission.a;
-#ifdef COATED
+#ifdef EXTENDED
     m.over = plain_coating(e);
 #endif
 #ifdef MEASURED
@@ -130,7 +131,14 @@ float level_of(MaterialEntry e, sampler2DArray maps, float size) {
     return log2(max(size * e.alpha.z * float(textureSize(maps, 0).x), 1.0));
 }
 
-#ifdef COATED
+#ifdef EXTENDED
+// With what maps give of the reflectance at normal incidence, and of transmission.
+MaterialEntry with_dielectric(MaterialEntry e, vec3 f0, float transmission) {
+    e.dielectric.rgb *= f0;
+    e.emission.a *= transmission;
+    return e;
+}
+
 // The material's own, times what maps give.
 Coating mapped_coating(MaterialEntry e, float coat, float roughness, vec3 sheen, float sheen_roughness) {
     return Coating(e.coat.x * coat, e.coat.y * roughness, vec3(0.0), e.sheen.rgb * sheen, e.coat.z * sheen_roughness);
@@ -150,9 +158,14 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     vec3 base = e.base_color.rgb * tint * map_level(color_maps, e.maps[BASE_COLOR], uv, level).rgb;
     vec2 rough_metal = map_level(data_maps, e.maps[METALLIC_ROUGHNESS], uv, level_of(e, data_maps, size)).gb;
     vec3 glow = glow_tint(e, tint) * map_level(color_maps, e.maps[EMISSIVE], uv, level).rgb;
+#ifdef EXTENDED
+    float data_level = level_of(e, data_maps, size);
+    vec3 f0 = map_level(color_maps, e.maps[SPECULAR_COLOR], uv, level).rgb * map_level(color_maps, e.maps[SPECULAR], uv, level).a;
+    e = with_dielectric(e, f0, map_level(data_maps, e.maps[TRANSMITTED], uv, data_level).r);
+#endif
     Material m = mapped(e, base, rough_metal.y, rough_metal.x, 1.0, glow);
-#ifdef COATED
-    m.over = coating_of(e, uv, level, level_of(e, data_maps, size));
+#ifdef EXTENDED
+    m.over = coating_of(e, uv, level, data_level);
 #endif
     return m;
 }
@@ -173,7 +186,7 @@ bool is_cut_out(int index, float opacity, float even) {
 #else
 struct Material {
     vec3 diffuse; vec3 f0; float roughness; vec3 emission; vec3 passing;
-#ifdef COATED
+#ifdef EXTENDED
     Coating over;
 #endif
 #ifdef MEASURED
@@ -192,7 +205,7 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     m.f0 = mix(e.dielectric.rgb, base, e.base_color.a);
     m.roughness = e.dielectric.a;
     m.emission = e.emission.rgb * glow_tint(e, tint);
-#ifdef COATED
+#ifdef EXTENDED
     m.over = plain_coating(e);
 #endif
 #ifdef MEASURED

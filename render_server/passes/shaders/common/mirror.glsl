@@ -22,7 +22,7 @@ Mirror mirror_at(ivec2 pixel) {
     Mirror m = Mirror(false, position.xyz, normal.xyz, position.w, LEAST_ALPHA, false);
     if (position.w <= 0.0) return m;
     float roughness = shines(materials[int(normal.w)]) ? roughness_at(raster, int(normal.w)) : 1.0;
-#ifdef COATED
+#ifdef EXTENDED
     Coating over = coating_at(raster, int(normal.w));
     m.of_coat = over.coat > 0.0 && over.roughness < roughness;
     if (m.of_coat) {   // the smoother of both speaks for both

@@ -20,7 +20,7 @@ vec3 response_times_cosine(vec3 n, vec3 v, vec3 l, float cosine, Material m, flo
     if (m.is_polynomial) return polynomial_response(m, l);
 #endif
 #endif
-#ifdef COATED
+#ifdef EXTENDED
     return coated_response(m, n, v, l, cosine, radius);
 #else
     vec3 base = m.diffuse / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v));

@@ -1,5 +1,5 @@
 // Light at the surfaces of transparent objects (docs/method.md 4.11): Snell, Fresnel, total reflection. Needs brdf.glsl and ray_mesh.glsl.
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/coating.glsl"
 #endif
 
@@ -44,7 +44,7 @@ vec3 interface_reflectance(Interface i, vec3 d, bool inside) {
     float cosine = -dot(i.normal, d);
     if (inside) return vec3(fresnel_dielectric(cosine, relative_index(i, true)));
     vec3 base = specular_reflectance(i.surface.f0, i.surface.roughness, cosine);
-#ifdef COATED
+#ifdef EXTENDED
     return 1.0 - reflected_towards(i.surface, i.normal, -d).below * (1.0 - base);
 #else
     return base;

@@ -1,5 +1,5 @@
 // Coat and base of the object that a pixel shows, for passes that trace a lobe of each. Needs brdf.glsl, geometry.glsl and shown_maps.glsl
-// with COATED.
+// with EXTENDED.
 #include "common/coating.glsl"
 layout(rgba8) readonly uniform image2D virtual_raster_tint;   // an image, because OpenGL guarantees no more than sixteen samplers
 

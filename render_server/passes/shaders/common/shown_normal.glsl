@@ -1,5 +1,5 @@
 // The normal of the object that a pixel shows; w: material. Needs geometry.glsl and shown_maps.glsl.
-#ifdef COATED
+#ifdef EXTENDED
 // `of_coat`: the coat's normal.
 vec4 shown_normal(ivec2 raster, bool of_coat) {
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);

@@ -23,7 +23,7 @@ vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
 }
 #else
 #include "common/materials.glsl"
-#ifdef COATED
+#ifdef EXTENDED
 #include "common/coating.glsl"
 #endif
 
@@ -34,7 +34,7 @@ Material virtual_material(Surfel s) {
 vec3 virtual_albedo(Surfel s) {
     Material m = virtual_material(s);
     vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
-#ifdef COATED
+#ifdef EXTENDED
     albedo = mean_coated_reflectance(m, albedo);
 #endif
     return min(albedo, vec3(ALBEDO_RANGE.y));
