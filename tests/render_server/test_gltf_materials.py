@@ -404,5 +404,8 @@ def test_stripes_that_run_away_stay_apart_at_a_grazing_angle(
 def test_users_read_what_of_a_file_is_left_out(objects: ObjectsRenderer, draw: Draw) -> None:
     made = plate()
     made.glb.document["extensionsUsed"] = ["KHR_lights_punctual"]
+    lights = [{"type": "point", "name": "Key"}, {"type": "spot"}]
+    made.glb.document["extensions"] = {"KHR_lights_punctual": {"lights": lights}}
     draw(made, [directional()])
-    assert objects.renderer.notices[-1].endswith("plate0.glb is shown without KHR_lights_punctual.")
+    named = "plate0.glb is shown without its lights `Key`, `1` (KHR_lights_punctual)."
+    assert objects.renderer.notices[-1].endswith(named)
