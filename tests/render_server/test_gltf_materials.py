@@ -319,6 +319,42 @@ def test_alpha_shows_the_cameras_own_picture(
         assert covered[LEFT].std() < 0.07, "eight samples a pixel differ by no more than one"
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_alpha_of_vertex_colours_blends(
+    objects: ObjectsRenderer, tmp_path: Path, antialiased: bool
+) -> None:
+    """From 0.2 at the left edge to 1 at the right, times the factor."""
+    made = plate()
+    made.attributes["COLOR_0"] = made.glb.floats([(1, 1, 1, alpha) for alpha in (0.2, 1, 1, 0.2)])
+    made.material |= {"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.75]}}
+    asset = {"asset": str(made.write(tmp_path / "plate.glb")), "up_axis": "z"}
+    document = unlit(Stage(tmp_path).document([asset], [directional()]))
+    output = document.output.model_copy(update={"antialiasing": antialiased})
+    covered = objects.coverage(document.replaced(output=output), seen_from_above())
+    for half in (LEFT, RIGHT):
+        x = (half[1].start + half[1].stop - 1) / 2 - (WIDTH - 1) / 2
+        wanted = 0.75 * (0.2 + 0.8 * (0.5 + x / WIDE))
+        assert covered[half].mean() == pytest.approx(wanted, abs=0.02)
+
+
+def test_light_falls_through_clear_vertices(gpu: GpuContext, tmp_path: Path) -> None:
+    """A blended plate whose vertices have a quarter of alpha casts a quarter of a shadow."""
+    made = Plate(0.24, 0.24)
+    made.attributes["COLOR_0"] = made.glb.floats([(0, 0, 0, 0.25)] * 4)
+    made.material |= {
+        "alphaMode": "BLEND",
+        "doubleSided": True,
+        "pbrMetallicRoughness": {"metallicFactor": 0},
+    }
+    asset = {"asset": str(made.write(tmp_path / "plate.glb")), "pose": {"translation_m": [0, 0, 0.1]}}
+    document = Stage(tmp_path).document([asset | {"up_axis": "z"}], [directional((0, 0, -1), 2.0)], floor())
+    found = solve(gpu, document, frame(depth=None))
+    near = np.abs(found.position[..., :3]).max(axis=-1) < 0.05
+    near &= found.position[..., 3] > 0
+    lit = found.direct_rho[near].sum() / found.direct_mu[near].sum()
+    assert lit == pytest.approx(0.75, abs=0.04)
+
+
 def half_open(edge: float, color: float) -> Plate:
     """Seen from both sides; its right half is not there."""
     made = Plate(edge, edge)

@@ -7,6 +7,9 @@ in vec2 uv;
 in vec3 tint;
 in float depth;
 flat in float material;
+#ifdef CUTOUTS
+in float clear;
+#endif
 #ifdef MATERIAL_MAPS
 in vec2 second_uv;
 #endif
@@ -30,6 +33,9 @@ Fragment interpolated() {
     f.tint = tint;
     f.material = int(material);
     f.is_front = gl_FrontFacing;
+#ifdef CUTOUTS
+    f.opacity = opacity_of_vertices(clear);
+#endif
 #ifdef MATERIAL_MAPS
     f.second_uv = second_uv;
     f.uv_slopes = vec4(dFdx(uv), dFdy(uv));

@@ -15,6 +15,9 @@ struct Fragment {
     vec3 tint;
     int material;
     bool is_front;
+#ifdef CUTOUTS
+    float opacity;   // of its vertices
+#endif
 #ifdef MATERIAL_MAPS
     vec2 second_uv;
     // What a pixel to the right (xy) and one down (zw) add; the same of the place.

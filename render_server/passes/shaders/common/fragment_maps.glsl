@@ -49,7 +49,11 @@ Extended fragment_extended(Fragment f, bool wanted) {
 
 float fragment_opacity(Fragment f) {
     MaterialEntry e = materials[f.material];
-    return e.alpha.y * map_here(color_maps, f, e.maps[BASE_COLOR], true).a;
+    float own = e.alpha.y * map_here(color_maps, f, e.maps[BASE_COLOR], true).a;
+#ifdef CUTOUTS
+    own *= f.opacity;
+#endif
+    return own;
 }
 
 // Directions along u and against v of a triangle's coordinate, of any length. `s`: slopes_of.

@@ -170,6 +170,9 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     return m;
 }
 
+// Vertices hold their opacity beside the material's number, as a fraction (scene/triangle_mesh.py).
+float opacity_of_vertices(float clear) { return 1.0 - 2.0 * clear; }
+
 // Fraction of a footprint that is there.
 float opacity_of(int index, vec2 uv, float size) {
     MaterialEntry e = materials[index];
