@@ -134,11 +134,12 @@ def _gpu() -> GpuContext:
 
 
 def drawn_picture(
-    asset: Path, material: Path, lights: dict[str, Any], shading: str = "auto"
+    asset: Path, material: Path | None, lights: dict[str, Any], shading: str = "auto"
 ) -> Float64[np.ndarray, "h w 3"]:
-    """Returns the object as Deltalight draws it."""
+    """Returns the object as Deltalight draws it; without `material`, as its file has it."""
+    given = {} if material is None else {"material": {"precomputed": str(material)}}
     document = {
-        "objects": [{"asset": str(asset), "material": {"precomputed": str(material)}, "up_axis": "z"}],
+        "objects": [{"asset": str(asset), "up_axis": "z", **given}],
         "lights": lights,
         "method": {"name": "none"},
         "shading": {"name": shading},

@@ -33,12 +33,12 @@ class LobeShares:
 
     def single(self, cosine: Numbers) -> Numbers:
         """Return what single reflection lets out."""
-        x = _root(cosine)
-        return dr.clip(mi.Color3f(*[_polynomial(each, x) for each in self.lobe.single]), 0, 1)
+        x = polynomial_place(cosine)
+        return dr.clip(mi.Color3f(*[polynomial(each, x) for each in self.lobe.single]), 0, 1)
 
     def held(self, cosine: Numbers) -> Numbers:
         """Return what the gaps between facets still hold then."""
-        return dr.clip(1 - _polynomial(self.lobe.whole, _root(cosine)), 0, 1)
+        return dr.clip(1 - polynomial(self.lobe.whole, polynomial_place(cosine)), 0, 1)
 
     def below(self, cosine: Numbers) -> Numbers:
         """Return what the lobe leaves to the diffuse base."""
@@ -169,12 +169,12 @@ def _normal_reflectance(base: Numbers, metallic: float, dielectric: float) -> Tr
     return float(red), float(green), float(blue)
 
 
-def _root(cosine: Numbers) -> Numbers:
+def polynomial_place(cosine: Numbers) -> Numbers:
     """Return where LobeAlbedo's polynomials are evaluated."""
     return 2 * dr.sqrt(dr.clip(cosine, 0, 1)) - 1
 
 
-def _polynomial(coefficients: Float64[np.ndarray, " k"], x: Numbers) -> Numbers:
+def polynomial(coefficients: Float64[np.ndarray, " k"], x: Numbers) -> Numbers:
     """Return a Chebyshev series by Clenshaw's recurrence."""
     last, before = 0.0 * x, 0.0 * x
     for value in coefficients[:0:-1]:

@@ -84,12 +84,12 @@ def surfel_scene(
 
 def reflects_screen(objects: GeometryState) -> bool:
     """Whether any object is smooth enough to reflect the picture."""
-    return bool(objects.materials.smoothest < ROUGHEST)
+    return bool(min(objects.materials.smoothest, objects.materials.smoothest_coat) < ROUGHEST)
 
 
 def mirrors_objects(objects: GeometryState) -> bool:
     """Whether any object is smooth enough to show objects, by rays."""
-    return bool(objects.materials.smoothest < RAY_ROUGHNESS)
+    return bool(min(objects.materials.smoothest, objects.materials.smoothest_coat) < RAY_ROUGHNESS)
 
 
 def casts_caustics(objects: GeometryState) -> bool:

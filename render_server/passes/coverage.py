@@ -146,6 +146,8 @@ class SampleCoverage:
         self._gpu.clear_start(self.pixels, LIST_HEADER_BYTES)
         self.triangles.clear()
         geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster)
+        if scene["PACKS_EXTENDED"]:
+            self.surface.with_extended()
         self.triangles.find_thin(mesh, view, raster, scene)
         self._first.run(
             touched,
@@ -171,6 +173,7 @@ class SampleCoverage:
             "normal_out": self.surface.normal,
             "uv_out": self.surface.uv,
             "tint_out": self.surface.tint,
+            "extended_out": self.surface.extended,
             "sample_coverage": self.texture,
             "second_surface": self.second_surface,
             "Texels": self.pixels,

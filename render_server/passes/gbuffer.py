@@ -1,5 +1,7 @@
 """Geometry buffers: what a camera sees of a mesh at each texel of a raster."""
 
+import moderngl
+
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Drawable, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
@@ -9,7 +11,8 @@ from deltalight.render_server.view import CameraView, Rectangle
 class GeometryBuffer:
     """World position + depth (RGBA32F, w = 0: nothing), normal + material (RGBA16F), uv, vertex colour.
 
-    Of materials with maps, what these give stands in place of uv and vertex colour (common/shown_maps.glsl).
+    Of materials with maps, what these give stands in place of uv and vertex colour (common/shown_maps.glsl), and
+    `extended` (RGBA32UI) holds what they give of coats, sheens, reflectance and transmission, if any has those.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
@@ -21,6 +24,9 @@ class GeometryBuffer:
         self._depth = gpu.ctx.depth_renderbuffer(size)
         self.framebuffer = gpu.ctx.framebuffer([self.position, self.normal, self.uv, self.tint], self._depth)
         self._places = gpu.ctx.framebuffer([self.position], self._depth)
+        self._gpu = gpu
+        self.extended: moderngl.Texture | None = None
+        self._with_extended: moderngl.Framebuffer | None = None
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -30,7 +36,16 @@ class GeometryBuffer:
             "virtual_raster_normal": self.normal,
             "virtual_raster_uv": self.uv,
             "virtual_raster_tint": self.tint,
+            "virtual_raster_extended": self.extended,
         }
+
+    def with_extended(self) -> moderngl.Framebuffer:
+        """Returns its framebuffer with `extended`."""
+        if self._with_extended is None:
+            self.extended = texture_2d(self._gpu, self.size, 4, "u4")
+            textures = [self.position, self.normal, self.uv, self.tint, self.extended]
+            self._with_extended = self._gpu.ctx.framebuffer(textures, self._depth)
+        return self._with_extended
 
     def clear(self) -> None:
         """Clears it."""
@@ -46,7 +61,9 @@ class GeometryBuffer:
         """Frees the GL objects."""
         release_target(self.framebuffer)
         release_target(self._places)
-        release_all(self._depth, self.position, self.normal, self.uv, self.tint)
+        if self._with_extended is not None:
+            release_target(self._with_extended)
+        release_all(self._depth, self.position, self.normal, self.uv, self.tint, self.extended)
 
 
 class RasterGeometry:
@@ -75,7 +92,7 @@ class RasterGeometry:
         else:
             target.clear_positions(rectangle)
         self._kernel.draw(
-            target.framebuffer,
+            target.with_extended() if scene["PACKS_EXTENDED"] else target.framebuffer,
             mesh,
             scene,
             clip_from_camera=view.clip_from_camera_at(offset),

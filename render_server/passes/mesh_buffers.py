@@ -13,7 +13,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
-from deltalight.render_server.scene.materials import map_table, measured_table
+from deltalight.render_server.scene.materials import coating_table, map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
 from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
@@ -33,6 +33,8 @@ BVH_ROW_BYTES = 1024 * TEXEL_BYTES
 # Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
 # hierarchy may become half as expensive again before it is rebuilt.
 WORN = 1.5
+
+BASE_MAPS, ALL_MAPS = 5, 13  # of a material, as materials.glsl has them
 
 NO_CUTOUTS: Bindings = {"CUTOUTS": False}
 NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
@@ -256,8 +258,8 @@ class ObjectBvh:
 class MaterialTable:
     """Materials in a storage buffer; if any has maps or alpha, their textures in two arrays (common/materials.glsl).
 
-    `smoothest` is the least roughness of those that reflect specularly, 1 if none does; `transmits` tells whether
-    light passes through any. `draws_maps`: false for the
+    `smoothest` is the least roughness of those that reflect specularly, 1 if none does, `smoothest_coat` that of what
+    lies over them; `transmits` tells whether light passes through any. `draws_maps`: false for the
     real scene, of which the camera tells how it looks.
     """
 
@@ -271,13 +273,18 @@ class MaterialTable:
         self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
         self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
         self.smoothest = _smoothest(mesh)
+        self.smoothest_coat = _smoothest_coat(mesh)
+        self._is_extended = draws_maps and any(material.is_extended for material in mesh.materials)
         self.transmits = any(material.transmits for material in mesh.materials)
         self._colors = self._data = None
         table = mesh.material_table
+        if self._is_extended:
+            table = np.hstack([table, coating_table(mesh.materials)])
         if self._has_maps:
             self._colors = MapArray(gpu, [each for each in maps if each.is_color], "f2")
             self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
-            table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
+            count = ALL_MAPS if self._is_extended else BASE_MAPS
+            table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer, count)])
             for row, material in zip(table, mesh.materials, strict=True):
                 if material.maps_by_light:
                     row[BY_LIGHT] = 1 + self._layer(material.maps_by_light[0])
@@ -299,6 +306,8 @@ class MaterialTable:
             "data_maps": None if self._data is None else self._data.texture,
             "MATERIAL_MAPS": self._has_maps,
             "CUTOUTS": self._has_cutouts,
+            "EXTENDED": self._is_extended,
+            "PACKS_EXTENDED": self._is_extended and self._has_maps,
             "TRANSMISSION": self.transmits,
             "Transmittances": self._transmittances,
             "MEASURED": self._measured is not None,
@@ -369,6 +378,11 @@ def _smoothest(mesh: GpuMesh) -> float:
     reflects |= np.array([material.transmits for material in mesh.materials])
     darkest = np.array([_least_green(material.metallic_roughness_map) for material in mesh.materials])
     return float(min((table[:, ROUGHNESS] * darkest)[reflects], default=1.0))
+
+
+def _smoothest_coat(mesh: GpuMesh) -> float:
+    coats = [material for material in mesh.materials if material.coat > 0]
+    return min((each.coat_roughness * _least_green(each.coat_roughness_map) for each in coats), default=1.0)
 
 
 def _least_green(each: TextureMap | None) -> float:

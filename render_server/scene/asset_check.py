@@ -24,11 +24,14 @@ MAX_TRIANGLES = 20_000_000
 _GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 _COMPONENT_BYTES = {kind: int(name[-1]) for kind, name in COMPONENT_TYPES.items()}
 _INDEX_TYPES = (5121, 5123, 5125)
+LIGHTS_EXTENSION = "KHR_lights_punctual"
 DRAWN_EXTENSIONS = frozenset(
     {
         "EXT_texture_webp",
+        "KHR_materials_clearcoat",
         "KHR_materials_emissive_strength",
         "KHR_materials_ior",
+        "KHR_materials_sheen",
         "KHR_materials_specular",
         "KHR_materials_transmission",
         "KHR_materials_unlit",
@@ -40,22 +43,14 @@ DRAWN_EXTENSIONS = frozenset(
 # What a file may require although it is left out: the object's shape, place and texture do not depend on it.
 LEFT_OUT_EXTENSIONS = frozenset(
     {
-        "KHR_lights_punctual",
+        LIGHTS_EXTENSION,
         "KHR_materials_anisotropy",
-        "KHR_materials_clearcoat",
         "KHR_materials_diffuse_transmission",
         "KHR_materials_dispersion",
         "KHR_materials_iridescence",
-        "KHR_materials_sheen",
         "KHR_materials_variants",
     }
 )
-
-_LEFT_OUT_TEXTURES = {
-    "KHR_materials_specular": ("specularTexture", "specularColorTexture"),
-    "KHR_materials_transmission": ("transmissionTexture",),
-    "KHR_materials_volume": ("thicknessTexture",),
-}
 
 
 def check_mesh_file(path: Path) -> str:
@@ -103,20 +98,24 @@ def read_gltf(path: Path) -> GltfDocument:
 def left_out(gltf: GltfDocument) -> str | None:
     """Returns a sentence about what a document uses and no picture shows; None if that is nothing."""
     names = [str(name) for name in gltf.root.get("extensionsUsed", []) if name not in DRAWN_EXTENSIONS]
-    used = [each.get("extensions", {}) for each in gltf.entries("materials")]
-    for extension, textures in _LEFT_OUT_TEXTURES.items():
-        if any(texture in each.get(extension, {}) for each in used for texture in textures):
-            names.append(f"the textures of {extension}")
-    if any(_has_vertex_alpha(gltf, part) for mesh in gltf.entries("meshes") for part in mesh["primitives"]):
-        names.append("the alpha of its vertex colours")
+    names = [_lamps(gltf) if name == LIGHTS_EXTENSION else name for name in names]
+    if any(_masks_by_vertices(gltf, part) for mesh in gltf.entries("meshes") for part in mesh["primitives"]):
+        names.append("the alpha of its vertex colours in masks")
     return f"{gltf.path} is shown without {', '.join(dict.fromkeys(names))}." if names else None
 
 
-def _has_vertex_alpha(gltf: GltfDocument, primitive: dict[str, Any]) -> bool:
+def _lamps(gltf: GltfDocument) -> str:
+    """Names the lights of a document: no object gives light to the scene but by what it emits."""
+    lights = gltf.root.get("extensions", {}).get(LIGHTS_EXTENSION, {}).get("lights", [])
+    names = [f"`{light.get('name', number)}`" for number, light in enumerate(lights)]
+    return f"its lights {', '.join(names)} ({LIGHTS_EXTENSION})" if names else LIGHTS_EXTENSION
+
+
+def _masks_by_vertices(gltf: GltfDocument, primitive: dict[str, Any]) -> bool:
     color, material = primitive["attributes"].get("COLOR_0"), primitive.get("material")
     if color is None or material is None or gltf.root["accessors"][color]["type"] != "VEC4":
         return False
-    return bool(gltf.root["materials"][material].get("alphaMode", "OPAQUE") != "OPAQUE")
+    return bool(gltf.root["materials"][material].get("alphaMode") == "MASK")
 
 
 def _json(data: bytes) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from deltalight.render_server.scene.gltf_document import (
     faults_named,
     read_nodes,
 )
-from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.materials import AlphaMode, Material
 from deltalight.render_server.scene.texture_maps import TextureReader
 from deltalight.render_server.scene.triangle_mesh import (
     MAX_COORDINATE_M,
@@ -132,7 +132,7 @@ class PartReader:
         key = mesh, number
         if key not in self._primitives:
             material = self._material(primitive.get("material"))
-            given = _geometry(self._gltf, primitive, second_uv=material.has_second_uv)
+            given = _geometry(self._gltf, primitive, material)
             # What has no area in the mesh itself may have one when it is morphed.
             keeps = "targets" in primitive
             self._primitives[key] = (
@@ -164,8 +164,8 @@ class PartReader:
         return Skin(joints, joint_from_mesh, weights)
 
 
-def _geometry(gltf: GltfDocument, primitive: dict[str, Any], *, second_uv: bool) -> FileGeometry | None:
-    """Returns the geometry of a primitive; None for points and lines. `second_uv`: with that set too."""
+def _geometry(gltf: GltfDocument, primitive: dict[str, Any], material: Material) -> FileGeometry | None:
+    """Returns the geometry of a primitive, with what its material needs; None for points and lines."""
     mode = primitive.get("mode", _TRIANGLES)
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         return None
@@ -178,8 +178,16 @@ def _geometry(gltf: GltfDocument, primitive: dict[str, Any], *, second_uv: bool)
         _attribute(gltf, attributes, "NORMAL", count, 3),
         _uv(gltf, attributes, "TEXCOORD_0", count),
         _attribute(gltf, attributes, "COLOR_0", count, 3),
-        _uv(gltf, attributes, "TEXCOORD_1", count) if second_uv else None,
+        _uv(gltf, attributes, "TEXCOORD_1", count) if material.has_second_uv else None,
+        _opacity(gltf, attributes, count) if material.alpha_mode == AlphaMode.BLEND else None,
     )
+
+
+def _opacity(gltf: GltfDocument, attributes: dict[str, int], count: int) -> Float32[np.ndarray, "n 1"] | None:
+    """Returns the alpha of the vertices' colours; None where they have none."""
+    has_alpha = "COLOR_0" in attributes and gltf.array(attributes["COLOR_0"]).shape[1] == 4
+    rgba = _attribute(gltf, attributes, "COLOR_0", count, 4) if has_alpha else None
+    return None if rgba is None else rgba[:, 3:]
 
 
 def _triangles(

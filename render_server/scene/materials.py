@@ -18,7 +18,7 @@ from deltalight.render_server.scene.texture_maps import TextureMap, TextureReade
 from deltalight.render_server.scene.texture_stack import TextureStack
 from deltalight.render_server.scene.textures_by_light import TextureByLight
 
-MATERIAL_FLOATS = 20
+MATERIAL_FLOATS, COATING_FLOATS = 20, 8
 DARKEST_ATTENUATION = 1e-4  # black has no logarithm
 _MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
 
@@ -43,6 +43,9 @@ class Material:
     `transmission` is the fraction of the light entering the surface that goes on through it, the rest is diffuse. The
     solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
 
+    `coat` is the fraction of the surface under a clear lacquer of index 1.5 (KHR_materials_clearcoat), `sheen` the
+    colour of fibres between it and the base (KHR_materials_sheen); both have their own roughness.
+
     `measured` replaces the rest where the camera sees the surface; elsewhere a Lambertian of its albedo does.
     `by_light` replaces the light of lamps there alone, and that of a map in image-based shading.
     """
@@ -58,6 +61,10 @@ class Material:
     is_thin: bool = False
     attenuation_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.ones(3, np.float32))
     attenuation_distance_m: float = math.inf
+    coat: float = 0.0
+    coat_roughness: float = 0.0
+    sheen: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3, np.float32))
+    sheen_roughness: float = 0.0
     is_unlit: bool = False
     double_sided: bool = False
     alpha_mode: AlphaMode = AlphaMode.OPAQUE
@@ -67,20 +74,47 @@ class Material:
     normal_map: TextureMap | None = None
     occlusion_map: TextureMap | None = None
     emissive_map: TextureMap | None = None
+    coat_map: TextureMap | None = None
+    coat_roughness_map: TextureMap | None = None
+    coat_normal_map: TextureMap | None = None
+    sheen_map: TextureMap | None = None
+    sheen_roughness_map: TextureMap | None = None
+    specular_map: TextureMap | None = None
+    specular_color_map: TextureMap | None = None
+    transmission_map: TextureMap | None = None
     measured: GaussianBrdf | None = None
     by_light: TextureByLight | None = None
     name: str = ""
 
     @property
     def maps(self) -> tuple[TextureMap | None, ...]:
-        """Its maps, in the order of the shaders' table."""
+        """Its maps, in the order of the shaders' table; those of extensions come last."""
         return (
             self.base_color_map,
             self.metallic_roughness_map,
             self.normal_map,
             self.occlusion_map,
             self.emissive_map,
+            self.coat_map,
+            self.coat_roughness_map,
+            self.coat_normal_map,
+            self.sheen_map,
+            self.sheen_roughness_map,
+            self.specular_map,
+            self.specular_color_map,
+            self.transmission_map,
         )
+
+    @property
+    def is_coated(self) -> bool:
+        """Whether a coat or a sheen lies over its base."""
+        return self.coat > 0 or bool(np.any(self.sheen > 0))
+
+    @property
+    def is_extended(self) -> bool:
+        """Whether it is coated, or has maps of what its dielectric part reflects and lets through."""
+        of_dielectric = self.specular_map, self.specular_color_map, self.transmission_map
+        return self.is_coated or any(each is not None for each in of_dielectric)
 
     @property
     def has_second_uv(self) -> bool:
@@ -132,7 +166,10 @@ class Material:
 
     def mean_transmittance(self, path_m: float) -> Float32[np.ndarray, "3"]:
         """Returns what passes of light at normal incidence: two surfaces and a path between, or a thin one; R G B."""
-        entered = (1 - self.dielectric_f0) * self.base_color * (self.transmission * (1 - self.metallic))
+        through = self.transmission * (1 - self.metallic)
+        if self.transmission_map is not None:
+            through *= float(self.transmission_map.texels[..., 0].mean()) / 255
+        entered = (1 - self.dielectric_f0) * self.base_color * np.float32(through)
         return np.asarray(
             entered ** (1 if self.is_thin else 2) * np.exp(-self.absorption_per_m * np.float32(path_m)),
             np.float32,
@@ -191,8 +228,10 @@ class Material:
         extensions = description.get("extensions", {})
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         specular = extensions.get("KHR_materials_specular", {})
-        transmission = extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0)
+        transmission = extensions.get("KHR_materials_transmission", {})
         volume = extensions.get("KHR_materials_volume", {})
+        coat = extensions.get("KHR_materials_clearcoat", {})
+        sheen = extensions.get("KHR_materials_sheen", {})
         color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
         material = cls(
             base_color=color[:3],
@@ -201,22 +240,36 @@ class Material:
             ior=extensions.get("KHR_materials_ior", {}).get("ior"),
             f0_tint=_f0_tint(specular),
             emission=np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
-            transmission=float(transmission),
+            transmission=float(transmission.get("transmissionFactor", 0.0)),
             is_thin=not volume.get("thicknessFactor", 0.0),
             attenuation_color=np.array(volume.get("attenuationColor", [1, 1, 1]), np.float32),
             attenuation_distance_m=float(volume.get("attenuationDistance", math.inf)),
+            coat=float(coat.get("clearcoatFactor", 0.0)),
+            coat_roughness=float(coat.get("clearcoatRoughnessFactor", 0.0)),
+            sheen=np.array(sheen.get("sheenColorFactor", [0, 0, 0]), np.float32),
+            sheen_roughness=float(sheen.get("sheenRoughnessFactor", 0.0)),
             double_sided=bool(description.get("doubleSided", False)),
             metallic_roughness_map=textures.data(pbr.get("metallicRoughnessTexture")),
             normal_map=textures.data(description.get("normalTexture"), "scale"),
             occlusion_map=textures.data(description.get("occlusionTexture"), "strength"),
             emissive_map=textures.color(description.get("emissiveTexture")),
+            coat_map=textures.data(coat.get("clearcoatTexture")),
+            coat_roughness_map=textures.data(coat.get("clearcoatRoughnessTexture")),
+            coat_normal_map=textures.data(coat.get("clearcoatNormalTexture"), "scale"),
+            sheen_map=textures.color(sheen.get("sheenColorTexture"), with_alpha=True),
+            sheen_roughness_map=textures.color(sheen.get("sheenRoughnessTexture"), with_alpha=True),
+            specular_map=textures.color(specular.get("specularTexture"), with_alpha=True),
+            specular_color_map=textures.color(specular.get("specularColorTexture"), with_alpha=True),
+            transmission_map=textures.data(transmission.get("transmissionTexture")),
             name=str(description.get("name", "")),
         )
         mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
         base_map = textures.color(pbr.get("baseColorTexture"), with_alpha=mode != AlphaMode.OPAQUE)
         material = replace(material, base_color_map=base_map)
         material = material._with_alpha(mode, float(color[3]), float(description.get("alphaCutoff", 0.5)))
-        return material._unlit() if "KHR_materials_unlit" in extensions else material
+        if "KHR_materials_unlit" in extensions:
+            return material._unlit()
+        return material if material.is_coated else material._bare()
 
     def _with_alpha(self, mode: AlphaMode, factor: float, cutoff: float) -> Self:
         """Returns the material with its alpha; a mask becomes coverage, one half at the cutoff.
@@ -230,11 +283,27 @@ class Material:
         texels[..., 3] = np.clip(0.5 + (texels[..., 3] * factor - cutoff) * _MASK_SLOPE, 0, 1)
         return replace(self, alpha_mode=mode, base_color_map=replace(self.base_color_map, texels=texels))
 
+    def _bare(self) -> Self:
+        """Returns the material without maps of what does not lie over it."""
+        return replace(
+            self,
+            coat_map=None,
+            coat_roughness_map=None,
+            coat_normal_map=None,
+            sheen_map=None,
+            sheen_roughness_map=None,
+        )
+
     def _unlit(self) -> Self:
         """Returns the material that glows with its base colour instead of being lit (KHR_materials_unlit)."""
         return replace(
-            self,
+            self._bare(),
+            specular_map=None,
+            specular_color_map=None,
+            transmission_map=None,
             base_color=np.zeros(3, np.float32),
+            coat=0.0,
+            sheen=np.zeros(3, np.float32),
             metallic=0.0,
             roughness=1.0,
             f0_tint=np.zeros(3, np.float32),
@@ -273,13 +342,14 @@ class Material:
         """
         ior = 1.0 if self.ior is None else self.ior
         scalars = self.metallic, self.roughness, ior, self.alpha, self.transmission
+        over = self.coat, self.coat_roughness, *self.sheen, self.sheen_roughness
         colors = *self.base_color, *self.emission, *self.f0_tint, *self.attenuation_color
-        numbers = np.array([*colors, *scalars])
+        numbers = np.array([*colors, *scalars, *over])
         if not self.attenuation_distance_m > 0:
             raise DeltalightError(
                 f"{place}: the material `{self.name}` has an attenuationDistance that is not above 0; correct it."
             )
-        if numbers.shape != (17,) or not np.isfinite(numbers).all() or (numbers < 0).any():
+        if numbers.shape != (23,) or not np.isfinite(numbers).all() or (numbers < 0).any():
             raise DeltalightError(
                 f"{place}: the material `{self.name}` has a value below 0 or not finite; correct it."
             )
@@ -289,6 +359,10 @@ class Material:
             metallic=min(self.metallic, 1.0),
             roughness=min(self.roughness, 1.0),
             transmission=min(self.transmission, 1.0),
+            coat=min(self.coat, 1.0),
+            coat_roughness=min(self.coat_roughness, 1.0),
+            sheen=np.minimum(self.sheen, 1.0),
+            sheen_roughness=min(self.sheen_roughness, 1.0),
             attenuation_color=np.minimum(self.attenuation_color, 1.0),
         )
 
@@ -336,6 +410,15 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]
     return table
 
 
+def coating_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 8"]:
+    """Packs what lies over the bases, two vectors each: (coat, its roughness, the sheen's, 0), (sheen R G B, 0)."""
+    table = np.zeros((len(materials), COATING_FLOATS), np.float32)
+    for row, material in zip(table, materials, strict=True):
+        row[:3] = material.coat, material.coat_roughness, material.sheen_roughness
+        row[4:7] = material.sheen
+    return table
+
+
 def measured_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 93 4"]:
     """Returns the rows of the measured ones among the materials (common/measured.glsl)."""
     rows = [material.measured.table_row() for material in materials if material.measured is not None]
@@ -346,18 +429,19 @@ def map_table(
     materials: Sequence[Material],
     repeats_per_m: Float32[np.ndarray, " k"],
     layer_of: Callable[[TextureMap], int],
-) -> Float32[np.ndarray, "k 64"]:
-    """Packs alpha and maps for a shader, sixteen vectors each, behind the rows of `material_table`.
+    count: int,
+) -> Float32[np.ndarray, "k _"]:
+    """Packs alpha and the first `count` maps for a shader, 1 + 3 `count` vectors each, behind all other rows.
 
     (alpha mode, alpha, repeats of the base colour's map a metre, 0); for each map (row of u, layer or -1),
     (row of v, set of coordinates), (wraps, across + 3 down; columns and rows of an unfiltered texture, else 0;
     strength).
     """
-    table = np.zeros((len(materials), 4 + 12 * len(Material().maps)), np.float32)
+    table = np.zeros((len(materials), 4 + 12 * count), np.float32)
     table[:, 7::12] = -1
     for row, material, repeats in zip(table, materials, repeats_per_m, strict=True):
         row[:3] = material.alpha_mode, material.alpha, repeats
-        for place, each in enumerate(material.maps):
+        for place, each in enumerate(material.maps[:count]):
             if each is not None:
                 row[4 + 12 * place :][:12] = _map_entry(each, layer_of(each))
     return table

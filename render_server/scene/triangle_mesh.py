@@ -151,7 +151,8 @@ class TriangleMesh:
     """Triangles of one material, counter-clockwise seen from outside.
 
     `normals` are unit vectors. `uv` (0, 0) is the top-left corner of the texture array. `colors` are linear
-    R G B that multiply the material's base colour. `second_uv` is what maps of set 1 lie on.
+    R G B that multiply the material's base colour. `second_uv` is what maps of set 1 lie on. `opacity` (0..1)
+    multiplies the alpha of a material that is blended.
     """
 
     positions: Float32[np.ndarray, "n 3"]
@@ -161,6 +162,7 @@ class TriangleMesh:
     material: Material
     colors: Float32[np.ndarray, "n 3"] | None = None
     second_uv: Float32[np.ndarray, "n 2"] | None = None
+    opacity: Float32[np.ndarray, "n 1"] | None = None
 
     def uv_of(self, texture: TextureMap | None) -> Float32[np.ndarray, "n 2"] | None:
         """Returns the coordinates that a map of its material lies on; None without them, or without a map."""
@@ -207,6 +209,7 @@ class FileGeometry:
     uv: Float32[np.ndarray, "n 2"] | None = None
     colors: Float32[np.ndarray, "n 3"] | None = None
     second_uv: Float32[np.ndarray, "n 2"] | None = None
+    opacity: Float32[np.ndarray, "n 1"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,6 +253,7 @@ def converted(
         material,
         None if given.colors is None else given.colors[source],
         None if given.second_uv is None else given.second_uv[source],
+        None if given.opacity is None else given.opacity[source],
     )
     return ConvertedMesh(mesh, source, smoothing)
 
@@ -290,6 +294,7 @@ def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
         parts[0].material,
         _joined_attribute([part.colors for part in parts], parts, 1.0),
         _joined_attribute([part.second_uv for part in parts], parts, 0.0),
+        _joined_attribute([part.opacity for part in parts], parts, 1.0),
     )
 
 
@@ -322,6 +327,7 @@ def _joined_attribute(
 
 MAX_PIECES = 4_000_000
 VERTEX_LAYOUT = "3f 3f 2f 3f 1f"
+CLEAR_FRACTION = 0.5  # beside the material's whole number, that of a vertex of opacity 0
 VERTEX_ATTRIBUTES = ("in_position", "in_normal", "in_uv", "in_color", "in_material")
 
 
@@ -358,7 +364,7 @@ class GpuMesh:
 
     def mean_path_m(self, material: int) -> float:
         """Returns the mean length of straight paths through a closed part of that material, 4 V / A (Cauchy 1841)."""
-        of_part = self.vertices[self.triangles[:, 0], 11] == material
+        of_part = self.vertices[self.triangles[:, 0], 11].astype(int) == material
         a, b, c = np.moveaxis(self.vertices[self.triangles[of_part], :3].astype(np.float64), 1, 0)
         across = np.cross(b - a, c - a)
         volume = abs(float(((a - a.mean(axis=0)) * across).sum())) / 6
@@ -410,6 +416,8 @@ def _interleaved(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 12"]:
         if mesh.colors is None:
             own[:, 8:11] = 1
         own[:, 11] = index
+        if mesh.opacity is not None:
+            own[:, 11] += CLEAR_FRACTION * (1 - np.clip(mesh.opacity[:, 0], 0, 1))
     return rows
 
 

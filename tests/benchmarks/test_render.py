@@ -212,6 +212,21 @@ def test_truths_materials_keep_the_light(roughness: float, metallic: float, low:
     assert disney.max() < high + 0.01
 
 
+@pytest.mark.parametrize(("coat", "sheen"), [((1.0, 0.5), 0.0), ((0.0, 0.0), 1.0), ((1.0, 0.6), 1.0)])
+def test_truths_coats_and_sheens_keep_the_light(coat: tuple[float, float], sheen: float) -> None:
+    """A white surface under them shows 1 in even light of 1, and they are sampled as they are evaluated."""
+    choose_variant()
+    from deltalight.benchmarks.ground_truth.coated_bsdf import coated
+
+    over = {"coat": coat, "sheen": (sheen,) * 3, "sheen_roughness": 0.5}
+    for metallic in (0.0, 1.0):
+        bsdf = coated((1.0, 1.0, 1.0), roughness=0.5, metallic=metallic, **over)
+        kept = reflected(bsdf)
+        print(f"coat {coat}, sheen {sheen}, metallic {metallic}: {np.round(kept[:, 0], 3)}")
+        assert kept == pytest.approx(1.0, abs=0.03)
+        assert reflected(bsdf, evenly=True) == pytest.approx(kept, rel=0.02, abs=0.005)
+
+
 def test_truths_materials_are_sampled_as_they_are_evaluated() -> None:
     """Means over the material's own samples and over even ones agree, colours apart; light goes both ways alike."""
     import drjit as dr

@@ -5,6 +5,7 @@ A context's `compile_watchers` are told of each, with its defines.
 
 from collections.abc import Callable
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,21 @@ MEASURED = (
     Case("paper", "depth", "mirror"),
     Case("dlpv", "model", "mirror"),
 )
+EXTENDED: dict[Case, dict[str, Any]] = {
+    Case("exact", "depth", "mirror"): {},
+    Case("exact", "depth", "antialiased"): {"quality": "live"},
+    Case("paper", "depth", "mirror"): {},
+    Case("differential", "depth", "mirror"): {},
+    Case("dlpv", "model", "mirror"): {},
+    Case("dlpv-paper", "depth", "plain"): {},
+    Case("aroof", "depth", "mirror"): {},
+}
 SEVERAL = [Case(method, "depth", "plain") for method in ("exact", "paper", "differential", "dlpv")]
+SURFACES = [  # what materials are shaded by maps of light
+    dict.fromkeys(switches, 1)
+    for count in range(4)
+    for switches in combinations(("EXTENDED", "MATERIAL_MAPS", "MEASURED"), count)
+]
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume", "error"),
@@ -114,6 +129,18 @@ def render_measured(case: Case, changes: dict[str, Any], gpu: GpuContext, folder
     glass.material["extensions"] = {"KHR_materials_transmission": {"transmissionFactor": 1}}
     for plate in (Plate(0.1, 0.1), glass):
         render_with(plate, case, changes, gpu, folder, measured)
+
+
+def render_coated(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame with a coated sheet more: plain, with maps and holes, of glass and not."""
+    over: dict[str, Any] = {
+        "KHR_materials_clearcoat": {"clearcoatFactor": 1.0},
+        "KHR_materials_sheen": {"sheenColorFactor": [1, 1, 1], "sheenRoughnessFactor": 0.5},
+    }
+    for extensions in (over, {**over, "KHR_materials_transmission": {"transmissionFactor": 1}}):
+        for plate in (Plate(0.1, 0.1), maps_and_holes(0.1)):
+            plate.material["extensions"] = extensions
+            render_with(plate, case, changes, gpu, folder)
 
 
 def maps_and_holes(edge_m: float) -> Plate:
@@ -204,20 +231,16 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
 
 def image_based(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     """Compiles image-based shading, without and with a lens that bends, materials with maps and measured ones."""
-    for name, switch in (
-        ("ambient_occlusion", "lens_bends"),
-        ("image_based_surface", "MATERIAL_MAPS"),
-        ("image_based_surface", "MEASURED"),
-    ):
-        for defines in ({}, {switch: 1}):
-            Kernel(gpu, name, **defines).release()
-    Kernel(gpu, "image_based_surface", MATERIAL_MAPS=1, MEASURED=1).release()
+    for defines in ({}, {"lens_bends": 1}):
+        Kernel(gpu, "ambient_occlusion", **defines).release()
+    for switches in SURFACES:
+        Kernel(gpu, "image_based_surface", **switches).release()
 
 
 def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     """Compiles shading by precomputed transfer, without and with materials that have maps or are measured."""
-    for defines in ({}, {"MATERIAL_MAPS": 1}, {"MEASURED": 1}, {"MATERIAL_MAPS": 1, "MEASURED": 1}):
-        Kernel(gpu, "image_based_surface", PRECOMPUTED=1, **defines).release()
+    for switches in SURFACES:
+        Kernel(gpu, "image_based_surface", PRECOMPUTED=1, **switches).release()
     Kernel(gpu, "transfer_light").release()
     RasterKernel(gpu, "transfer_raster").release()
 
@@ -232,6 +255,7 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
     **{f"{case} measured": partial(render_measured, case, {}) for case in MEASURED},
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
+    **{f"{case} coated": partial(render_coated, case, changes) for case, changes in EXTENDED.items()},
     **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
     "objects far apart": render_apart,
     "objects far apart, live": partial(render_apart, quality="live"),

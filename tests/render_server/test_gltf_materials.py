@@ -1,6 +1,7 @@
 """glTF materials as they are drawn: closed forms of plates with textures."""
 
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +57,11 @@ Draw = Callable[..., np.ndarray]
 def draw(objects: ObjectsRenderer, tmp_path: Path) -> Draw:
     """Draws a plate under some lights; returns the linear picture."""
 
+    numbers = count()  # of files: renderers keep an asset that they loaded
+
     def drawn(plate: Plate, lights: list[dict[str, Any]] | None = None) -> np.ndarray:
         stage = Stage(tmp_path)
-        asset = {"asset": str(plate.write(tmp_path / "plate.glb")), "up_axis": "z"}
+        asset = {"asset": str(plate.write(tmp_path / f"plate{next(numbers)}.glb")), "up_axis": "z"}
         return objects.linear(unlit(stage.document([asset], lights or [])), seen_from_above())
 
     return drawn
@@ -110,6 +113,39 @@ def test_a_texture_of_roughness_and_metal_is_as_the_factors(draw: Draw) -> None:
         pictures.append(draw(made, lights)[INSIDE])
     assert pictures[0] == pytest.approx(pictures[1], rel=6e-3, abs=1e-3)
     assert pictures[0].max() > 1.5 * np.median(pictures[0]), "a highlight is seen"
+
+
+SPECULAR: dict[str, tuple[dict[str, Any], dict[str, tuple[int, ...]]]] = {
+    "specular": (
+        {
+            "specularFactor": 0.8 * 128 / 255,
+            "specularColorFactor": [float(LINEAR[code]) for code in (200, 150, 90)],
+        },
+        {"specularTexture": (0, 0, 0, 128), "specularColorTexture": (200, 150, 90)},
+    ),
+    "transmission": ({"transmissionFactor": 0.8 * 128 / 255}, {"transmissionTexture": (128, 0, 0)}),
+}
+
+
+@pytest.mark.parametrize("name", SPECULAR)
+def test_textures_of_specular_and_transmission_are_as_the_factors(draw: Draw, name: str) -> None:
+    """A dark plate under a lamp, whose highlight is seen; a pale one, whose diffuse part is what does not pass."""
+    lights = [directional((0.05, 0.02, -1.0), 4.0, 2.0), ambient(0.3)]
+    factors, textures = SPECULAR[name]
+    color = 0.0 if name == "specular" else 0.8
+    pictures = []
+    for is_texture in (True, False):
+        made = plate()
+        pbr = {"baseColorFactor": [color] * 3 + [1], "metallicFactor": 0, "roughnessFactor": 0.4}
+        given = {f"{name}Factor": 0.8, **{key: made.texture(even(*code)) for key, code in textures.items()}}
+        extension = {f"KHR_materials_{name}": given if is_texture else factors}
+        made.material = {
+            "pbrMetallicRoughness": pbr,
+            "extensions": {"KHR_materials_ior": {"ior": 1.8}, **extension},
+        }
+        pictures.append(draw(made, lights)[INSIDE])
+    assert pictures[0] == pytest.approx(pictures[1], rel=0.02, abs=1e-3)
+    assert pictures[1].max() > 0.05
 
 
 def lambert(normal: Any) -> float:  # noqa: ANN401
@@ -283,6 +319,42 @@ def test_alpha_shows_the_cameras_own_picture(
         assert covered[LEFT].std() < 0.07, "eight samples a pixel differ by no more than one"
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_alpha_of_vertex_colours_blends(
+    objects: ObjectsRenderer, tmp_path: Path, antialiased: bool
+) -> None:
+    """From 0.2 at the left edge to 1 at the right, times the factor."""
+    made = plate()
+    made.attributes["COLOR_0"] = made.glb.floats([(1, 1, 1, alpha) for alpha in (0.2, 1, 1, 0.2)])
+    made.material |= {"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.75]}}
+    asset = {"asset": str(made.write(tmp_path / "plate.glb")), "up_axis": "z"}
+    document = unlit(Stage(tmp_path).document([asset], [directional()]))
+    output = document.output.model_copy(update={"antialiasing": antialiased})
+    covered = objects.coverage(document.replaced(output=output), seen_from_above())
+    for half in (LEFT, RIGHT):
+        x = (half[1].start + half[1].stop - 1) / 2 - (WIDTH - 1) / 2
+        wanted = 0.75 * (0.2 + 0.8 * (0.5 + x / WIDE))
+        assert covered[half].mean() == pytest.approx(wanted, abs=0.02)
+
+
+def test_light_falls_through_clear_vertices(gpu: GpuContext, tmp_path: Path) -> None:
+    """A blended plate whose vertices have a quarter of alpha casts a quarter of a shadow."""
+    made = Plate(0.24, 0.24)
+    made.attributes["COLOR_0"] = made.glb.floats([(0, 0, 0, 0.25)] * 4)
+    made.material |= {
+        "alphaMode": "BLEND",
+        "doubleSided": True,
+        "pbrMetallicRoughness": {"metallicFactor": 0},
+    }
+    asset = {"asset": str(made.write(tmp_path / "plate.glb")), "pose": {"translation_m": [0, 0, 0.1]}}
+    document = Stage(tmp_path).document([asset | {"up_axis": "z"}], [directional((0, 0, -1), 2.0)], floor())
+    found = solve(gpu, document, frame(depth=None))
+    near = np.abs(found.position[..., :3]).max(axis=-1) < 0.05
+    near &= found.position[..., 3] > 0
+    lit = found.direct_rho[near].sum() / found.direct_mu[near].sum()
+    assert lit == pytest.approx(0.75, abs=0.04)
+
+
 def half_open(edge: float, color: float) -> Plate:
     """Seen from both sides; its right half is not there."""
     made = Plate(edge, edge)
@@ -368,5 +440,8 @@ def test_stripes_that_run_away_stay_apart_at_a_grazing_angle(
 def test_users_read_what_of_a_file_is_left_out(objects: ObjectsRenderer, draw: Draw) -> None:
     made = plate()
     made.glb.document["extensionsUsed"] = ["KHR_lights_punctual"]
+    lights = [{"type": "point", "name": "Key"}, {"type": "spot"}]
+    made.glb.document["extensions"] = {"KHR_lights_punctual": {"lights": lights}}
     draw(made, [directional()])
-    assert objects.renderer.notices[-1].endswith("plate.glb is shown without KHR_lights_punctual.")
+    named = "plate0.glb is shown without its lights `Key`, `1` (KHR_lights_punctual)."
+    assert objects.renderer.notices[-1].endswith(named)

@@ -10,6 +10,9 @@ layout(rgba32f) uniform image2D position_out;
 layout(rgba16f) uniform image2D normal_out;
 layout(rg32f) writeonly uniform image2D uv_out;
 layout(rgba8) writeonly uniform image2D tint_out;
+#ifdef PACKS_EXTENDED
+layout(rgba32ui) writeonly uniform uimage2D extended_out;
+#endif
 layout(rgba16f) uniform image2D sample_coverage;   // as in sample_coverage.comp.glsl
 // samples of another surface: the first one's position, w: their fraction
 layout(rgba32f) writeonly uniform image2D second_surface;
@@ -120,6 +123,9 @@ void store(ivec2 pixel, Surface s) {
     imageStore(normal_out, pixel, s.normal);
     imageStore(uv_out, pixel, vec4(s.uv, 0.0, 0.0));
     imageStore(tint_out, pixel, s.tint);
+#ifdef PACKS_EXTENDED
+    imageStore(extended_out, pixel, s.extended);
+#endif
 }
 
 // The samples, as bits, that are visible, come after the one that represents the pixel, and show another triangle.

@@ -7,6 +7,9 @@ in vec2 uv;
 in vec3 tint;
 in float depth;
 flat in float material;
+#ifdef CUTOUTS
+in float clear;
+#endif
 #ifdef MATERIAL_MAPS
 in vec2 second_uv;
 #endif
@@ -14,6 +17,9 @@ layout(location = 0) out vec4 out_position;
 layout(location = 1) out vec4 out_normal;
 layout(location = 2) out vec2 out_uv;
 layout(location = 3) out vec4 out_tint;
+#ifdef PACKS_EXTENDED
+layout(location = 4) out uvec4 out_extended;
+#endif
 
 Fragment interpolated() {
     vec3 right = dFdx(world), down = dFdy(world), across = cross(right, down), view = camera_position - world;
@@ -27,6 +33,9 @@ Fragment interpolated() {
     f.tint = tint;
     f.material = int(material);
     f.is_front = gl_FrontFacing;
+#ifdef CUTOUTS
+    f.opacity = opacity_of_vertices(clear);
+#endif
 #ifdef MATERIAL_MAPS
     f.second_uv = second_uv;
     f.uv_slopes = vec4(dFdx(uv), dFdy(uv));
@@ -47,4 +56,7 @@ void main() {
     out_normal = s.normal;
     out_uv = s.uv;
     out_tint = s.tint;
+#ifdef PACKS_EXTENDED
+    out_extended = s.extended;
+#endif
 }

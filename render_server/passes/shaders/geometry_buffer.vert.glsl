@@ -17,7 +17,10 @@ out vec3 normal;
 out vec2 uv;
 out vec3 tint;
 out float depth;
-flat out float material;
+flat out float material;   // its number
+#ifdef CUTOUTS
+out float clear;           // half of what the vertex's opacity lacks to 1
+#endif
 
 void main() {
     vec4 camera = camera_from_world * vec4(in_position, 1.0);
@@ -27,6 +30,9 @@ void main() {
     tint = in_color;
     depth = camera.z;
     material = in_material;
+#ifdef CUTOUTS
+    clear = fract(in_material);
+#endif
 #ifdef MATERIAL_MAPS
     second_uv = in_second_uv;
 #endif

@@ -85,12 +85,27 @@ vec4 arriving_light(ivec2 pixel, vec4 position, vec3 normal) {
 }
 #endif
 
+// Half of the turn across a pixel of what the surface or (`of_coat`) its coat mirrors.
+float mirrored_turn(ivec2 pixel, vec4 position, vec4 normal, bool of_coat) {
+    vec3 across = change_along(pixel, ivec2(1, 0), position, normal, of_coat).normal;
+    vec3 down = change_along(pixel, ivec2(0, 1), position, normal, of_coat).normal;
+    return max(length(across), length(down));
+}
+
 // Mean radiance over what the surface mirrors.
-vec3 mirrored_radiance(vec3 n, vec3 v, Material m, float footprint, int count) {
+vec3 mirrored_radiance(ivec2 pixel, vec4 position, vec4 normal, vec3 v, Material m) {
+    vec3 n = normalize(normal.xyz);
+    float footprint = mirrored_turn(pixel, position, normal, false);
 #ifdef MEASURED
     if (m.measured >= 0) return measured_radiance(n, v, m.measured, footprint, sample_count);
 #endif
-    return lobe_radiance(n, v, m.f0, m.roughness, footprint, count);
+    vec3 seen = lobe_radiance(n, v, m.f0, m.roughness, footprint, has_interface(m.f0) ? sample_count : 0);
+#ifdef EXTENDED
+    vec3 share = coat_share(reflected_towards(m, n, v)), above = coat_normal(m.over, n);
+    footprint = mirrored_turn(pixel, position, vec4(above, normal.w), true);
+    seen = mix(seen, lobe_radiance(above, v, COAT_F0, m.over.roughness, footprint, m.over.coat > 0.0 ? sample_count : 0), share);
+#endif
+    return seen;
 }
 
 #ifdef MEASURED
@@ -137,12 +152,8 @@ vec3 shaded(ivec2 pixel, ivec2 raster, vec4 position) {
     }
 #endif
 #endif
-    vec3 across = change_along(pixel, ivec2(1, 0), position, normal).normal;
-    vec3 down = change_along(pixel, ivec2(0, 1), position, normal).normal;
-    float footprint = max(length(across), length(down));   // half of the turn of what is mirrored
-    int count = has_interface(m.f0) ? sample_count : 0;
-    Indirect arriving = Indirect(light.rgb, light.a * mirrored_radiance(n, v, m, footprint, count));
-    return with_gathered(m.emission, m, max(dot(n, v), 1e-3), arriving);
+    Indirect arriving = Indirect(light.rgb, light.a * mirrored_radiance(pixel, position, normal, v, m));
+    return with_gathered(emitted(m, n, v), m, n, v, arriving);
 }
 
 void main() {

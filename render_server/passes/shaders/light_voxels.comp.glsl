@@ -31,6 +31,9 @@
 #endif
 #ifdef VIRTUAL
 #include "common/materials.glsl"
+#ifdef EXTENDED
+#include "common/coating.glsl"
+#endif
 #endif
 
 layout(local_size_x = 64) in;
@@ -154,6 +157,9 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 diffuse = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness);
     vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(WHITEST));
     bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
+#ifdef EXTENDED
+    albedo = min(mean_coated_reflectance(m, albedo), vec3(WHITEST));
+#endif
     vec3 carried = in_beams ? (albedo - min(diffuse, albedo)) * surfel_light(own, DIRECT_RHO).rgb : vec3(0.0);
     return unsummed(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
 }

@@ -5,6 +5,9 @@
 #include "common/light_rays.glsl"
 #ifndef REAL
 #include "common/materials.glsl"
+#ifdef EXTENDED
+#include "common/coating.glsl"
+#endif
 #endif
 #include "common/packing.glsl"
 #include "common/volume.glsl"
@@ -37,7 +40,11 @@ vec3 virtual_albedo(ivec2 texel) {
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z), 0.0);
     bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // beams carry these
     vec3 lobe = in_beams ? vec3(0.0) : mean_specular_reflectance(m.f0, m.roughness);
-    return mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + lobe;
+    vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + lobe;
+#ifdef EXTENDED
+    albedo = mean_coated_reflectance(m, albedo);
+#endif
+    return albedo;
 }
 
 // A lobe that points where the light travels, in the cell half a cell in front of the surface, towards the light.

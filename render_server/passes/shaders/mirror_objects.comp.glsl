@@ -65,6 +65,9 @@ vec4 trace(ivec2 pixel, Ray ray, out float met_at) {
 #ifdef TRANSMISSION
     // What is behind goes on below the object, unrefracted.
     vec3 passing = material.passing * (1.0 - specular_reflectance(material.f0, material.roughness, -dot(s.normal, ray.direction)));
+#ifdef EXTENDED
+    passing *= reflected_towards(material, s.normal, -ray.direction).below;
+#endif
     return open * vec4(radiance, 1.0 - dot(passing, vec3(1.0 / 3.0)));
 #else
     return open * vec4(radiance, 1.0);

@@ -15,11 +15,13 @@ layout(location = 0) out vec4 out_normal;
 layout(location = 1) out vec4 out_uv;
 
 #ifdef CUTOUTS
+in float clear;
+
 bool is_left_out() {
     MaterialEntry e = materials[int(material)];
     vec2 place = place_on(e.maps[BASE_COLOR], uv) * float(textureSize(color_maps, 0).x);
     float level = log2(max(max(length(dFdx(place)), length(dFdy(place))), 1.0));
-    float opacity = e.alpha.y * map_level(color_maps, e.maps[BASE_COLOR], uv, level).a;
+    float opacity = opacity_of_vertices(clear) * e.alpha.y * map_level(color_maps, e.maps[BASE_COLOR], uv, level).a;
     return is_cut_out(int(material), opacity, even_noise(gl_FragCoord.xy + APART * material));
 }
 #endif

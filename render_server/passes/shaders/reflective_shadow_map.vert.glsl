@@ -14,6 +14,9 @@ out vec3 normal;
 out vec2 uv;
 out vec3 tint;
 flat out float material;
+#ifdef CUTOUTS
+out float clear;
+#endif
 
 void main() {
     vec3 v = (view_from_world * vec4(in_position, 1.0)).xyz;
@@ -22,7 +25,10 @@ void main() {
     normal = in_normal;
     uv = in_uv;
     tint = in_color;
-    material = in_material;
+    material = floor(in_material);
+#ifdef CUTOUTS
+    clear = fract(in_material);
+#endif
     if (orthographic) gl_Position = vec4(v.xy / half_extent, 2.0 * (v.z - near) / (far - near) - 1.0, 1.0);
     else gl_Position = vec4(v.xy / half_extent, ((far + near) * v.z - 2.0 * far * near) / (far - near), v.z);
 }

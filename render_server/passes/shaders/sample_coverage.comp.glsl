@@ -6,6 +6,7 @@
 #include "common/work_list.glsl"
 #include "common/raster_tiles.glsl"
 #pragma switch CUTOUTS
+#pragma switch PACKS_EXTENDED
 
 #include "common/pixel_group.glsl"
 layout(rgba32f) writeonly uniform image2D position_out;
@@ -21,6 +22,12 @@ uniform sampler2D virtual_raster_uv;
 uniform sampler2D virtual_raster_tint;
 #pragma texels rg32f virtual_raster_uv
 #pragma texels rgba8 virtual_raster_tint
+#ifdef PACKS_EXTENDED
+layout(rgba32ui) writeonly uniform uimage2D extended_out;
+#pragma outputs extended_out
+uniform usampler2D virtual_raster_extended;
+#pragma texels rgba32ui virtual_raster_extended
+#endif
 uniform vec2 offset;           // pixels
 uniform float weight;          // of a sample
 uniform ivec4 rectangle;       // first pixel and size of the part of the picture that may show an object, or did before
@@ -43,6 +50,9 @@ void copy_surface(ivec2 pixel, ivec2 raster, vec4 position) {
     imageStore(normal_out, pixel, drawn ? texelFetch(virtual_raster_normal, raster, 0) : vec4(0.0));
     imageStore(uv_out, pixel, drawn ? texelFetch(virtual_raster_uv, raster, 0) : vec4(0.0));
     imageStore(tint_out, pixel, drawn ? texelFetch(virtual_raster_tint, raster, 0) : vec4(0.0));
+#ifdef PACKS_EXTENDED
+    imageStore(extended_out, pixel, drawn ? texelFetch(virtual_raster_extended, raster, 0) : uvec4(0u));
+#endif
 }
 
 const ivec2 NEIGHBOURS[8] = ivec2[](ivec2(-1), ivec2(0, -1), ivec2(1, -1), ivec2(-1, 0), ivec2(1, 0), ivec2(-1, 1), ivec2(0, 1), ivec2(1));

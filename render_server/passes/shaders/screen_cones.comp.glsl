@@ -1,7 +1,9 @@
 // Reflections of the visible real scene in smooth virtual surfaces, by cones across the picture ([D] 4.4.2): the
 // picture's radiance there, times the objects' change of its light. What a cone does not find in the picture it looks
-// up in voxels (VOXELS), or that fraction of the lobe is left to other passes.
+// up in voxels (VOXELS), or that fraction of the lobe is left to other passes. (What is included within a condition, as look.glsl does, is
+// not again.)
 #include "common/brdf.glsl"
+#include "common/octahedral.glsl"
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
 #include "common/shown_maps.glsl"
@@ -9,6 +11,9 @@
 #include "common/shown_pixels.glsl"
 #include "common/walk.glsl"
 #include "common/surface_change.glsl"
+#ifdef EXTENDED
+#include "common/shown_coating.glsl"
+#endif
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D reflected;   // rgb radiance times fraction; a: fraction of the lobe
@@ -47,18 +52,11 @@ float spread_of(float alpha, Change x, Change y) {
     return length(vec2(2.0 * MEDIAN_DISC * alpha, curved));
 }
 
-// Cones spread evenly over the lobe and over the pixel.
-vec4 reflection(ivec2 pixel) {
-    ivec2 raster = raster_texel(pixel);
-    vec4 position = texelFetch(virtual_raster_position, raster, 0);
-    vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
-    MaterialEntry m = materials[int(normal.w)];
-    bool shines = m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0;
-    float roughness = roughness_at(raster, int(normal.w));
-    if (!shines || roughness >= ROUGHEST) return vec4(0.0);
+// `count` cones spread evenly over the lobe and over the pixel; `of_coat`: of the coat, whose normal that is.
+vec4 lobe_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bool of_coat, int count_of_cones) {
     float alpha = max(roughness * roughness, LEAST_ALPHA);
-    Change x = change_along(pixel, ivec2(1, 0), position, normal);
-    Change y = change_along(pixel, ivec2(0, 1), position, normal);
+    Change x = change_along(pixel, ivec2(1, 0), position, normal, of_coat);
+    Change y = change_along(pixel, ivec2(0, 1), position, normal, of_coat);
     float spread = spread_of(alpha, x, y);
     bool objects_apart = roughness < OBJECTS_BY_RAYS, is_open;
     vec4 sum = vec4(0.0);
@@ -78,14 +76,50 @@ vec4 reflection(ivec2 pixel) {
         if (objects_apart && !is_open) continue;
         sum += seen;
         count += 1.0;
-    } while (++j < CONE_COUNT);
+    } while (++j < count_of_cones);
     vec4 seen = sum / max(count, 1.0);
 #ifdef OBJECT_RAYS
     vec4 objects = imageLoad(object_rays, pixel);
-    seen = objects + (1.0 - objects.a) * seen;
+    if (objects_apart) seen = objects + (1.0 - objects.a) * seen;
 #endif
     return seen;
 }
+
+#ifdef EXTENDED
+// The same of a rougher lobe too, by one cone through voxels.
+vec4 any_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bool of_coat, bool wanted) {
+    if (roughness < ROUGHEST) return lobe_reflection(pixel, position, normal, roughness, of_coat, wanted ? CONE_COUNT : 1);
+#ifdef VOXELS
+    vec3 d = reflect(normalize(position.xyz - camera_position), normal.xyz);
+    float open;
+    return vec4(look_in_voxels(position.xyz + CLEAR * position.w * normal.xyz, d, 2.0 * tan(specular_half_angle(roughness)), open), 1.0);
+#else
+    return vec4(0.0);
+#endif
+}
+
+vec4 reflection(ivec2 pixel) {
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = texelFetch(virtual_raster_position, raster, 0), normal = shown_normal(raster, false);
+    Material m = coated_material(raster);
+    vec3 share = coat_share(reflected_towards(m, normal.xyz, normalize(camera_position - position.xyz)));
+    vec4 base = any_reflection(pixel, position, normal, m.roughness, false, has_interface(m.f0));
+    if (m.over.coat == 0.0) return base;
+    vec4 coat = any_reflection(pixel, position, shown_normal(raster, true), m.over.roughness, true, true);
+    return vec4(mix(base.rgb, coat.rgb, share), mix(base.a, coat.a, dot(share, vec3(1.0 / 3.0))));
+}
+#else
+vec4 reflection(ivec2 pixel) {
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = texelFetch(virtual_raster_position, raster, 0);
+    vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
+    MaterialEntry m = materials[int(normal.w)];
+    bool shines = m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0;
+    float roughness = roughness_at(raster, int(normal.w));
+    if (!shines || roughness >= ROUGHEST) return vec4(0.0);
+    return lobe_reflection(pixel, position, normal, roughness, false, CONE_COUNT);
+}
+#endif
 
 // Of the listed pixels: all that show an object, or one for each quad of them (list_quads).
 void main() {

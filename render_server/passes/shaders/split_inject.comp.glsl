@@ -8,6 +8,9 @@
 #include "common/even_noise.glsl"
 #ifdef VIRTUAL
 #include "common/materials.glsl"
+#ifdef EXTENDED
+#include "common/coating.glsl"
+#endif
 #endif
 #include "common/packing.glsl"
 #include "common/volume.glsl"
@@ -91,7 +94,11 @@ void hold(int slot, bool shadowed, vec3 flux, float area) {
 vec3 virtual_albedo(ivec2 texel) {
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z), 0.0);
-    return mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
+    vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
+#ifdef EXTENDED
+    albedo = mean_coated_reflectance(m, albedo);
+#endif
+    return albedo;
 }
 
 bool is_wanted(LightView view, ivec2 texel) { return first_depth(virtual_light_depth, view, texel) != NOTHING; }

@@ -67,6 +67,27 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
 #endif
 #endif
 
+#ifndef REAL
+#ifdef EXTENDED
+#include "common/shown_coating.glsl"
+
+// A cone for the base's lobe and one for the coat's, weighted by what they reflect.
+vec3 coated_specular(ivec2 texel, SurfacePoint s, vec3 q) {
+    ivec2 raster = raster_texel(texelFetch(sample_pixels, texel, 0).zw);
+    Material m = coated_material(raster);
+    vec3 v = normalize(camera_position - s.position), share = coat_share(reflected_towards(m, s.normal, v)), sum = vec3(0.0);
+    int k = 0, lobes = m.over.coat > 0.0 ? 2 : 1;
+    do {
+        vec3 d = reflect(-v, k == 0 ? s.normal : coat_normal(m.over, s.normal));
+        float half_angle = specular_half_angle(k == 0 ? m.roughness : m.over.roughness);
+        March met = march(q, d, 2.0 * tan(half_angle), false);
+        sum += (k == 0 ? 1.0 - share : share) * (met.c_rho + met.t_rho * environment(d, half_angle));
+    } while (++k < lobes);
+    return sum;
+}
+#endif
+#endif
+
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     enter_volume(s.position);
@@ -84,6 +105,14 @@ void trace(ivec2 texel) {
         c_rho = measured_specular(s, q, row);
         s.roughness = -1.0;
     }
+#endif
+#ifndef REAL
+#ifdef EXTENDED
+    if (s.roughness >= 0.0) {
+        c_rho = coated_specular(texel, s, q);
+        s.roughness = -1.0;
+    }
+#endif
 #endif
     if (s.roughness >= 0.0) {
         vec3 v = normalize(camera_position - s.position);

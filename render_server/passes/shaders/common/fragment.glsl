@@ -3,6 +3,7 @@
 #include "common/shown_maps.glsl"
 #include "common/camera.glsl"
 #pragma switch CUTOUTS
+#pragma switch PACKS_EXTENDED
 #pragma switch MEASURED
 
 struct Fragment {
@@ -14,6 +15,9 @@ struct Fragment {
     vec3 tint;
     int material;
     bool is_front;
+#ifdef CUTOUTS
+    float opacity;   // of its vertices
+#endif
 #ifdef MATERIAL_MAPS
     vec2 second_uv;
     // What a pixel to the right (xy) and one down (zw) add; the same of the place.
@@ -24,7 +28,12 @@ struct Fragment {
 #endif
 };
 
-struct Surface { vec4 position; vec4 normal; vec2 uv; vec4 tint; };   // as the geometry buffer's textures
+struct Surface {   // as the geometry buffer's textures
+    vec4 position; vec4 normal; vec2 uv; vec4 tint;
+#ifdef PACKS_EXTENDED
+    uvec4 extended;
+#endif
+};
 
 #ifdef MATERIAL_MAPS
 #include "common/fragment_maps.glsl"
@@ -62,6 +71,10 @@ Surface surface_at(Fragment f, bool shows) {
     vec3 view = camera_position - f.world, n = facing_normal(f, view);
     vec2 uv = f.uv;
     vec4 tint = vec4(f.tint, 1.0);
+#ifdef PACKS_EXTENDED
+    Extended extended = fragment_extended(f, shows);
+    extended.over.normal = bent_normal(f, materials[f.material].maps[COAT_NORMAL], n, normalize(view));
+#endif
 #ifdef MATERIAL_MAPS
     n = bent_normal(f, materials[f.material].maps[NORMAL], n, normalize(view));
     pack_maps(fragment_maps(f, shows), uv, tint);
@@ -69,5 +82,13 @@ Surface surface_at(Fragment f, bool shows) {
     if (is_by_light(f.material)) uv = place_on_texture(f, n, uv.x);
 #endif
 #endif
-    return Surface(vec4(f.world, f.depth), vec4(n, float(f.material)), uv, tint);
+    Surface s;
+    s.position = vec4(f.world, f.depth);
+    s.normal = vec4(n, float(f.material));
+    s.uv = uv;
+    s.tint = tint;
+#ifdef PACKS_EXTENDED
+    s.extended = pack_extended(extended);
+#endif
+    return s;
 }

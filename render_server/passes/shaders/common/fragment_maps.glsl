@@ -37,9 +37,23 @@ ShownMaps fragment_maps(Fragment f, bool wanted) {
     return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, glow);
 }
 
+#ifdef EXTENDED
+Extended fragment_extended(Fragment f, bool wanted) {
+    MaterialEntry e = materials[f.material];
+    vec3 f0 = map_here(color_maps, f, e.maps[SPECULAR_COLOR], wanted).rgb * map_here(color_maps, f, e.maps[SPECULAR], wanted).a;
+    Coating over = mapped_coating(e, map_here(data_maps, f, e.maps[COAT], wanted).r, map_here(data_maps, f, e.maps[COAT_ROUGHNESS], wanted).g,
+        map_here(color_maps, f, e.maps[SHEEN], wanted).rgb, map_here(color_maps, f, e.maps[SHEEN_ROUGHNESS], wanted).a);
+    return Extended(over, f0, map_here(data_maps, f, e.maps[TRANSMITTED], wanted).r);
+}
+#endif
+
 float fragment_opacity(Fragment f) {
     MaterialEntry e = materials[f.material];
-    return e.alpha.y * map_here(color_maps, f, e.maps[BASE_COLOR], true).a;
+    float own = e.alpha.y * map_here(color_maps, f, e.maps[BASE_COLOR], true).a;
+#ifdef CUTOUTS
+    own *= f.opacity;
+#endif
+    return own;
 }
 
 // Directions along u and against v of a triangle's coordinate, of any length. `s`: slopes_of.

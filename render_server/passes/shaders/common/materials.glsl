@@ -1,5 +1,7 @@
 // Materials of meshes. MATERIAL_MAPS: some have maps or alpha (scene/materials.py): two arrays of textures with mip levels.
+// EXTENDED: a coat or a sheen lies over some (common/coating.glsl), or maps tell what their dielectric part reflects and lets through.
 #include "common/even_noise.glsl"
+#pragma switch EXTENDED
 #ifndef MATERIAL_MAPS
 #pragma switch MATERIAL_MAPS
 #else
@@ -9,21 +11,37 @@ struct MapEntry {
     vec4 sampling;   // wraps (across + 3 down); columns, rows of an unfiltered texture, else 0; strength
 };
 #endif
+#ifdef EXTENDED
+const int MAP_COUNT = 13;
+
+// What lies over a base; `normal` is the coat's own, zero if it has the surface's.
+struct Coating { float coat; float roughness; vec3 normal; vec3 sheen; float sheen_roughness; };
+#else
+const int MAP_COUNT = 5;
+#endif
 struct MaterialEntry {
     vec4 base_color;   // rgb linear; metallic
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
     vec4 flags;        // double-sided; row + 1 of the measured, layer + 1 of a texture by light, 0: none; layers of a stack, -1: unlit
     vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
+#ifdef EXTENDED
+    vec4 coat;         // fraction under the coat, its roughness; the sheen's
+    vec4 sheen;        // rgb
+#endif
 #ifdef MATERIAL_MAPS
     vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
-    MapEntry maps[5];
+    MapEntry maps[MAP_COUNT];
 #endif
 };
 layout(std430) readonly buffer Materials { MaterialEntry materials[]; };
 
 // An unlit surface glows with its base colour, which the vertex colour multiplies.
 vec3 glow_tint(MaterialEntry e, vec3 tint) { return e.flags.w < 0.0 ? tint : vec3(1.0); }
+
+#ifdef EXTENDED
+Coating plain_coating(MaterialEntry e) { return Coating(e.coat.x, e.coat.y, vec3(0.0), e.sheen.rgb, e.coat.z); }
+#endif
 
 // Of a Material: `passing` is the fraction of the light entering the surface that goes on through it, `diffuse` what of
 // the rest comes back.
@@ -32,6 +50,10 @@ uniform sampler2DArray color_maps;   // linear; a: alpha, of a mask the fraction
 uniform sampler2DArray data_maps;
 
 const int BASE_COLOR = 0, METALLIC_ROUGHNESS = 1, NORMAL = 2, OCCLUSION = 3, EMISSIVE = 4;
+#ifdef EXTENDED
+const int COAT = 5, COAT_ROUGHNESS = 6, COAT_NORMAL = 7, SHEEN = 8, SHEEN_ROUGHNESS = 9;
+const int SPECULAR = 10, SPECULAR_COLOR = 11, TRANSMITTED = 12;
+#endif
 const int CLAMPED = 1, MIRRORED = 2;   // wraps; 0 repeats
 const float MASKED = 1.0, BLENDED = 2.0;   // modes of alpha
 const float APART = 5.588238;              // of the noise of materials and sides: what lies behind is left out elsewhere
@@ -39,6 +61,9 @@ const float COARSEST = 32.0;   // mip level: a texture's mean
 
 struct Material {
     vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; vec3 passing;
+#ifdef EXTENDED
+    Coating over;
+#endif
 #ifdef MEASURED
     int measured;   // row, -1: none
     int layers;     // of a stack, 0: none
@@ -61,6 +86,9 @@ Material mapped(MaterialEntry e, vec3 base, float metallic, float roughness, flo
     m.emission = e.emission.rgb * glow;
     m.occlusion = occlusion;
     m.passing = entering * e.emission.a;
+#ifdef EXTENDED
+    m.over = plain_coating(e);
+#endif
 #ifdef MEASURED
     m.measured = int(e.flags.y) - 1;
     m.layers = 0;
@@ -103,6 +131,26 @@ float level_of(MaterialEntry e, sampler2DArray maps, float size) {
     return log2(max(size * e.alpha.z * float(textureSize(maps, 0).x), 1.0));
 }
 
+#ifdef EXTENDED
+// With what maps give of the reflectance at normal incidence, and of transmission.
+MaterialEntry with_dielectric(MaterialEntry e, vec3 f0, float transmission) {
+    e.dielectric.rgb *= f0;
+    e.emission.a *= transmission;
+    return e;
+}
+
+// The material's own, times what maps give.
+Coating mapped_coating(MaterialEntry e, float coat, float roughness, vec3 sheen, float sheen_roughness) {
+    return Coating(e.coat.x * coat, e.coat.y * roughness, vec3(0.0), e.sheen.rgb * sheen, e.coat.z * sheen_roughness);
+}
+
+Coating coating_of(MaterialEntry e, vec2 uv, float color_level, float data_level) {
+    return mapped_coating(e, map_level(data_maps, e.maps[COAT], uv, data_level).r,
+        map_level(data_maps, e.maps[COAT_ROUGHNESS], uv, data_level).g, map_level(color_maps, e.maps[SHEEN], uv, color_level).rgb,
+        map_level(color_maps, e.maps[SHEEN_ROUGHNESS], uv, color_level).a);
+}
+#endif
+
 // `tint`: the vertex colour, which multiplies the base colour. `size`: of the footprint, m.
 Material material_of(int index, vec2 uv, vec3 tint, float size) {
     MaterialEntry e = materials[index];
@@ -110,8 +158,20 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     vec3 base = e.base_color.rgb * tint * map_level(color_maps, e.maps[BASE_COLOR], uv, level).rgb;
     vec2 rough_metal = map_level(data_maps, e.maps[METALLIC_ROUGHNESS], uv, level_of(e, data_maps, size)).gb;
     vec3 glow = glow_tint(e, tint) * map_level(color_maps, e.maps[EMISSIVE], uv, level).rgb;
-    return mapped(e, base, rough_metal.y, rough_metal.x, 1.0, glow);
+#ifdef EXTENDED
+    float data_level = level_of(e, data_maps, size);
+    vec3 f0 = map_level(color_maps, e.maps[SPECULAR_COLOR], uv, level).rgb * map_level(color_maps, e.maps[SPECULAR], uv, level).a;
+    e = with_dielectric(e, f0, map_level(data_maps, e.maps[TRANSMITTED], uv, data_level).r);
+#endif
+    Material m = mapped(e, base, rough_metal.y, rough_metal.x, 1.0, glow);
+#ifdef EXTENDED
+    m.over = coating_of(e, uv, level, data_level);
+#endif
+    return m;
 }
+
+// Vertices hold their opacity beside the material's number, as a fraction (scene/triangle_mesh.py).
+float opacity_of_vertices(float clear) { return 1.0 - 2.0 * clear; }
 
 // Fraction of a footprint that is there.
 float opacity_of(int index, vec2 uv, float size) {
@@ -129,6 +189,9 @@ bool is_cut_out(int index, float opacity, float even) {
 #else
 struct Material {
     vec3 diffuse; vec3 f0; float roughness; vec3 emission; vec3 passing;
+#ifdef EXTENDED
+    Coating over;
+#endif
 #ifdef MEASURED
     int measured;
 #endif
@@ -145,6 +208,9 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     m.f0 = mix(e.dielectric.rgb, base, e.base_color.a);
     m.roughness = e.dielectric.a;
     m.emission = e.emission.rgb * glow_tint(e, tint);
+#ifdef EXTENDED
+    m.over = plain_coating(e);
+#endif
 #ifdef MEASURED
     m.measured = int(e.flags.y) - 1;
 #endif

@@ -4,11 +4,12 @@
 #include "common/lobe.glsl"
 #ifdef OF_OBJECTS
 #include "common/shown_maps.glsl"
+#include "common/shown_normal.glsl"
 #else
 #include "common/surfaces.glsl"
 #endif
 
-struct Mirror { bool present; vec3 point; vec3 normal; float depth; float alpha; };
+struct Mirror { bool present; vec3 point; vec3 normal; float depth; float alpha; bool of_coat; };
 
 #ifdef OF_OBJECTS
 bool shines(MaterialEntry m) { return m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0; }
@@ -18,12 +19,19 @@ Mirror mirror_at(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
     vec4 position = texelFetch(virtual_raster_position, raster, 0);
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
-    Mirror m = Mirror(false, position.xyz, normal.xyz, position.w, LEAST_ALPHA);
+    Mirror m = Mirror(false, position.xyz, normal.xyz, position.w, LEAST_ALPHA, false);
     if (position.w <= 0.0) return m;
-    float roughness = roughness_at(raster, int(normal.w));
+    float roughness = shines(materials[int(normal.w)]) ? roughness_at(raster, int(normal.w)) : 1.0;
+#ifdef EXTENDED
+    Coating over = coating_at(raster, int(normal.w));
+    m.of_coat = over.coat > 0.0 && over.roughness < roughness;
+    if (m.of_coat) {   // the smoother of both speaks for both
+        roughness = over.roughness;
+        m.normal = shown_normal(raster, true).xyz;
+    }
+#endif
     m.alpha = max(roughness * roughness, LEAST_ALPHA);
-    bool faces = dot(m.normal, camera_position - m.point) > 0.0;
-    m.present = shines(materials[int(normal.w)]) && roughness < RAY_ROUGHNESS && faces;
+    m.present = roughness < RAY_ROUGHNESS && dot(m.normal, camera_position - m.point) > 0.0;
     return m;
 }
 
@@ -40,7 +48,7 @@ float mirror_entry(ivec2 pixel) { return texelFetch(virtual_raster_normal, raste
 Mirror mirror_at(ivec2 pixel) {
     vec4 position = texelFetch(real_surface_position, pixel, 0);
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);
-    Mirror m = Mirror(false, position.xyz, normal.xyz, position.w, LEAST_ALPHA);
+    Mirror m = Mirror(false, position.xyz, normal.xyz, position.w, LEAST_ALPHA, false);
     if (position.w <= 0.0 || normal.w < 0.0) return m;
     SurfaceEntry e = surfaces[int(normal.w)];
     vec3 away = camera_position - position.xyz;

@@ -11,7 +11,8 @@ const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its 
 // A ray from the camera, reflected by a sample of the lobe of a surface that may be curved; `spread`: pixels that the rays start from.
 Ray lobe_ray(ivec2 pixel, Mirror m, vec4 numbers, float spread) {
     vec4 position = vec4(m.point, m.depth), normal = vec4(m.normal, mirror_entry(pixel));
-    Change x = change_along(pixel, ivec2(1, 0), position, normal), y = change_along(pixel, ivec2(0, 1), position, normal);
+    Change x = change_along(pixel, ivec2(1, 0), position, normal, m.of_coat);
+    Change y = change_along(pixel, ivec2(0, 1), position, normal, m.of_coat);
     vec2 within = spread * (numbers.zw - 0.5);
     vec3 aside = within.x * x.position + within.y * y.position;
     vec3 from = m.point + aside - m.normal * dot(aside, m.normal);   // on the tangent plane: not within a ball

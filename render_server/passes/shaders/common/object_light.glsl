@@ -20,8 +20,12 @@ vec3 response_times_cosine(vec3 n, vec3 v, vec3 l, float cosine, Material m, flo
     if (m.is_polynomial) return polynomial_response(m, l);
 #endif
 #endif
+#ifdef EXTENDED
+    return coated_response(m, n, v, l, cosine, radius);
+#else
     vec3 base = m.diffuse / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v));
     return base * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
+#endif
 }
 
 vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
@@ -41,5 +45,5 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
 }
 
 vec3 object_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, Indirect indirect) {
-    return with_gathered(m.emission + direct_radiance(p, depth, n, v, m), m, max(dot(n, v), 1e-3), indirect);
+    return with_gathered(emitted(m, n, v) + direct_radiance(p, depth, n, v, m), m, n, v, indirect);
 }

@@ -43,9 +43,13 @@ bool is_open_at(int at, vec2 place) {
     ivec3 rows = VERTEX_FLOATS * floatBitsToInt(vec3(face_at(3 * at).w, face_at(3 * at + 1).w, face_at(3 * at + 2).w));
     vec3 weights = vec3(1.0 - place.x - place.y, place);
     vec2 uv = vec2(0.0);
-    for (int k = 0; k < 3; ++k) uv += weights[k] * vec2(vertices[rows[k] + 6], vertices[rows[k] + 7]);
+    float clear = 0.0;
+    for (int k = 0; k < 3; ++k) {
+        uv += weights[k] * vec2(vertices[rows[k] + 6], vertices[rows[k] + 7]);
+        clear += weights[k] * fract(vertices[rows[k] + 11]);
+    }
     int material = int(vertices[rows.x + 11]);
-    return is_cut_out(material, opacity_of(material, uv, 0.0), even_noise(PLACES * place));
+    return is_cut_out(material, opacity_of_vertices(clear) * opacity_of(material, uv, 0.0), even_noise(PLACES * place));
 }
 #endif
 

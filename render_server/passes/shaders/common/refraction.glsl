@@ -1,4 +1,7 @@
 // Light at the surfaces of transparent objects (docs/method.md 4.11): Snell, Fresnel, total reflection. Needs brdf.glsl and ray_mesh.glsl.
+#ifdef EXTENDED
+#include "common/coating.glsl"
+#endif
 
 // A surface that a ray meets: normals against the ray, of the mesh as it is smoothed and of the triangle itself.
 struct Interface { vec3 position; vec3 normal; vec3 face; int material; Material surface; };
@@ -40,7 +43,12 @@ float relative_index(Interface i, bool inside) {
 vec3 interface_reflectance(Interface i, vec3 d, bool inside) {
     float cosine = -dot(i.normal, d);
     if (inside) return vec3(fresnel_dielectric(cosine, relative_index(i, true)));
-    return specular_reflectance(i.surface.f0, i.surface.roughness, cosine);
+    vec3 base = specular_reflectance(i.surface.f0, i.surface.roughness, cosine);
+#ifdef EXTENDED
+    return 1.0 - reflected_towards(i.surface, i.normal, -d).below * (1.0 - base);
+#else
+    return base;
+#endif
 }
 
 // The refracted direction; it goes on beyond the triangle, too, where the smooth normal is another one. Not for total reflection.

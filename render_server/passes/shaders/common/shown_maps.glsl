@@ -23,6 +23,30 @@ ShownMaps unpack_maps(vec2 uv, vec4 tint) {
 // An image, because OpenGL guarantees no more than sixteen samplers.
 layout(rg32f) readonly uniform image2D virtual_raster_uv;
 
+#ifdef EXTENDED
+#include "common/octahedral.glsl"
+layout(rgba32ui) readonly uniform uimage2D virtual_raster_extended;
+
+// Coat and sheen with their maps, and what maps give of f0 and transmission.
+struct Extended { Coating over; vec3 f0; float transmission; };
+
+uvec4 pack_extended(Extended s) {
+    uint normal = packUnorm2x16(octahedral_uv(s.over.normal));   // for mirror images
+    return uvec4(packUnorm4x8(vec4(s.over.coat, s.over.roughness, s.over.sheen_roughness, s.transmission)),
+        packUnorm4x8(vec4(sqrt(s.over.sheen), 0.0)), normal, packUnorm4x8(vec4(sqrt(s.f0), 0.0)));
+}
+
+Extended extended_at(ivec2 raster) {
+    uvec4 codes = imageLoad(virtual_raster_extended, raster);
+    vec4 amounts = unpackUnorm4x8(codes.x);
+    vec3 sheen = unpackUnorm4x8(codes.y).rgb, f0 = unpackUnorm4x8(codes.w).rgb;
+    vec3 normal = octahedral_direction(unpackUnorm2x16(codes.z));
+    return Extended(Coating(amounts.x, amounts.y, normal, sheen * sheen, amounts.z), f0 * f0, amounts.w);
+}
+
+Coating coating_at(ivec2 raster, int material) { return extended_at(raster).over; }
+#endif
+
 ShownMaps maps_at(ivec2 raster, vec4 tint) { return unpack_maps(imageLoad(virtual_raster_uv, raster).xy, tint); }
 
 float roughness_at(ivec2 raster, int material) {
@@ -32,9 +56,21 @@ float roughness_at(ivec2 raster, int material) {
 Material material_at(ivec2 raster, int material, vec4 tint) {
     ShownMaps s = maps_at(raster, tint);
     MaterialEntry e = materials[material];
-    return mapped(e, e.base_color.rgb * s.base, s.metallic, s.roughness, s.occlusion, s.glow);
+#ifdef EXTENDED
+    Extended extended = extended_at(raster);
+    e = with_dielectric(e, extended.f0, extended.transmission);
+#endif
+    Material m = mapped(e, e.base_color.rgb * s.base, s.metallic, s.roughness, s.occlusion, s.glow);
+#ifdef EXTENDED
+    m.over = extended.over;
+#endif
+    return m;
 }
 #else
+#ifdef EXTENDED
+Coating coating_at(ivec2 raster, int material) { return plain_coating(materials[material]); }
+#endif
+
 float roughness_at(ivec2 raster, int material) { return materials[material].dielectric.a; }
 
 Material material_at(ivec2 raster, int material, vec4 tint) { return material_of(material, vec2(0.0), tint.rgb, 0.0); }

@@ -23,6 +23,9 @@ vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
 }
 #else
 #include "common/materials.glsl"
+#ifdef EXTENDED
+#include "common/coating.glsl"
+#endif
 
 Material virtual_material(Surfel s) {
     return material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb, sqrt(s.position_area.w));
@@ -30,6 +33,10 @@ Material virtual_material(Surfel s) {
 
 vec3 virtual_albedo(Surfel s) {
     Material m = virtual_material(s);
-    return min(mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness), vec3(ALBEDO_RANGE.y));
+    vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
+#ifdef EXTENDED
+    albedo = mean_coated_reflectance(m, albedo);
+#endif
+    return min(albedo, vec3(ALBEDO_RANGE.y));
 }
 #endif
