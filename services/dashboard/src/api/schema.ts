@@ -1957,6 +1957,12 @@ export interface components {
              */
             readonly geometry_volume?: boolean | null;
             /**
+             * Memory Budget Mb
+             * @description Memory limit of the volumes, MB; beyond it, rendering is refused.
+             * @default 4096
+             */
+            readonly memory_budget_mb: number;
+            /**
              * Name
              * @default dlpv
              * @constant
@@ -2039,7 +2045,7 @@ export interface components {
             readonly volume_edge_m?: number | null;
             /**
              * Volume Size
-             * @description Cells along each edge; more cells cost more without improving the picture.
+             * @description Cells along each edge; more cells cost more and hardly improve the picture.
              * @default 32
              */
             readonly volume_size: number;
