@@ -19,7 +19,7 @@ import numpy as np
 
 from deltalight.render_server.gpu.buffer_images import BUFFER_IMAGES, BufferImage
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.program_slots import BindingCalls, Calls, Slot, Value, values_of
+from deltalight.render_server.gpu.program_slots import BindingCalls, Slot, Value, values_of
 from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
 from deltalight.render_server.gpu.texel_images import with_images
 from deltalight.render_server.gpu.textures import image_format, release_all, texels_of
@@ -110,9 +110,9 @@ class Program:
             (self._storage, self._storage_call),
             (self._blocks, self._block_call),
         )
-        self._binders = [(slot, binder) for slots, binder in binders for slot in slots]
-        self._resources = values_of([slot.name for slot, _ in self._binders])
-        self._calls = BindingCalls()
+        bound = [(slot, binder) for slots, binder in binders for slot in slots]
+        self._resources = values_of([slot.name for slot, _ in bound])
+        self._calls = BindingCalls([partial(binder, slot) for slot, binder in bound])
         self._values = values_of([slot.name for slot in self._uniforms])
         self._switch_values = values_of(declared.switches)
 
@@ -154,21 +154,14 @@ class Program:
             for slot in self._arrays:
                 self._shown[slot.name].bind(slot.place, self._buffer(slot, known[slot.name]))
         except KeyError:
-            slots = (*(slot for slot, _ in self._binders), *self._arrays, *self._uniforms)
-            self._require({slot.name for slot in slots}, known)
+            slots = self._samplers, self._images, self._storage, self._blocks, self._arrays, self._uniforms
+            self._require({slot.name for each in slots for slot in each}, known)
             raise
-        calls = self._calls.of(resources)
-        for call in self._made_calls(resources) if calls is None else calls:
+        for call in self._calls.of(resources):
             call()
         for slot, value in zip(self._uniforms, values, strict=True):
             if type(value) not in NUMBERS or slot.last != value:
                 self._write(slot, value)
-
-    def _made_calls(self, resources: Sequence[Any]) -> Calls:
-        """Returns the calls that bind the resources, which are checked."""
-        calls = [call(slot, item) for (slot, call), item in zip(self._binders, resources, strict=True)]
-        self._calls.keep(resources, calls)
-        return calls
 
     def _require(self, names: Set[str], known: Bindings) -> None:
         if not names <= known.keys():

@@ -27,19 +27,25 @@ class Slot:
 class BindingCalls:
     """The calls that bind the resources of a program, for each set of them that it ran with while all of it lives.
 
-    What was bound once needs no more checks, and most runs bind what the same run of the last frame did.
+    What was bound once needs no more checks, and most runs bind what the same run of the last frame did. `binders`
+    check a resource each and return the call that binds it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, binders: Sequence[Callable[[Any], Callable[[], None]]]) -> None:
+        self._binders = binders
         self._kept: dict[tuple[int, ...], tuple[Calls, list[ReferenceType[Any]]]] = {}
 
-    def of(self, items: Sequence[object]) -> Calls | None:
-        """Returns the calls that bind these very objects, None if there are none yet."""
+    def of(self, items: Sequence[Any]) -> Calls:
+        """Returns the calls that bind these very objects; None among them stands for nothing."""
         found = self._kept.get(tuple(map(id, items)))
-        return None if found is None else found[0]
+        if found is not None:
+            return found[0]
+        calls = [binder(item) for binder, item in zip(self._binders, items, strict=True)]
+        self._keep(items, calls)
+        return calls
 
-    def keep(self, items: Sequence[object], calls: Calls) -> None:
-        """Keeps the calls that bind `items` (None: nothing), until one of these ends: its id may be used again."""
+    def _keep(self, items: Sequence[Any], calls: Calls) -> None:
+        """Keeps the calls until one of the items ends: its id may be used again."""
         if len(self._kept) >= SETS_KEPT:
             self._kept.clear()
         kept, ids = self._kept, tuple(map(id, items))

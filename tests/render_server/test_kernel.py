@@ -14,7 +14,6 @@ from deltalight.render_server.gpu import context as context_module
 from deltalight.render_server.gpu import kernel as kernel_module
 from deltalight.render_server.gpu.context import GpuContext, count_gl_objects
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, RasterKernel, watched
-from deltalight.render_server.gpu.program_slots import BindingCalls
 from deltalight.render_server.gpu.shader_source import SHADERS
 from deltalight.render_server.gpu.textures import texture_2d
 from deltalight.render_server.gpu.uniform_block import (
@@ -110,20 +109,6 @@ def test_textures_that_take_turns_are_checked_once_each_and_others_still(
         kernel.run((1,), Out=out, seen=codes)
     other.release()
     codes.release()
-
-
-def test_calls_are_kept_as_long_as_what_they_bind() -> None:
-    class Resource:
-        """Something that can be bound."""
-
-    kept, made = BindingCalls(), [lambda: None]
-    held = Resource(), None, Resource()
-    kept.keep(held, made)
-    assert kept.of(held) is made
-    assert kept.of(held[::-1]) is None
-    del held
-    # Python gives the ids of what ended to what comes next.
-    assert all(kept.of((Resource(), None, Resource())) is None for _ in range(100))
 
 
 def test_what_a_variant_leaves_out_may_be_given(make: MakeKernel, out: moderngl.Buffer) -> None:
