@@ -5,7 +5,7 @@ No sockets, no files except the scene's assets.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -27,7 +27,6 @@ from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, raster_texels
 from deltalight.render_server.post_effects.bloom import bloomed
 from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
-from deltalight.render_server.post_effects.tone import in_tone
 from deltalight.render_server.room_mesh import RoomMesh, room_mesh
 from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.started_frame import (
@@ -493,7 +492,7 @@ class SceneRenderer:
             return None
         low, high = shown.objects.bounds
         found = source.camera.artifacts.observe(frame, shown.view.world_from_camera, (low + high) / 2)
-        return replace(found, frame=in_tone(frame, output.tone))
+        return found.under(output.tone)
 
     def release(self) -> None:
         """Frees all GL objects."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import moderngl
@@ -481,19 +481,12 @@ def shading_stages(
     mirrored = g.stage("mirrored objects", shading.mirror_objects, s.objects, scene, grid, bvh, marching)
     screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
     radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
-    return Layers(
-        direct,
-        cones,
-        grid,
-        change,
-        radiance,
-        reflection,
-        shown,
-        volume,
-        lit.real_maps,
-        direct_mu=own_light,
-        transmit=lambda own: g.stage("transmitted light", shading.add_transmitted, own, *behind),
-    )
+
+    def transmit(own: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
+        return g.stage("transmitted light", shading.add_transmitted, own, *behind)
+
+    layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
+    return replace(layers, direct_mu=own_light, transmit=transmit)
 
 
 def _new_object(*_: object) -> object:

@@ -4,12 +4,14 @@ In this order: vignetting, blur, compression, noise. Noise is last because it is
 Where the camera's mosaic is known, noise comes before it, as at the sensor, and the compression last.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene_output import Tone
 from deltalight.render_server.post_effects.camera_blur import (
     LEAST_MOTION_PX,
     NO_MOTION,
@@ -36,6 +38,7 @@ from deltalight.render_server.post_effects.camera_mosaic import (
 )
 from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
 from deltalight.render_server.post_effects.camera_vignetting import PaperVignetting, Vignetting, vignetted
+from deltalight.render_server.post_effects.tone import in_tone
 
 MOST_MEASURED = 8
 """Frames in which the lens's blur is measured."""
@@ -54,6 +57,10 @@ class FrameArtifacts:
     compression: Compression | None = None
     distance_blur: DistanceBlur | None = None
     mosaic: Mosaic | None = None
+
+    def under(self, tone: Tone) -> Self:
+        """Return what a picture gets that was made with a tone curve."""
+        return replace(self, frame=in_tone(self.frame, tone))
 
     def applied(
         self, color: Color, coverage: Coverage, depth_m: Float32[np.ndarray, "h w"] | None = None
