@@ -216,12 +216,15 @@ def measure_sweeps(
     """Measure the small points of every sweep, or all; what this machine refuses is listed with the reason.
 
     Raises:
-        DeltalightError: no OpenGL, or missing demo files.
+        DeltalightError: no OpenGL, missing demo files, or a machine that refuses every size.
     """
     take = prepare_take(progress)
     with opened(device):
         pass  # what this refuses, no point could do
-    return [_measured(sweep, frames, size, device, progress, take, full=full) for sweep in SWEEPS]
+    found = [_measured(sweep, frames, size, device, progress, take, full=full) for sweep in SWEEPS]
+    if not any(each.reports for each in found):
+        raise DeltalightError(next(reason for each in found for reason in each.refused.values()))
+    return found
 
 
 def _measured(  # noqa: PLR0917 (as the command has them)

@@ -116,6 +116,17 @@ def test_sizes_that_a_machine_refuses_are_listed_with_the_reason(monkeypatch: py
     assert "paper:volume_size=512: A buffer of 537 MB is needed." in shown.getvalue()
 
 
+def test_a_machine_that_refuses_every_size_is_told_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def measure(*_: object, **_more: object) -> SpeedReport:
+        raise DeltalightError("A buffer of 537 MB is needed.")
+
+    monkeypatch.setattr(sweep, "measure_speed", measure)
+    monkeypatch.setattr(sweep, "prepare_take", lambda _: None)
+    monkeypatch.setattr(sweep, "opened", lambda _: nullcontext())
+    with pytest.raises(DeltalightError, match="A buffer of 537 MB is needed"):
+        measure_sweeps(1, None, None, Progress(disable=True), full=False)
+
+
 def test_tables_join_our_stages_with_published_times() -> None:
     point = Point("64^3", "paper", (1.5, None), is_small=True)
     both = Sweep("Both", "arm", {"voxels": ("voxelize a", "voxelize b"), "rest": ("missing",)}, (point,))
