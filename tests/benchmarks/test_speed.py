@@ -252,7 +252,7 @@ def test_counted_frames_agree_with_what_the_graph_ran(
     )  # the objects' first samples, and a shadow map
     assert camera.per_frame["dispatches"] > 10
     assert 0 < camera.python_ms.median <= camera.python_ms.p95
-    assert 0 < camera.thread_ms.median <= camera.python_ms.p95
+    assert camera.thread_ms.median > 0
 
 
 # The commands
