@@ -107,7 +107,8 @@ def build_surface_table(
     """
     if len(surfaces) > MAX_SURFACES:
         raise DeltalightError(
-            f"real.surfaces has {len(surfaces)} entries; declare at most {MAX_SURFACES}, no diffuse ones."
+            f"real.surfaces has {len(surfaces)} entries; declare at most {MAX_SURFACES}, and of "
+            "what is diffuse only sheets."
         )
     rows = [] if board is None else [_sheet_row(quad) for quad in _sheets(board)]
     rows += [_sheet_row(_outline(each.region.sheet)) for each in surfaces if each.region.sheet is not None]
