@@ -56,8 +56,9 @@ class CameraHistory:
     def update(self, taken: PosedFrame, *, is_unknown: bool) -> bool:
         """Takes a frame; returns whether anything moved in it. `is_unknown`: there is no real scene yet."""
         expected, self._expected = self._expected, None
-        is_expected = expected is not None and expected.frame is taken.frame
-        self._newest = samples = expected if expected and is_expected else FrameSamples(taken.frame)
+        if expected is None or expected.frame is not taken.frame:
+            expected = FrameSamples(taken.frame)
+        self._newest = samples = expected
         # Depth without a surface (a camera that starts) explains nothing: the next frame counts as another scene.
         self.moved = self._motion.update(samples) or is_unknown
         if self.moved:
