@@ -1,7 +1,8 @@
 """A BSDF for Mitsuba of surfaces under clear coats and sheens; imported where Mitsuba is.
 
 It has the layers of KHR_materials_clearcoat and KHR_materials_sheen as the renderer (docs/method.md 4.12) and
-none of its numbers: integrals are by quadrature here, and the base and the coat are those of energy_keeping.py.
+none of its fits but the published one of the fibres' shadowing: integrals are by quadrature here, and the base and
+the coat are those of energy_keeping.py.
 """
 
 import math
