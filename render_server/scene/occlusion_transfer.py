@@ -77,11 +77,11 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
     color = np.ones_like(corners)
     if not plain:
         material = mesh.material
-        base, metal = (
-            _texels(mesh, each) for each in (material.base_color_map, material.metallic_roughness_map)
-        )
+        maps = (material.base_color_map, material.metallic_roughness_map, material.transmission_map)
+        base, metal, clear = (_texels(mesh, each) for each in maps)
         metallic = material.metallic * (1.0 if metal is None else metal[..., 2:] / 255)
-        color *= (1 - metallic) * (1 - material.transmission) * material.base_color
+        passing = material.transmission * (1.0 if clear is None else clear[..., :1] / 255)
+        color *= (1 - metallic) * (1 - passing) * material.base_color
         if mesh.colors is not None:
             color *= mesh.colors[mesh.triangles]
         if base is not None:

@@ -251,7 +251,7 @@ def test_counted_frames_agree_with_what_the_graph_ran(
         camera.per_frame["draws"] == 2 + 3 * gpu.is_software
     )  # the objects' first samples, and a shadow map
     assert camera.per_frame["dispatches"] > 10
-    assert 0 < camera.python_ms.median <= camera.python_ms.p95
+    assert camera.python_ms.median > 0
     assert camera.thread_ms.median > 0
 
 

@@ -14,6 +14,7 @@ from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.caustics import HEADER_BYTES, SENT_BEAM_BYTES
 from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 
 WIDTH, HEIGHT = 160, 120
@@ -308,3 +309,12 @@ class ObjectsRenderer:
         graph = self.renderer.graph
         assert graph is not None
         return array_of(graph["object surface"].coverage.texture)[..., 0]
+
+
+def sent_flux(renderer: SceneRenderer) -> float:
+    """Flux of all beams that leave the objects, as shaders/common/sent_beams.glsl packs them."""
+    assert renderer.graph is not None
+    data = renderer.graph["caustic beams"].beams.bindings["SentBeams"].read()
+    count = int(np.frombuffer(data[:4], np.uint32)[0])
+    beams = np.frombuffer(data, np.float32, count * SENT_BEAM_BYTES // 4, HEADER_BYTES)
+    return float(beams.reshape(count, -1)[:, 8].sum())

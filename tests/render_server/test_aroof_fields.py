@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,12 +73,20 @@ def test_reflectance_is_that_of_the_texture_where_it_lies(
     assert found[:, 3:] == pytest.approx(np.repeat(np.array(expected)[:, None], 3, axis=1), abs=1e-3)
 
 
-def test_a_texture_tells_which_part_is_metal() -> None:
-    """Whose factor is 1 where a glTF file does not say otherwise; metal has no diffuse reflectance."""
-    data = np.array([[(0, 128, 0), (0, 128, 51)]], np.uint8)
-    material = Material(
-        base_color=np.full(3, 0.5, np.float32), metallic=1.0, metallic_roughness_map=TextureMap(data)
-    )
+@pytest.mark.parametrize(
+    ("textured", "texel"),
+    [
+        (lambda data: {"metallic": 1.0, "metallic_roughness_map": data}, (0, 128, 51)),
+        (lambda data: {"transmission": 1.0, "transmission_map": data}, (51, 0, 0)),
+    ],
+    ids=["metal", "clear"],
+)
+def test_a_texture_tells_which_part_is_metal_or_clear(
+    textured: Callable[[TextureMap], dict[str, Any]], texel: tuple[int, int, int]
+) -> None:
+    """Whose factor may be 1 for all of it; what is metal, or lets light through, has no diffuse reflectance."""
+    data = TextureMap(np.array([[(0, 128, 0), texel]], np.uint8))
+    material = Material(base_color=np.full(3, 0.5, np.float32), **textured(data))
     corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0)], np.float32)
     up, uv = (
         np.tile(np.array([0, 0, 1], np.float32), (3, 1)),

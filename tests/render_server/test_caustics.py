@@ -10,12 +10,7 @@ import trimesh
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
-from deltalight.render_server.passes.caustics import (
-    GREATEST_ALPHA,
-    HEADER_BYTES,
-    SENT_BEAM_BYTES,
-    Caustics,
-)
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
@@ -30,6 +25,7 @@ from tests.render_server.scenes import (
     fields_of,
     floor,
     frame,
+    sent_flux,
     shifted,
     sphere_light,
 )
@@ -173,15 +169,6 @@ def test_beams_of_white_metal_carry_all_light_that_meets_it(
     renderer.release()
     print(f"{tilt_deg} degrees: {np.round(shares, 3)}")
     assert shares == pytest.approx(np.ones(len(shares)), abs=0.03)
-
-
-def sent_flux(renderer: SceneRenderer) -> float:
-    """Flux of all beams that leave the objects, as shaders/common/sent_beams.glsl packs them."""
-    assert renderer.graph is not None
-    data = renderer.graph["caustic beams"].beams.bindings["SentBeams"].read()
-    count = int(np.frombuffer(data[:4], np.uint32)[0])
-    beams = np.frombuffer(data, np.float32, count * SENT_BEAM_BYTES // 4, HEADER_BYTES)
-    return float(beams.reshape(count, -1)[:, 8].sum())
 
 
 @pytest.mark.slow

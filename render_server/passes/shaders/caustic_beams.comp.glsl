@@ -9,6 +9,9 @@
 #include "common/ray_pattern.glsl"
 #include "common/lobe.glsl"
 #include "common/packing.glsl"
+#ifdef EXTENDED
+#include "common/coating.glsl"
+#endif
 #ifdef REFRACTED
 #include "common/refraction.glsl"
 #endif
@@ -265,6 +268,9 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     if (n_dot_l <= 0.0) return;
     flux *= fresnel_schlick(m.f0, dot(v, h)) * unmasked(dot(spot.normal, v), n_dot_l, alpha)
         * further_reflections(m.f0, lobe_albedo(m.roughness, dot(spot.normal, v)).x);
+#ifdef EXTENDED
+    flux *= reflected_towards(m, spot.normal, direction).below;
+#endif
     float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // half a disc's radius
     float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
     Drift x = drift_along(view, texel, ivec2(1, 0), spot, side), y = drift_along(view, texel, ivec2(0, 1), spot, side);

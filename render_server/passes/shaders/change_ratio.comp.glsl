@@ -21,9 +21,9 @@ uniform sampler2D reflection;   // a: fraction of a smooth surface's lobe that o
 #pragma texels rgba16f direct_mu direct_rho cone_mu cone_rho cone_specular_mu cone_specular_rho reflection
 #pragma switch bool has_reflection
 uniform int scale;
+#include "common/least_change.glsl"
 
 const float LEAST_IRRADIANCE = 1e-4;
-const float LEAST_CHANGE = 1.0 / 512.0;   // of the irradiance: 0.2 of a code of an 8-bit picture at most
 
 bool differs(vec3 mu, vec3 rho, vec3 all_mu) { return any(greaterThan(abs(rho - mu), LEAST_CHANGE * all_mu)); }
 

@@ -157,10 +157,13 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 diffuse = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness);
     vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(WHITEST));
     bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
-#ifdef EXTENDED
-    albedo = min(mean_coated_reflectance(m, albedo), vec3(WHITEST));
-#endif
     vec3 carried = in_beams ? (albedo - min(diffuse, albedo)) * surfel_light(own, DIRECT_RHO).rgb : vec3(0.0);
+#ifdef EXTENDED
+    float below = mean_below(m.over);   // beams carry the base's lobe alone
+    albedo = min(mean_coated_reflectance(m, albedo), vec3(WHITEST));
+    carried *= below;
+    m.emission *= below;
+#endif
     return unsummed(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
 }
 #endif
@@ -218,11 +221,9 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 #endif
 
 #ifdef REAL_DELTA
-// Relative changes of gathered light below this fraction are invisible in 8-bit pictures; mu and rho then count as
-// equal, and need no two marches.
-const float LEAST_CHANGE = 1.0 / 512.0;
+#include "common/least_change.glsl"
 
-// L_rho - L_mu.
+// L_rho - L_mu; 0 where gathered light hardly changes, so that mu and rho are equal there, and need no two marches.
 vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
@@ -253,6 +254,9 @@ void light(Surfel s, uint own, vec3 n) {
 #if defined(VIRTUAL) && defined(TRANSMISSION)
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb, sqrt(s.position_area.w));
     vec3 passing = m.passing * (1.0 - mean_specular_reflectance(m.f0, m.roughness));
+#ifdef EXTENDED
+    passing *= mean_below(m.over);
+#endif
     opaque -= dot(passing, vec3(1.0 / 3.0));
 #endif
     add(voxel, n, area, opaque, radiance);

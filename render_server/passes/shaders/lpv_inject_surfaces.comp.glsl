@@ -17,7 +17,7 @@ vec3 reflectance(Surfel s, vec3 n) { return albedo_at(s, n, environment_irradian
 vec3 emission_of(Surfel s) { return vec3(0.0); }
 #else
 vec3 reflectance(Surfel s, vec3 n) { return virtual_albedo(s); }
-vec3 emission_of(Surfel s) { return virtual_material(s).emission; }
+vec3 emission_of(Surfel s) { return virtual_emission(s); }
 #endif
 
 vec3 sent_out(Surfel s, vec3 n) {

@@ -18,7 +18,7 @@ layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 w
 layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mean radiance of the specular cone
 #define READS_TAIL
 #include "common/bounce_tail.glsl"
-const float LEAST_CHANGE = 1.0 / 512.0;   // as in light_voxels: where less changes, mu and rho stay equal
+#include "common/least_change.glsl"
 
 vec3 with_further_bounces(vec3 e_mu, vec3 e_rho, vec3 q, vec3 n) {
     if (!inside_volume(q)) return e_rho;

@@ -80,9 +80,14 @@ vec3 coated_response(Material m, vec3 n, vec3 v, vec3 l, float cosine, float rad
         + over.coat * specular_times_cosine(nc, v, l, COAT_F0, over.roughness, radius);
 }
 
+// What coat and sheen let out of the base, in the mean.
+float mean_below(Coating over) {
+    return (1.0 - mean_coat_reflectance(over)) * (1.0 - greatest_of(over.sheen) * mean_sheen_albedo(over.sheen_roughness));
+}
+
 // Of light from everywhere, the part that a surface reflects, of its base's `base`.
 vec3 mean_coated_reflectance(Material m, vec3 base) {
     float coat = mean_coat_reflectance(m.over);
     vec3 sheen = m.over.sheen * mean_sheen_albedo(m.over.sheen_roughness);
-    return coat + (1.0 - coat) * (sheen + (1.0 - greatest_of(sheen)) * base);
+    return coat + (1.0 - coat) * sheen + mean_below(m.over) * base;
 }

@@ -39,4 +39,12 @@ vec3 virtual_albedo(Surfel s) {
 #endif
     return min(albedo, vec3(ALBEDO_RANGE.y));
 }
+
+vec3 virtual_emission(Surfel s) {
+    Material m = virtual_material(s);
+#ifdef EXTENDED
+    m.emission *= mean_below(m.over);
+#endif
+    return m.emission;
+}
 #endif
