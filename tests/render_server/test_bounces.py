@@ -209,7 +209,7 @@ def in_a_niche(
 def test_the_tail_stands_for_further_gatherings(gpu: GpuContext, stage: Stage, bounces: int) -> None:
     found, many = in_a_niche(gpu, stage, bounces), in_a_niche(gpu, stage, 4)
     print(f"{bounces} bounces: {found:.4f} of the light is taken, with four {many:.4f}")
-    assert found == pytest.approx(many, rel=0.03)
+    assert found == pytest.approx(many, rel=0.035)
 
 
 def test_without_the_tail_a_bounce_takes_much_less_than_four(gpu: GpuContext, stage: Stage) -> None:
