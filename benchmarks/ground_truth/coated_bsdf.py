@@ -28,6 +28,7 @@ from deltalight.benchmarks.ground_truth.energy_keeping import (
 from deltalight.benchmarks.ground_truth.energy_keeping_bsdf import (
     GlossySurface,
     LobeShares,
+    bsdf_class,
     polynomial,
     polynomial_place,
 )
@@ -57,7 +58,7 @@ def coated(
     """Return a surface under a coat (factor, roughness) over a sheen, in glTF's terms."""
     variant = str(mi.variant())
     if variant not in _registered:
-        mi.register_bsdf(PLUGIN, _material())
+        mi.register_bsdf(PLUGIN, bsdf_class(CoatedSurface))
         _registered.add(variant)
     values = {"roughness": roughness, "metallic": metallic, "specular": 0.5}
     over = {"coat": coat[0], "coat_roughness": coat[1], "sheen_roughness": sheen_roughness}
@@ -135,6 +136,15 @@ class CoatedSurface:
         return bs, dr.select(found, value / dr.select(found, bs.pdf, 1), 0)
 
     @property
+    def color(self) -> Numbers:
+        """The texture that tells the base's colour."""
+        return self.base.color
+
+    def albedo(self, si: Numbers, active: Numbers) -> Numbers:
+        """Return that of the base."""
+        return self.base.albedo(si, active)
+
+    @property
     def _coat_samples(self) -> float:
         return COAT_SAMPLES if self.amount > 0 else 0.0
 
@@ -169,36 +179,3 @@ class CoatedSurface:
         facing = dr.clip(mi.Frame3f.cos_theta(normal), 0, 1 - 1e-6)
         white = _fibres(facing, (cosine_i, cosine_o), self.sheen_alpha, (dr.exp, dr.select))
         return mi.Color3f(*self.sheen.tolist()) * white
-
-
-def _material() -> type:
-    """Return the class of the current variant; a context's choice of components is not heeded."""
-
-    class Coated(mi.BSDF):
-        """See `coated`."""
-
-        def __init__(self, props: Numbers) -> None:
-            super().__init__(props)
-            self.surface = CoatedSurface.of(props)
-            kinds = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection
-            self.m_components = [kind | mi.BSDFFlags.FrontSide for kind in kinds]
-            self.m_flags = self.m_components[0] | self.m_components[1]
-
-        def sample(
-            self, _ctx: Numbers, si: Numbers, u: Numbers, uv: Numbers, active: Numbers = True
-        ) -> Numbers:
-            return self.surface.sample(si, u, uv, active)
-
-        def eval(self, _ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
-            return self.surface.eval_pdf(si, wo, active)[0]
-
-        def pdf(self, _ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
-            return self.surface.eval_pdf(si, wo, active)[1]
-
-        def eval_pdf(self, _ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
-            return self.surface.eval_pdf(si, wo, active)
-
-        def to_string(self) -> str:
-            return f"Coated[coat={self.surface.amount}, sheen={self.surface.sheen.tolist()}]"
-
-    return Coated

@@ -121,9 +121,9 @@ def register() -> None:
     """Make the material known to Mitsuba's current variant."""
     import mitsuba as mi
 
-    from deltalight.benchmarks.ground_truth.energy_keeping_bsdf import material
+    from deltalight.benchmarks.ground_truth.energy_keeping_bsdf import GlossySurface, bsdf_class
 
     variant = str(mi.variant())
     if variant not in _registered:
-        mi.register_bsdf(PLUGIN, material())
+        mi.register_bsdf(PLUGIN, bsdf_class(GlossySurface))
         _registered.add(variant)

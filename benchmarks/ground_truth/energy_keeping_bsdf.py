@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Protocol, Self
 
 import drjit as dr
 import mitsuba as mi
@@ -75,6 +75,11 @@ class GlossySurface:
         facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
         return cls(base, metallic, alpha, f0, LobeShares(lobe_albedo(alpha, f0, metallic)), facets)
 
+    @property
+    def color(self) -> Numbers:
+        """The texture that tells its colour."""
+        return self.base
+
     def albedo(self, si: Numbers, active: Numbers) -> Numbers:
         """Return that of the base."""
         return (1 - self.metallic) * self.base.eval(si, active)
@@ -121,17 +126,38 @@ class GlossySurface:
         return lobe / dr.maximum(lobe + rest, 1e-6)
 
 
-def material() -> type:
-    """Return the class of the current variant; a context's choice of components is not heeded."""
+class Surface(Protocol):
+    """What a BSDF of `bsdf_class` asks of its surface; angles and directions are in its local frame."""
 
-    class EnergyKeeping(mi.BSDF):
-        """See `energy_keeping`."""
+    @classmethod
+    def of(cls, props: Numbers) -> Self:
+        """Return the surface that Mitsuba's properties describe."""
+
+    def sample(self, si: Numbers, sample1: Numbers, sample2: Numbers, active: Numbers) -> Numbers:
+        """Draw a direction."""
+
+    def eval_pdf(self, si: Numbers, wo: Numbers, active: Numbers) -> Numbers:
+        """Return the BSDF times cosine, and the density of `sample` per solid angle."""
+
+    def albedo(self, si: Numbers, active: Numbers) -> Numbers:
+        """Return the diffuse reflectance, which guides denoisers."""
+
+    @property
+    def color(self) -> Numbers:
+        """The texture that tells its colour."""
+
+
+def bsdf_class(kind: type[Surface]) -> type:
+    """Return the current variant's class of such surfaces; a context's choice of components is not heeded."""
+
+    class SurfaceBsdf(mi.BSDF):
+        """Hands everything on to its surface."""
 
         def __init__(self, props: Numbers) -> None:
             super().__init__(props)
-            self.surface = GlossySurface.of(props)
-            kinds = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection
-            self.m_components = [kind | mi.BSDFFlags.FrontSide for kind in kinds]
+            self.surface = kind.of(props)
+            lobes = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection
+            self.m_components = [lobe | mi.BSDFFlags.FrontSide for lobe in lobes]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def sample(
@@ -149,15 +175,15 @@ def material() -> type:
             return self.surface.eval_pdf(si, wo, active)
 
         def eval_diffuse_reflectance(self, si: Numbers, active: Numbers = True) -> Numbers:
-            return self.surface.albedo(si, active)  # it guides denoisers
+            return self.surface.albedo(si, active)
 
         def traverse(self, cb: Numbers) -> None:
-            cb.put("base_color", self.surface.base, mi.ParamFlags.Differentiable)
+            cb.put("base_color", self.surface.color, mi.ParamFlags.Differentiable)
 
         def to_string(self) -> str:
-            return f"EnergyKeeping[alpha={self.surface.alpha}, metallic={self.surface.metallic}]"
+            return str(self.surface)
 
-    return EnergyKeeping
+    return SurfaceBsdf
 
 
 def _normal_reflectance(base: Numbers, metallic: float, dielectric: float) -> Triple:

@@ -71,6 +71,7 @@ def test_every_point_is_a_method_with_settings_that_exist(one: Sweep) -> None:
         assert variant.name == method
     assert all(len(point.published_ms) == len(one.columns) for point in one.points)
     assert any(point.is_small and point.method for point in one.points)
+    assert "splatting" in one.title or not all(point.is_small for point in one.points)
 
 
 def test_every_size_of_the_dissertations_propagation_is_there() -> None:
