@@ -1,5 +1,6 @@
 """Light propagation volumes: injection and queries against closed forms, and what holds for every picture."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,13 @@ from jaxtyping import Float64
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose, ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument, parse_scene
-from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.protocol.scene_objects import Pose
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.graph import Graph
-from deltalight.render_server.passes.lpv import CONSTANT, LOBE, LightVolume, LpvPropagate, lobe_weights
+from deltalight.render_server.passes.lpv import CONSTANT, LightVolume, LpvPropagate, lobe_weights
 from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server.lpv_scenes import dlpv as on_every_pixel
+from tests.render_server.lpv_scenes import graph_of, injected_flux
 from tests.render_server.scenes import (
     FOCAL,
     GREY,
@@ -42,7 +43,7 @@ from tests.render_server.scenes import (
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 CELLS = 16
-FIXED = 2**20  # steps a unit of injected light
+dlpv = partial(on_every_pixel, volume_size=CELLS)
 
 
 @pytest.fixture
@@ -50,29 +51,10 @@ def stage(tmp_path: Path) -> Stage:
     return Stage(tmp_path)
 
 
-def dlpv(document: SceneDocument, **settings: object) -> SceneDocument:
-    """The document with this method, queried at every pixel."""
-    method = {"volume_size": CELLS, "volume_edge_m": 0.6, "query_scale": 1, "rsm_size": 256, **settings}
-    return document.replaced(method=DlpvMethod.model_validate({"name": "dlpv", **method}))
-
-
 def run(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None = None) -> SceneRenderer:
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame() if view is None else view)
     return renderer
-
-
-def graph_of(renderer: SceneRenderer) -> Graph:
-    assert renderer.graph is not None
-    return renderer.graph
-
-
-def flux(graph: Graph, name: str) -> Float64[np.ndarray, "n n n 3"]:
-    """Injected flux of each cell, W in the picture's units."""
-    sums = np.frombuffer(graph[name].read(), np.int32).reshape(-1, 3, 4)
-    edge = graph["volume"].placement.voxel_edge
-    watts = sums[..., 0] / FIXED * np.pi / LOBE[0] * edge**2
-    return np.asarray(watts.reshape(CELLS, CELLS, CELLS, 3))
 
 
 def test_injected_is_the_flux_that_a_box_reflects_and_what_the_floor_lost(
@@ -83,7 +65,7 @@ def test_injected_is_the_flux_that_a_box_reflects_and_what_the_floor_lost(
     document = dlpv(document, operator="paper", volume_edge_m=0.5)
     renderer = run(gpu, document)
     graph = graph_of(renderer)
-    change, direct = (flux(graph, name) for name in ("inject change", "inject direct"))
+    change, direct = (injected_flux(graph, name) for name in ("inject change", "inject direct"))
     linear = array_of(graph["camera image"].linear)[0, 0, :3]
     renderer.release()
     albedo = np.pi * linear / 2.0

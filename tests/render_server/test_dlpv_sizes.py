@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument, parse_scene
@@ -16,9 +16,10 @@ from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods.lpv import DifferenceVolumes, LpvCells, PrintedVolumes
 from deltalight.render_server.methods.lpv_memory import PrintedSizes, state_memory, volumes_bytes
 from deltalight.render_server.methods.method import SOFTWARE_DEFAULTS
-from deltalight.render_server.passes.lpv import CONSTANT, LOBE, LightVolume, LpvPropagate, moment_weights
+from deltalight.render_server.passes.lpv import CONSTANT, LightVolume, LpvPropagate, moment_weights
 from deltalight.render_server.passes.voxels import LEAST_SURFELS
 from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server.lpv_scenes import dlpv, graph_of, injected_flux
 from tests.render_server.scenes import (
     Stage,
     array_of,
@@ -33,7 +34,6 @@ from tests.render_server.scenes import (
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 LARGEST = 128
-FIXED = 2**20  # steps a unit of injected light
 
 
 @pytest.fixture
@@ -45,24 +45,10 @@ def settings_of(**settings: object) -> DlpvMethod:
     return DlpvMethod.model_validate({"name": "dlpv", **settings})
 
 
-def dlpv(document: SceneDocument, **settings: object) -> SceneDocument:
-    """The document with this method, queried at every pixel."""
-    method = {"volume_edge_m": 0.6, "query_scale": 1, "rsm_size": 256, **settings}
-    return document.replaced(method=settings_of(**method))
-
-
 def rendered(gpu: GpuContext, document: SceneDocument) -> tuple[SceneRenderer, Graph]:
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame())
-    assert renderer.graph is not None
-    return renderer, renderer.graph
-
-
-def injected_flux(graph: Graph, name: str) -> Float64[np.ndarray, "z y x 3"]:
-    """Of each cell, W in the picture's units."""
-    placement = graph["volume"].placement
-    sums = np.frombuffer(graph[name].read(), np.int32).reshape((*(placement.size,) * 3, 3, 4))
-    return np.asarray(sums[..., 0] / FIXED * np.pi / LOBE[0] * placement.voxel_edge**2)
+    return renderer, graph_of(renderer)
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (0.4, 0.25, -1.0)])
