@@ -89,8 +89,8 @@ def read_plot(speed: Sequence[Path], quality: Sequence[Path], motion: str) -> Pl
     timed, rated = [read_report(path) for path in speed], [_read_means(path) for path in quality]
     for other in timed[1:]:
         require_alike(timed[0], other)
-    for rated_otherwise in rated[1:]:
-        _require_alike(rated[0], rated_otherwise)
+    for other_means in rated[1:]:
+        _require_alike(rated[0], other_means)
     times_ms, means = _medians(timed, motion), rated[0]
     qualities = {
         name: figures.get("changed_psnr_db")

@@ -269,7 +269,7 @@ class Material:
         material = material._with_alpha(mode, float(color[3]), float(description.get("alphaCutoff", 0.5)))
         if "KHR_materials_unlit" in extensions:
             return material._unlit()
-        return material if material.is_coated else material._bare()
+        return material if material.is_coated else material._without_coating()
 
     def _with_alpha(self, mode: AlphaMode, factor: float, cutoff: float) -> Self:
         """Returns the material with its alpha; a mask becomes coverage, one half at the cutoff.
@@ -283,8 +283,8 @@ class Material:
         texels[..., 3] = np.clip(0.5 + (texels[..., 3] * factor - cutoff) * _MASK_SLOPE, 0, 1)
         return replace(self, alpha_mode=mode, base_color_map=replace(self.base_color_map, texels=texels))
 
-    def _bare(self) -> Self:
-        """Returns the material without maps of what does not lie over it."""
+    def _without_coating(self) -> Self:
+        """Returns the material without the maps of a coat and a sheen, which it lacks."""
         return replace(
             self,
             coat_map=None,
@@ -297,7 +297,7 @@ class Material:
     def _unlit(self) -> Self:
         """Returns the material that glows with its base colour instead of being lit (KHR_materials_unlit)."""
         return replace(
-            self._bare(),
+            self._without_coating(),
             specular_map=None,
             specular_color_map=None,
             transmission_map=None,

@@ -39,8 +39,8 @@ float sheen_times_cosine(vec3 n, vec3 v, vec3 l, float roughness) {
     h *= inversesqrt(max(dot(h, h), 1e-12));
     float cosine = clamp(dot(n, h), 0.0, 1.0);
     float d = (2.0 + 1.0 / alpha) * pow(max(1.0 - cosine * cosine, 1e-6), 0.5 / alpha) / (2.0 * PI);
-    float shown = 1.0 / ((1.0 + sheen_lambda(n_dot_v, alpha) + sheen_lambda(n_dot_l, alpha)) * 4.0 * n_dot_v);
-    return d * shown / max(sheen_lobe_albedo(r, n_dot_v), 1.0);
+    float masking = 1.0 / ((1.0 + sheen_lambda(n_dot_v, alpha) + sheen_lambda(n_dot_l, alpha)) * 4.0 * n_dot_v);
+    return d * masking / max(sheen_lobe_albedo(r, n_dot_v), 1.0);
 }
 
 float greatest_of(vec3 c) { return max(max(c.r, c.g), c.b); }

@@ -14,19 +14,19 @@ Patch lit_patch(LightView view, vec2 s, vec3 p, vec3 n) {
 }
 
 // With the axis that a normal is nearest to as the last one, and back.
-vec3 flat_lying(vec3 v, vec3 steep) { return steep.z >= max(steep.x, steep.y) ? v : steep.y >= steep.x ? v.zxy : v.yzx; }
-vec3 upright(vec3 v, vec3 steep) { return steep.z >= max(steep.x, steep.y) ? v : steep.y >= steep.x ? v.yzx : v.zxy; }
+vec3 to_plane_axes(vec3 v, vec3 steep) { return steep.z >= max(steep.x, steep.y) ? v : steep.y >= steep.x ? v.zxy : v.yzx; }
+vec3 from_plane_axes(vec3 v, vec3 steep) { return steep.z >= max(steep.x, steep.y) ? v : steep.y >= steep.x ? v.yzx : v.zxy; }
 
 // As inject(), of a patch. It is split by cells along the two axes that its plane is nearest to, and its parts lie in that plane.
 void inject_patch(Patch lit, vec3 axis, vec3 flux) {
-    vec3 steep = abs(lit.n), n = flat_lying(lit.n, steep), q = flat_lying(volume_coordinate(lit.p) + 0.5 * axis, steep);
-    vec2 extent = clamp(flat_lying(lit.extents, steep).xy / voxel_edge, 1e-3, LARGEST_PATCH), slope = -n.xy / n.z;
+    vec3 steep = abs(lit.n), n = to_plane_axes(lit.n, steep), q = to_plane_axes(volume_coordinate(lit.p) + 0.5 * axis, steep);
+    vec2 extent = clamp(to_plane_axes(lit.extents, steep).xy / voxel_edge, 1e-3, LARGEST_PATCH), slope = -n.xy / n.z;
     vec2 low = q.xy - 0.5 * extent, high = low + extent;
     ivec2 first = max(ivec2(floor(low)), 0), last = min(ivec2(floor(high)), volume_size - 1);   // none outside the volume
     for (int j = first.y; j <= last.y; ++j)
         for (int i = first.x; i <= last.x; ++i) {
             vec2 from = max(low, vec2(i, j)), to = min(high, vec2(i, j) + 1.0), share = (to - from) / extent, middle = 0.5 * (from + to);
             vec3 part = vec3(middle, q.z + dot(slope, middle - q.xy));
-            inject_at(upright(part, steep), axis, flux * share.x * share.y);
+            inject_at(from_plane_axes(part, steep), axis, flux * share.x * share.y);
         }
 }
