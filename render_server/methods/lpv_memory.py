@@ -1,5 +1,6 @@
 """Sizes of light propagation volumes, and the memory that they take (docs/method.md 5)."""
 
+import math
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -8,10 +9,12 @@ from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.passes.lpv import (
     COVERED_BYTES,
     INJECTED_BYTES,
+    JOINED_BYTES,
     LIGHT_BYTES,
     TRANSMITTED_BYTES,
 )
-from deltalight.render_server.passes.voxels import SLOT_BYTES, mipmap_bytes, within_budget
+from deltalight.render_server.passes.volumes import MOST_VOLUMES
+from deltalight.render_server.passes.voxels import MEGABYTE, SLOT_BYTES, mipmap_bytes, within_budget
 
 # Per cell of `LpvCells`: two sums each of light and of covered faces, transmittances, and grids of eight half cells.
 CELL_BYTES = 2 * (INJECTED_BYTES + COVERED_BYTES + TRANSMITTED_BYTES + 8 * SLOT_BYTES)
@@ -37,8 +40,29 @@ class PrintedSizes:
         return sorted({self.objects, self.indirect, self.direct})
 
 
-def volumes_bytes(settings: DlpvMethod) -> int:
-    """Returns the bytes of all volumes and grids; surfels come on top, as many as there are."""
+def volumes_bytes(settings: DlpvMethod, count: int = 1) -> int:
+    """Returns the bytes of `count` sets of volumes and grids; surfels come on top, as many as there are."""
+    joined = 0 if count == 1 else _joined_bytes(settings)
+    return count * (_set_bytes(settings) + joined)
+
+
+def _joined_bytes(settings: DlpvMethod) -> int:
+    """Returns the bytes of one set of volumes in the textures that surfaces read, where several are joined."""
+    sizes = PrintedSizes.of(settings)
+    read = [sizes.objects, sizes.indirect]
+    if settings.resolved_shadow == "lobe":
+        read.append(sizes.direct)
+    return sum(JOINED_BYTES * n**3 for n in read)
+
+
+def affordable_count(settings: DlpvMethod) -> int:
+    """Returns how many sets of volumes the budget has room for; a single one that does not fit is refused."""
+    budget = settings.memory_budget_mb * MEGABYTE
+    counts = range(2, MOST_VOLUMES + 1)
+    return max((count for count in counts if volumes_bytes(settings, count) <= budget), default=1)
+
+
+def _set_bytes(settings: DlpvMethod) -> int:
     sizes = PrintedSizes.of(settings)
     common = sum(CELL_BYTES * n**3 for n in sizes.counts) + mipmap_bytes(sizes.indirect, 1)
     if settings.operator == "difference":
@@ -58,4 +82,9 @@ def state_memory(settings: DlpvMethod, _resolved: ResolvedSettings) -> str:
     size, name = max(((getattr(settings, name) or 0, name) for name in names), key=itemgetter(0))
     budget_mb, what = settings.memory_budget_mb, f"A volume set of {size}^3 cells"
     needed = within_budget(volumes_bytes(settings), what, budget_mb, f"method.{name}")
-    return f"volume set {size}^3: {needed} MB of a budget of {budget_mb} MB"
+    stated = f"volume set {size}^3: {needed} MB of a budget of {budget_mb} MB"
+    count = affordable_count(settings)
+    if settings.volume_edge_m is not None or count == 1:
+        return stated
+    several_mb = math.ceil(volumes_bytes(settings, count) / MEGABYTE)
+    return f"{stated}; objects far apart: up to {count} sets, {several_mb} MB"

@@ -76,14 +76,14 @@ def place_volumes(
     whole = extent.volume_edge if edge_m is None else edge_m
     single = [extent], (_placed(extent, size_of(1), whole),)
     parts = [each for each in extent.parts if each.volume_edge > 0]
-    if edge_m is not None or len(parts) < 2 or not size_of(2):
+    if edge_m is not None or len(parts) < 2:
         return single
     gaps = relative_gaps(parts)
-    members = group_near(gaps)
+    members = group_near(gaps, max(count for count in range(1, MOST_VOLUMES + 1) if size_of(count)))
     size = size_of(len(members))
     groups = [ObjectExtent.around([parts[each] for each in group]) for group in members]
     edges = _volume_edges(groups, [[gaps[np.ix_(one, other)].min() for other in members] for one in members])
-    if len(groups) == 1 or not size or max(edges) * size_of(1) > whole * size:
+    if len(groups) == 1 or max(edges) * size_of(1) > whole * size:
         return single
     placed = zip(groups, edges, strict=True)
     return groups, tuple(_placed(group, size, edge) for group, edge in placed)
@@ -102,11 +102,11 @@ def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
     return np.asarray(np.abs(middles[:, None] - middles).max(axis=-1) / reach - 1)
 
 
-def group_near(gaps: Float64[np.ndarray, "n n"]) -> list[list[int]]:
-    """Joins objects whose gap is negative, then the nearest until MOST_VOLUMES groups are left (single linkage)."""
+def group_near(gaps: Float64[np.ndarray, "n n"], most: int = MOST_VOLUMES) -> list[list[int]]:
+    """Joins objects whose gap is negative, then the nearest until `most` groups are left (single linkage)."""
     groups = {index: [index] for index in range(len(gaps))}
     for one, other in sorted(combinations(groups, 2), key=lambda pair: gaps[pair]):
-        if gaps[one, other] >= 0 and len({id(group) for group in groups.values()}) <= MOST_VOLUMES:
+        if gaps[one, other] >= 0 and len({id(group) for group in groups.values()}) <= most:
             break
         if groups[one] is not groups[other]:
             joined = sorted(groups[one] + groups[other])

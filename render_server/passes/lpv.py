@@ -4,7 +4,9 @@ See docs/method.md 5; shaders/common/light_cells.glsl has the cells' layout.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import moderngl
 import numpy as np
@@ -22,7 +24,8 @@ from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 INJECTED_SUMS = 12  # per cell: 4 coefficients x 3 channels
 COVERED_SUMS = 6  # per cell: its low faces on three axes, surfaces that face - and +
 INJECTED_BYTES, COVERED_BYTES, TRANSMITTED_BYTES = 4 * INJECTED_SUMS, 4 * COVERED_SUMS, 8  # per cell
-LIGHT_BYTES = 3 * 3 * 16  # per cell of a `LightVolume`: three textures, three channels
+JOINED_BYTES = 3 * 16  # per cell of `LpvJoin`: three channels
+LIGHT_BYTES = 3 * JOINED_BYTES  # per cell of a `LightVolume`: three textures
 LOWER_CELLS = "method.volume_size (objects_volume_size, direct_volume_size)"
 CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0 and Y_1 along its axis
 LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # of the clamped cosine in them
@@ -104,6 +107,59 @@ class LightVolume:
         release_all(self.state, self.next_state, self.total)
 
 
+class Light(Protocol):
+    """What surfaces read of light volumes."""
+
+    @property
+    def cells(self) -> int:
+        """Along an edge of each volume."""
+
+    @property
+    def total(self) -> moderngl.Texture3D:
+        """Those of several volumes side by side in x."""
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedLight:
+    """The totals of several volumes."""
+
+    cells: int
+    total: moderngl.Texture3D
+
+
+class LpvJoin:
+    """Puts the totals of several volumes side by side; surfaces read that of a single one as it is."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._kernel = Kernel(gpu, "lpv_join")
+        self._total: moderngl.Texture3D | None = None
+
+    def run(self, lights: Sequence[LightVolume | None]) -> Light | None:
+        """Returns all light; None where there are no volumes."""
+        given = [light for light in lights if light is not None]
+        if len(given) < 2:
+            release_all(self._total)
+            self._total = None
+            return given[0] if given else None
+        cells = given[0].cells
+        total = self._with_room((len(given) * cells, cells, 3 * cells))
+        for index, light in enumerate(given):
+            own: Bindings = {"total": light.total, "first": index * cells, "cells": cells}
+            self._kernel.run((cells, cells, 3 * cells), own, joined=total)
+        return JoinedLight(cells, total)
+
+    def _with_room(self, size: tuple[int, int, int]) -> moderngl.Texture3D:
+        if self._total is None or self._total.size != size:
+            release_all(self._total)
+            self._total = texture_3d(self._gpu, size, 4, "f4")
+        return self._total
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._kernel, self._total)
+
+
 def injected_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
     """Creates empty fixed-point sums of injected light."""
     return _zeros(gpu, cells**3 * INJECTED_BYTES)
@@ -180,10 +236,18 @@ class LpvShow:
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = Kernel(gpu, "lpv_show")
 
-    def run(self, shown: VoxelMipmap, change: moderngl.Buffer, direct: moderngl.Buffer | None = None) -> None:
-        """Writes `change`, and what `direct` has in its cells, into level 0 of `shown`, which has one direction.
+    def run(
+        self,
+        shown: VoxelMipmap,
+        change: moderngl.Buffer,
+        direct: moderngl.Buffer | None = None,
+        *,
+        volume: int = 0,
+    ) -> None:
+        """Writes `change`, and what `direct` has in its cells, into level 0 of a `volume` of `shown`.
 
-        Cells of `direct` may be larger or smaller than those of `change`; both fill the same cube.
+        `shown` has one direction. Cells of `direct` may be larger or smaller than those of `change`; both fill the
+        same cube.
         """
         cells = cells_of(change)
         self._kernel.run(
@@ -193,6 +257,7 @@ class LpvShow:
             Direct=change if direct is None else direct,
             cells=cells,
             direct_cells=0 if direct is None else cells_of(direct),
+            first=volume * cells,
         )
 
     def release(self) -> None:

@@ -79,6 +79,10 @@ class VolumePlacement:
         """Returns the placement's block as the coarse volume beyond; cones end before it unless it `is_used`."""
         return FarVolumeBlock(self.origin, self.voxel_edge, self.size if is_used else 0, self.levels)
 
+    def divided(self, size: int) -> "VolumePlacement":
+        """Returns the same cube of `size`^3 voxels."""
+        return VolumePlacement(self.origin, self.voxel_edge * self.size / size, size)
+
     def meets(self, low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]) -> bool:
         """Whether a box (world, m) reaches into the volume."""
         origin, edge = np.array(self.origin), self.size * self.voxel_edge

@@ -36,6 +36,7 @@ vec3 mirrored(SurfacePoint s) {
 
 #ifdef REAL
 void shade(ivec2 texel, SurfacePoint s) {
+    enter_volume(s.position);
     vec3 q = volume_coordinate(s.position);
     vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), c = vec3(0.0);
     float fade = s.present ? border_fade(q) : 0.0;
@@ -63,6 +64,7 @@ void shade(ivec2 texel, SurfacePoint s) {
 void shade(ivec2 texel, SurfacePoint s) {
     vec3 e = vec3(0.0), c = vec3(0.0);
     if (s.present) {
+        enter_volume(s.position);
         vec3 q = volume_coordinate(s.position);
         e = max(environment_irradiance(s.normal) + from_volume(true, q, s.normal), vec3(0.0));
         c = mirrored(s);

@@ -8,6 +8,7 @@ layout(std430) readonly buffer Change { int change[]; };
 layout(std430) readonly buffer Direct { int direct[]; };
 uniform int cells;
 uniform int direct_cells;   // of the same cube; 0: none
+uniform int first;          // x of the volume's first cell among all volumes
 
 const float RADIANCE = 1.0 / LOBE.x;   // of the first coefficient: flux / (pi edge^2)
 
@@ -38,5 +39,5 @@ void main() {
     vec3 light = radiance_of(cell);
     if (direct_cells > 0) light += direct_mean(cell);
     float mean = dot(light, vec3(1.0 / 3.0));
-    imageStore(shown, cell, vec4(mean < 0.0 ? vec3(-mean, 0.0, 0.0) : max(light, vec3(0.0)), light == vec3(0.0) ? 0.0 : 1.0));
+    imageStore(shown, cell + ivec3(first, 0, 0), vec4(mean < 0.0 ? vec3(-mean, 0.0, 0.0) : max(light, vec3(0.0)), light == vec3(0.0) ? 0.0 : 1.0));
 }

@@ -31,6 +31,7 @@ void gather(ivec2 texel) {
     vec3 position = texelFetch(hit_position, texel, 0).xyz;
     vec4 normal = texelFetch(hit_normal, texel, 0);
     Mirror m = mirror_at(mirror_pixel(texelFetch(sample_pixels, texel, 0)));
+    enter_volume(position);
     vec3 q = volume_coordinate(position), d = reflect(normalize(position - m.point), normal.xyz);
     vec3 e = max(environment_irradiance(normal.xyz) + from_volume(true, q, normal.xyz), vec3(0.0));
     vec3 seen = environment(d, specular_half_angle(materials[int(normal.w)].dielectric.a));

@@ -1,5 +1,6 @@
 // Irradiance of a surface from the light volumes (docs/method.md 5): E(n) = 2/3 <SH, lobe(-n)> (light is stored per
-// cell edge squared), trilinear about the point half a cell above the surface. Needs volume.glsl.
+// cell edge squared), trilinear about the point half a cell above the surface. Volumes lie side by side in x; the one of
+// volume.glsl, which must come first, is read.
 #include "common/light_cells.glsl"
 
 uniform sampler3D light_mu;    // or the direct change
@@ -18,7 +19,7 @@ struct Light12 { vec4 r; vec4 g; vec4 b; };
 
 // Intensity at q of a volume of `size` cells an edge; with `front_only` from the cells whose centres are in front of the plane (p, n).
 Light12 intensity(bool with_objects, int size, vec3 q, vec3 p, vec3 n, bool front_only) {
-    ivec3 base = ivec3(floor(q - 0.5));
+    ivec3 base = ivec3(floor(q - 0.5)), first = ivec3(volume * size, 0, 0);
     vec3 f = q - 0.5 - vec3(base);
     Light12 sum = Light12(vec4(0.0), vec4(0.0), vec4(0.0));
     float total = 0.0;
@@ -27,9 +28,9 @@ Light12 intensity(bool with_objects, int size, vec3 q, vec3 p, vec3 n, bool fron
         vec3 fraction = mix(1.0 - f, f, vec3(o));
         float w = fraction.x * fraction.y * fraction.z * (front_only ? max(dot(vec3(cell) + 0.5 - p, n), 0.0) : 1.0);
         if (w <= 0.0 || !in_grid(cell, size)) continue;
-        sum.r += w * light_of(with_objects, in_channel(cell, 0, size));
-        sum.g += w * light_of(with_objects, in_channel(cell, 1, size));
-        sum.b += w * light_of(with_objects, in_channel(cell, 2, size));
+        sum.r += w * light_of(with_objects, in_channel(first + cell, 0, size));
+        sum.g += w * light_of(with_objects, in_channel(first + cell, 1, size));
+        sum.b += w * light_of(with_objects, in_channel(first + cell, 2, size));
         total += w;
     }
     float scale = total > 0.0 ? 1.0 / total : 0.0;
