@@ -26,7 +26,7 @@ def graph_of(renderer: SceneRenderer) -> Graph:
 
 
 def injected_flux(graph: Graph, name: str) -> Float64[np.ndarray, "z y x 3"]:
-    """Of each cell, W in the picture's units."""
+    """Of each cell of the first volume, W in the picture's units."""
     placement = graph["volume"].placement
-    sums = np.frombuffer(graph[name].read(), np.int32).reshape((*(placement.size,) * 3, 3, 4))
+    sums = np.frombuffer(graph[name][0].read(), np.int32).reshape((*(placement.size,) * 3, 3, 4))
     return np.asarray(sums[..., 0] / INJECTED_STEPS * np.pi / LOBE[0] * placement.voxel_edge**2)

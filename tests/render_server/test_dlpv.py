@@ -87,7 +87,7 @@ def test_a_query_in_an_even_field_is_exact(gpu: GpuContext, stage: Stage) -> Non
     even = np.zeros((3, CELLS, CELLS, CELLS, 4), np.float32)
     even[..., 0] = 1.5 * 0.3 / CONSTANT
     light = graph.resource("bounces")
-    light.value.total.write(even.tobytes())
+    light.value[0].total.write(even.tobytes())
     light.write(light.value)
     graph.run()
     field = array_of(graph["cones"].virtual)
@@ -114,7 +114,7 @@ def test_same_input_gives_the_same_bytes(gpu: GpuContext, stage: Stage, operator
     first, second = (run(gpu, document, frame(noisy())) for _ in range(2))
     volumes = {"paper": ("propagate rho", "propagate delta", "propagate direct")}
     for name in volumes.get(operator, ("bounces", "propagate mu")):
-        totals = [graph_of(renderer)[name].total.read() for renderer in (first, second)]
+        totals = [graph_of(renderer)[name][0].total.read() for renderer in (first, second)]
         assert totals[0] == totals[1]
     pictures = [renderer.render(frame(noisy())).color for renderer in (first, first, second)]
     for renderer in (first, second):
@@ -351,7 +351,7 @@ def test_steps_of_direct_light_are_its_own(gpu: GpuContext, stage: Stage) -> Non
     totals = []
     for steps in (0, 2):
         renderer = run(gpu, dlpv(document, operator="paper", steps=1, direct_steps=steps))
-        totals.append(graph_of(renderer)["propagate direct"].total.read())
+        totals.append(graph_of(renderer)["propagate direct"][0].total.read())
         renderer.release()
     volume, propagate = LightVolume(gpu, CELLS), LpvPropagate(gpu)
     for buffer in (volume.state, volume.total):
@@ -370,7 +370,7 @@ def test_printed_volumes_have_sizes_of_their_own(gpu: GpuContext, stage: Stage) 
 
     def totals(**settings: object) -> list[bytes]:
         renderer = run(gpu, dlpv(document, operator="paper", volume_edge_m=0.5, **settings))
-        found = [graph_of(renderer)[name].total.read() for name in names]
+        found = [graph_of(renderer)[name][0].total.read() for name in names]
         renderer.release()
         return found
 

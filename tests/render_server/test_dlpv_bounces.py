@@ -48,12 +48,12 @@ def bounced_flux(
     renderer.render(frame())
     graph = renderer.graph
     assert graph is not None
-    mu, rho = graph["propagate mu"], graph["bounces"]
+    (mu,), (rho,) = graph["propagate mu"], graph["bounces"]
     fill(mu, radiance_mu)
     fill(rho, radiance_rho)
     bounce, reflected = LpvBounce(gpu), injected_sums(gpu, CELLS)
-    surfels = graph["voxelize real"], graph["voxelize objects"]
-    bounce.run(reflected, surfels, (mu, rho), {**graph["inject scene joint"], **graph["marching"]})
+    (surfels,), (scene,) = graph["surfels"], graph["inject scene joint"]
+    bounce.run(reflected, surfels, (mu, rho), {**scene, **graph["marching"]})
     sums = np.frombuffer(reflected.read(), np.int32).reshape(CELLS, CELLS, CELLS, 3, 4)
     placement = graph["volume"].placement
     bottom_m, edge_m = placement.origin[2], placement.voxel_edge

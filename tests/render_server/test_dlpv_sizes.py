@@ -13,10 +13,24 @@ from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
 from deltalight.render_server.graph import Graph
-from deltalight.render_server.methods.lpv import DifferenceVolumes, LpvCells, PrintedVolumes
-from deltalight.render_server.methods.lpv_memory import PrintedSizes, state_memory, volumes_bytes
+from deltalight.render_server.methods.lpv import DifferenceVolumes, PrintedVolumes, ShownCells
+from deltalight.render_server.methods.lpv_cells import LpvCells
+from deltalight.render_server.methods.lpv_memory import (
+    PrintedSizes,
+    affordable_count,
+    state_memory,
+    volumes_bytes,
+)
 from deltalight.render_server.methods.method import SOFTWARE_DEFAULTS
-from deltalight.render_server.passes.lpv import CONSTANT, LightVolume, LpvPropagate, moment_weights
+from deltalight.render_server.methods.per_volume import PerVolume
+from deltalight.render_server.passes.lpv import (
+    CONSTANT,
+    LightVolume,
+    LpvJoin,
+    LpvPropagate,
+    injected_sums,
+    moment_weights,
+)
 from deltalight.render_server.passes.voxels import LEAST_SURFELS
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.lpv_scenes import dlpv, graph_of, injected_flux
@@ -90,7 +104,7 @@ def test_a_query_in_the_largest_volume_is_exact(gpu: GpuContext, stage: Stage) -
     radiance = np.array((0.1, 0.2, 0.3))
     even[..., 0] = (1.5 / CONSTANT * radiance)[:, None, None, None]
     light = graph.resource("bounces")
-    light.value.total.write(even.tobytes())
+    light.value[0].total.write(even.tobytes())
     light.write(light.value)
     graph.run()
     field = array_of(graph["cones"].virtual)
@@ -156,22 +170,50 @@ SIZES: list[dict[str, object]] = [
 ]
 
 
+def readers(gpu: GpuContext, method: DlpvMethod, count: int) -> list[Any]:
+    """What all of `count` volumes share: cells that are shown, and light that surfaces read."""
+    sizes = PrintedSizes.of(method)
+    shown = ShownCells(gpu, sizes.indirect)
+    injected = injected_sums(gpu, sizes.indirect)
+    shown.show(PerVolume([injected] * count))
+    read = [sizes.objects, sizes.indirect] + ([sizes.direct] if method.resolved_shadow == "lobe" else [])
+    joins = [LpvJoin(gpu) for _ in read]
+    for join, cells in zip(joins, read, strict=True):
+        light = LightVolume(gpu, cells)
+        join.run([light] * count)
+        light.release()
+    injected.release()
+    return [shown, *joins]
+
+
+@pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("settings", SIZES, ids=str)
-def test_the_stated_memory_is_what_is_allocated(gpu: GpuContext, settings: dict[str, object]) -> None:
+def test_the_stated_memory_is_what_is_allocated(
+    gpu: GpuContext, settings: dict[str, object], count: int
+) -> None:
     """But for surfels, of which there are none yet, and uniform blocks and the like."""
     method = settings_of(volume_size=32, **settings)
     sizes = PrintedSizes.of(method)
-    cells = [LpvCells(gpu, method, count) for count in sizes.counts]
-    volumes: Any = (
-        DifferenceVolumes(gpu, method, cells[0])
+    cells = [LpvCells(gpu, method, size) for size in sizes.counts for _ in range(count)]
+    volumes: list[Any] = [
+        DifferenceVolumes(gpu, method, sizes.indirect)
         if method.operator == "difference"
         else PrintedVolumes(gpu, method, sizes)
-    )
-    held = sizes_bytes([list(gpu_objects([*cells, volumes]))])[0]
+        for _ in range(count)
+    ]
+    items = [*cells, *volumes, *readers(gpu, method, count)]
+    held = sizes_bytes([list(gpu_objects(items))])[0]
     surfels = 2 * len(cells) * LEAST_SURFELS * 400  # bytes a surfel, with its slot
-    assert 0 <= held - volumes_bytes(method) < surfels
-    for item in (*cells, volumes):
+    assert 0 <= held - volumes_bytes(method, count) < surfels
+    for item in items:
         item.release()
+
+
+def test_the_budget_limits_how_many_volumes_there_are() -> None:
+    two_mb = -(-volumes_bytes(settings_of(), 2) // 1_000_000)
+    assert affordable_count(settings_of(memory_budget_mb=two_mb)) == 2
+    assert affordable_count(settings_of(memory_budget_mb=two_mb - 1)) == 1
+    assert affordable_count(settings_of()) == 4
 
 
 @pytest.mark.parametrize(
