@@ -1,4 +1,4 @@
-"""Cells of light propagation volumes: light injected into them, and what blocks it between them (docs/method.md 5)."""
+"""Cells of light propagation volumes: the light injected into them, and what blocks it between them."""
 
 from dataclasses import dataclass
 from functools import partial
