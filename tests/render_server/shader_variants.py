@@ -78,6 +78,11 @@ EXTENDED: dict[Case, dict[str, Any]] = {
     Case("dlpv-paper", "depth", "plain"): {},
     Case("aroof", "depth", "mirror"): {},
 }
+APART = [
+    Case("exact", "model", "mirror"),
+    Case("dlpv", "model", "mirror"),
+    Case("dlpv-paper", "depth", "plain"),
+]
 SEVERAL = [Case(method, "depth", "plain") for method in ("exact", "paper", "differential", "dlpv")]
 SURFACES = [  # what materials are shaded by maps of light
     dict.fromkeys(switches, 1)
@@ -165,9 +170,8 @@ def render_several(case: Case, gpu: GpuContext, folder: Path) -> None:
         renderer.release()
 
 
-def render_apart(gpu: GpuContext, folder: Path, **method: Any) -> None:  # noqa: ANN401
-    """Renders objects that have volumes of their own, in the composite and as voxels."""
-    case = Case("exact", "model", "mirror")
+def render_apart(case: Case, gpu: GpuContext, folder: Path, **method: Any) -> None:  # noqa: ANN401
+    """Renders the case's objects, and one that has a volume of its own, in the composite and as voxels."""
     document = scene_of(case, Stage(folder)).model_dump(mode="json", exclude_unset=True)
     far = {**document["objects"][0], "id": "far", "pose": {"translation_m": [2.0, 0, 0]}}
     document["objects"].append(far)
@@ -257,8 +261,8 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
     **{f"{case} coated": partial(render_coated, case, changes) for case, changes in EXTENDED.items()},
     **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
-    "objects far apart": render_apart,
-    "objects far apart, live": partial(render_apart, quality="live"),
+    **{f"{case}, objects far apart": partial(render_apart, case) for case in APART},
+    "objects far apart, live": partial(render_apart, APART[0], quality="live"),
     "by device": by_device,
     "image-based shading": image_based,
     "precomputed transfer": precomputed_transfer,
