@@ -254,10 +254,20 @@ def _continuation_probability(
     The visible length is twice that from the centre of the visible part to where the line to the position leaves the
     view.
     """
-    start = frustum.inside(seen.position.mean(axis=0)[None])
+    middle = seen.position.mean(axis=0)
+    start = frustum.inside(middle[None])
     end = frustum.inside(places)
     in_view = np.divide(start, start - end, out=np.ones_like(end), where=end < 0).min(axis=1)
-    return np.asarray(2 * in_view / (1 + in_view))
+    away_m = np.linalg.norm(places - middle, axis=1)
+    length_m = np.maximum(2 * in_view * away_m, _longest_extent(seen.position))
+    return np.asarray(length_m / (length_m + (1 - in_view) * away_m))
+
+
+def _longest_extent(positions: Float64[np.ndarray, "k 3"]) -> float:
+    """Returns the extent (m) of positions along the direction in which they scatter most."""
+    away = positions - positions.mean(axis=0)
+    _, axes = np.linalg.eigh(away.T @ away)
+    return float(np.ptp(away @ axes[:, -1]))
 
 
 def _expected_radiance(
