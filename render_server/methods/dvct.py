@@ -311,9 +311,11 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
 
     volume = g.value("volume", placed_volume, "voxelize real")
-    distant = DistantCones(g.gpu, settings, shading.grid.size)
+    distant = None
+    if settings.tier.distant_light:
+        distant = DistantCones(g.gpu, settings, shading.grid.size).trace
     layers = shading_stages(
-        g, s, shading, lit, volume, trace, voxels=rho, marching=marching, find_distant=distant.trace
+        g, s, shading, lit, volume, trace, voxels=rho, marching=marching, find_distant=distant
     )
     unchanged = UnchangedCones(g.gpu, settings, voxels, shading.cones.mu.size)
     return replace(layers, cones_mu=g.stage("cones mu", unchanged.trace, "shading scene", layers.grid, mu))
