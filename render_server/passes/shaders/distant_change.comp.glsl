@@ -19,7 +19,9 @@ uniform float noise_sigma;   // m at 1 m
 #include "common/camera.glsl"
 
 const float LEAST_IRRADIANCE = 1e-4;
-const ConeSet ALL = ConeSet(1, 0, 1.0, 0.0);
+
+// As in trace_cones: four adjacent points share four times as many directions, and distant_upsample takes the mean.
+int part_of(ivec2 point) { return (point.x & 1) + 2 * (point.y & 1); }
 
 // The texel with a real surface that lies nearest to the middle of a block; negative if there is none.
 ivec2 texel_of(ivec2 point) {
@@ -57,19 +59,19 @@ float greatest_share(vec3 to_ball, float radius, vec3 n) {
 
 // Change by what is in this volume, of the irradiance at q (voxels). Cones are stratified over the ball's cap, or over the
 // hemisphere where the ball surrounds the point.
-vec3 change_by_volume(vec3 q, vec3 n) {
+vec3 change_by_volume(vec3 q, vec3 n, int part) {
     vec4 ball = ball_around_support();
     vec3 to_ball = ball.xyz - q, sum = vec3(0.0);
     if (greatest_share(to_ball, ball.w, n) < LEAST_CHANGE) return sum;
     float sine = ball.w / max(length(to_ball), 1e-6);
     bool surrounds = sine >= 1.0;
     float cap = 1.0 - sqrt(max(1.0 - sine * sine, 0.0)), share = cap / float(AIMED_CONES);   // solid angles / 2 pi
-    float ratio = surrounds ? cone_ratio() : sqrt(8.0 * share);
+    float ratio = 0.5 * (surrounds ? cone_ratio() : sqrt(8.0 * share));
     mat3 basis = basis_around(surrounds ? n : normalize(to_ball));
     int k = 0;
     do {
-        float part = (float(k) + 0.5) / float(AIMED_CONES), phi = float(k) * GOLDEN_ANGLE;
-        float z = surrounds ? sqrt(1.0 - part) : 1.0 - part * cap;
+        float number = float(4 * k + part), at = (number + 0.5) / float(4 * AIMED_CONES), phi = number * GOLDEN_ANGLE;
+        float z = surrounds ? sqrt(1.0 - at) : 1.0 - at * cap;
         vec3 d = basis * vec3(sqrt(max(1.0 - z * z, 0.0)) * vec2(cos(phi), sin(phi)), z);
         float weight = surrounds ? PI / float(AIMED_CONES) : 2.0 * PI * share * dot(d, n);
         if (weight > 0.0) sum += weight * change_along(q, d, ratio);
@@ -77,16 +79,16 @@ vec3 change_by_volume(vec3 q, vec3 n) {
     return sum;
 }
 
-vec3 relative_change(SurfacePoint s) {
+vec3 relative_change(SurfacePoint s, int part) {
     vec3 change = vec3(0.0);
     for (int i = 0; i < volume_count; ++i) {
         work_in_volume(i);
-        change += change_by_volume(volume_coordinate(s.position), s.normal);
+        change += change_by_volume(volume_coordinate(s.position), s.normal, part);
     }
     if (change == vec3(0.0)) return change;
     vec3 e_mu, e_rho;
     enter_volume(s.position);
-    diffuse(volume_coordinate(s.position), s.normal, ALL, true, e_mu, e_rho);
+    diffuse(volume_coordinate(s.position), s.normal, ConeSet(4, part, 0.5, 0.0), true, e_mu, e_rho);
     return max(change / (direct_irradiance(s) + e_mu + LEAST_IRRADIANCE), vec3(-1.0));
 }
 
@@ -105,7 +107,7 @@ void main() {
         pixel = texelFetch(sample_pixels, texel, 0).xy;
         vec4 rho = texelFetch(cone_rho, texel, 0);
         if (rho.a == 1.0) change = known_change(texel, texelFetch(cone_mu, texel, 0).rgb, rho.rgb);
-        else change = relative_change(surface_point(texel));
+        else change = relative_change(surface_point(texel), part_of(point));
     }
     imageStore(lattice_pixels, point, ivec4(pixel, 0, 0));
     imageStore(lattice_change, point, vec4(change, texel.x >= 0 ? 1.0 : 0.0));

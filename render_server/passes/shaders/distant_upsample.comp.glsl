@@ -11,18 +11,20 @@ uniform sampler2D lattice_change;
 uniform isampler2D lattice_pixels;
 #include "common/camera.glsl"
 
+// A tent over 4 x 4 points weights the four parts of their directions equally.
 vec3 interpolated(ivec2 texel, SurfacePoint s) {
     vec2 at = (vec2(texel) + 0.5) / float(LATTICE_STEP) - 0.5, f = fract(at);
     ivec2 base = ivec2(floor(at)), last = textureSize(lattice_change, 0) - 1;
     float size = float(LATTICE_STEP) * sample_distance * (camera_from_world * vec4(s.position, 1.0)).z, total = 1e-6;
     vec3 sum = vec3(0.0);
-    for (int j = 0; j < 4; ++j) {
-        ivec2 o = ivec2(j & 1, j >> 1), point = clamp(base + o, ivec2(0), last);
+    for (int j = 0; j < 16; ++j) {
+        ivec2 o = ivec2(j & 3, j >> 2) - 1, point = clamp(base + o, ivec2(0), last);
+        vec2 apart = abs(vec2(o) - f);
         vec4 change = texelFetch(lattice_change, point, 0);
         if (change.a == 0.0) continue;
         ivec2 pixel = texelFetch(lattice_pixels, point, 0).xy;
         vec3 sp = texelFetch(real_surface_position, pixel, 0).xyz, sn = texelFetch(real_surface_normal, pixel, 0).xyz;
-        float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y) + 1e-3;
+        float w = (2.0 - apart.x) * (2.0 - apart.y) + 1e-3;
         w *= continuation(s.position, s.normal, sp, sn, size) + 1e-4;
         sum += w * change.rgb;
         total += w;
