@@ -2,7 +2,8 @@
 
 How far is unknown. A plane seen over a length L continues for at least d beyond the border with probability
 L / (L + d), because the border cuts it at a place that is independent of it (Gott 1993, Nature 363, for lengths in
-place of times). Its radiance there follows from the lights and from its reflectance where it is seen.
+place of times). L is the longest extent that is seen of it: a wall of which the picture shows a wide, low strip is unlikely
+to end just above. Its radiance there follows from the lights and from its reflectance where it is seen.
 """
 
 from collections.abc import Sequence
@@ -252,7 +253,7 @@ def _continuation_probability(
     """Returns the probability that a plane extends to positions on it.
 
     The visible length is twice that from the centre of the visible part to where the line to the position leaves the
-    view.
+    view, or the longest extent of the visible part if that is longer.
     """
     middle = seen.position.mean(axis=0)
     start = frustum.inside(middle[None])

@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping
 
-import moderngl
-
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
@@ -26,9 +24,7 @@ class DistantChange:
         self._lattice = texture_2d(gpu, self._points, 4, "f2")
         self._pixels = texture_2d(gpu, self._points, 4, "i2")
         own = {"REAL": 1, "LATTICE_STEP": LATTICE_STEP}
-        self._find = Kernel(
-            gpu, "distant_change", **own, **defines, ENDS_AHEAD=1, AIMED_CONES=AIMED_CONES
-        )
+        self._find = Kernel(gpu, "distant_change", **own, **defines, ENDS_AHEAD=1, AIMED_CONES=AIMED_CONES)
         self._upsample = Kernel(gpu, "distant_upsample", **own)
 
     def run(self, direct: DirectLight, cones: ConeFields, grid: LowResGrid, scene: Bindings) -> None:
