@@ -311,7 +311,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
 
     volume = g.value("volume", placed_volume, "voxelize real")
-    distant = None
+    distant: Callable[..., moderngl.Texture] | None = None
     if settings.tier.distant_light:
         distant = DistantCones(g.gpu, settings, shading.grid.size).trace
     layers = shading_stages(

@@ -482,7 +482,7 @@ def shading_stages(
     light = light_directly or shading.light_directly
     direct = g.stage("direct light", light, scene, grid, caustics, shown, *kept)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
-    distant = []
+    distant: list[Resource[moderngl.Texture]] = []
     if find_distant is not None:
         distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
