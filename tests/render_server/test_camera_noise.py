@@ -169,8 +169,8 @@ def even_blocks(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 @pytest.mark.data
-def test_noise_of_a_real_camera_in_frames_that_were_not_fitted(shared_data: Path) -> None:
-    """A RealSense that soon moves, learnt from its first three frames: even blocks of the next, by intensity."""
+def test_noise_of_a_real_camera_in_a_pair_that_was_not_fitted(shared_data: Path) -> None:
+    """A RealSense that soon moves: even blocks of a pair that counted as moving, so was not fitted, by intensity."""
     paths = sorted((shared_data / "rgbd" / "visp_rbt_apriltag" / "color").glob("*.png"))[:8]
     pictures = [decode_rgb(read_bytes(path), str(path)) for path in paths]
     camera = CameraModel(640, 480, np.array([[607, 0, 320], [0, 607, 240], [0, 0, 1.0]]))
