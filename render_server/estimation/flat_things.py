@@ -26,16 +26,12 @@ from deltalight.render_server.scene.plane_reflection import MirrorPlane, PlaneRe
 from deltalight.render_server.view import PosedFrame
 
 WIDTH_PX = 320  # at which pictures are searched
-EDGE_NOISES, LEAST_EDGE = (
-    4.0,
-    0.02,
-)  # relative change from pixel to pixel: multiples of the median one, and at least
+EDGE_NOISES = 4.0  # how many times the median change from pixel to pixel makes an edge
+LEAST_EDGE = 0.02  # relative change from pixel to pixel, below which there is none
 DARK = 0.05  # of sensor white: below, changes count absolutely, because noise does not become less
 LEAST_AREA_PX, LEAST_KNOWN_PX = 200, 100
 LEAST_SPREAD = 0.02  # of sensor white: what depth errors and reflections out of sight leave uncertain
-CONTRADICTION = (
-    4.0  # how much more the predicted reflection varies than the picture; in mirrors at most 1.1 times
-)
+CONTRADICTION = 3.0  # how many times as much as the picture the reflection varies; at most 1.2 in mirrors
 LEAST_FILL = 0.7  # of its rectangle: other shapes are no sheets
 EDGE_PX = 2  # within which an edge blurs an area
 ERROR_PX = 4  # by which a prediction may be beside the picture, because depth errs
