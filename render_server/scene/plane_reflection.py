@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float32, Float64
 from deltalight.protocol.frames import linear_color
 from deltalight.render_server.view import PosedFrame
 
-CELL_PX = (
-    2  # of the grid that mirrored points fall on; farther apart than in the picture, they leave gaps in 1
-)
+CELL_PX = 2  # of the grid that mirrored points fall on, which are farther apart than pixels
 FRONT = 1.05  # up to which multiple of the least depth in a cell points count as the nearest surface
 
 
