@@ -207,7 +207,10 @@ class VirtualObjects:
             return self._standing[item.id]
         meshes = [mesh.transformed(item.world_from_asset) for mesh in item.meshes]
         if item.material is not None:
-            meshes = [replace(mesh, material=item.material, colors=None, opacity=None) for mesh in meshes]
+            meshes = [
+                replace(mesh, material=item.material, colors=None, opacity=None, tangents=None)
+                for mesh in meshes
+            ]
         if not item.moves:
             self._standing[item.id] = meshes
         return meshes

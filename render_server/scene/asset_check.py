@@ -99,8 +99,6 @@ def left_out(gltf: GltfDocument) -> str | None:
     """Returns a sentence about what a document uses and no picture shows; None if that is nothing."""
     names = [str(name) for name in gltf.root.get("extensionsUsed", []) if name not in DRAWN_EXTENSIONS]
     names = [_lamps(gltf) if name == LIGHTS_EXTENSION else name for name in names]
-    if any(_masks_by_vertices(gltf, part) for mesh in gltf.entries("meshes") for part in mesh["primitives"]):
-        names.append("the alpha of its vertex colours in masks")
     return f"{gltf.path} is shown without {', '.join(dict.fromkeys(names))}." if names else None
 
 
@@ -109,13 +107,6 @@ def _lamps(gltf: GltfDocument) -> str:
     lights = gltf.root.get("extensions", {}).get(LIGHTS_EXTENSION, {}).get("lights", [])
     names = [f"`{light.get('name', number)}`" for number, light in enumerate(lights)]
     return f"its lights {', '.join(names)} ({LIGHTS_EXTENSION})" if names else LIGHTS_EXTENSION
-
-
-def _masks_by_vertices(gltf: GltfDocument, primitive: dict[str, Any]) -> bool:
-    color, material = primitive["attributes"].get("COLOR_0"), primitive.get("material")
-    if color is None or material is None or gltf.root["accessors"][color]["type"] != "VEC4":
-        return False
-    return bool(gltf.root["materials"][material].get("alphaMode") == "MASK")
 
 
 def _json(data: bytes) -> dict[str, Any]:

@@ -178,11 +178,12 @@ class Plate:
             texture["sampler"] = self.glb.add("samplers", sampler)
         return {"index": self.glb.add("textures", texture), **info}
 
-    def write(self, path: Path) -> Path:
+    def write(self, path: Path, node: dict[str, Any] | None = None) -> Path:
+        """Writes the file; `node`: the plate's transform."""
         indices = self.glb.array(np.array([0, 1, 2, 0, 2, 3], np.uint16))
         part = {"attributes": self.attributes, "indices": indices, "material": 0}
         self.glb.add("materials", self.material)
-        self.glb.add("nodes", {"mesh": self.glb.add("meshes", {"primitives": [part]})})
+        self.glb.add("nodes", {**(node or {}), "mesh": self.glb.add("meshes", {"primitives": [part]})})
         return self.glb.write(path)
 
 
