@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.lights.lights import Light
 from deltalight.render_server.scene.asset_check import left_out, read_gltf
 from deltalight.render_server.scene.gltf_animation import Clip, read_clips
 from deltalight.render_server.scene.gltf_document import (
@@ -18,6 +19,7 @@ from deltalight.render_server.scene.gltf_document import (
     faults_named,
     read_nodes,
 )
+from deltalight.render_server.scene.gltf_lamps import GltfLamp, read_lamps
 from deltalight.render_server.scene.gltf_posing import (
     GltfPart,
     Morph,
@@ -280,9 +282,12 @@ class GltfAsset:
         nodes: NodeTree,
         parts: list[list[GltfPart]],
         clips: tuple[Clip, ...],
+        *,
         left_out: str | None = None,
+        lamps: tuple[GltfLamp, ...] = (),
     ) -> None:
         self.clips, self.left_out = clips, left_out
+        self._lamps = lamps
         self._path = path
         self._nodes = nodes
         self._parts = parts
@@ -305,6 +310,10 @@ class GltfAsset:
     def meshes(self, pose: Pose) -> list[TriangleMesh]:
         """Returns the meshes in a pose."""
         return [posed(rest, same, pose) for rest, same in zip(self._rest, self._parts, strict=True)]
+
+    def lamps(self, pose: Pose, world_from_asset: Float64[np.ndarray, "4 4"]) -> tuple[Light, ...]:
+        """Returns the lights in a pose, in the world."""
+        return tuple(lamp.placed(world_from_asset @ pose.asset_from_node[lamp.node]) for lamp in self._lamps)
 
     def bounds(self, clip: Clip) -> Float64[np.ndarray, "2 3"]:
         """Returns least and greatest coordinates over a whole clip, with a margin of 2 %; computed once.
@@ -346,7 +355,14 @@ def load_gltf(path: Path) -> GltfAsset:
             together[material].append(part)
         if not together:
             raise DeltalightError(f"{path} has no triangle with an area; export a triangle mesh.")
-        return GltfAsset(path, nodes, list(together.values()), read_clips(gltf, nodes), left_out(gltf))
+        return GltfAsset(
+            path,
+            nodes,
+            list(together.values()),
+            read_clips(gltf, nodes),
+            left_out=left_out(gltf),
+            lamps=read_lamps(gltf, nodes),
+        )
 
 
 def _sweep_times(clip: Clip) -> Float64[np.ndarray, " k"]:
