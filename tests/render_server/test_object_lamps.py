@@ -32,7 +32,7 @@ HOLDER = {"translation": [0, 0.9, 0.03]}  # of a plate that is not in the way
 
 
 def lamp_model(
-    path: Path, light: dict[str, Any], lamp: dict[str, Any], plate: dict[str, Any] = 0.02
+    path: Path, light: dict[str, Any], lamp: dict[str, Any], plate: dict[str, Any], edge: float = 0.02
 ) -> dict[str, Any]:
     """An object: a plate and a lamp at nodes of their own; a lamp without rotation shines down."""
     made = Plate(edge, edge)
