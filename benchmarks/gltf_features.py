@@ -70,8 +70,8 @@ def _masked(plate: Plate) -> None:
 
 
 def _cut(plate: Plate) -> None:
-    x = EDGE / 2
-    corners = [(0, -x, 0), (x, -x, 0), (x, x, 0), (0, x, 0)]
+    x, y = plate.half_width, plate.half_height
+    corners = [(0, -y, 0), (x, -y, 0), (x, y, 0), (0, y, 0)]
     plate.attributes["POSITION"] = plate.glb.floats(corners)
     plate.material["pbrMetallicRoughness"] = {"metallicFactor": 0}
 

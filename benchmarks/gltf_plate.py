@@ -23,7 +23,7 @@ class Plate:
         uv = repeats * np.array([(0, 1), (1, 1), (1, 0), (0, 0)], float)
         if mirrored:
             uv[:, 0] = repeats - uv[:, 0]
-        self.corner_uv = uv
+        self.half_width, self.half_height = x, y
         self.attributes = {
             "POSITION": self.glb.floats(corners),
             "NORMAL": self.glb.floats([(0, 0, 1)] * 4),

@@ -1,4 +1,4 @@
-"""Features of glTF files look as the same by plain means; the plates are those of the picture in docs/materials.md."""
+"""Features of glTF files look as the same by plain means, on the plates of the picture in docs/materials.md."""
 
 from collections.abc import Callable
 from pathlib import Path
