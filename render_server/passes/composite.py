@@ -145,6 +145,7 @@ class Composite:
             cone_specular_rho=cones.specular_rho,
             change_ratio=layers.change.ratio,
             Texels=layers.change.texels,
+            has_virtual_lights=layers.lights.has_virtual_lights,
             reflection=layers.reflection,
             has_reflection=layers.reflection is not None,
             distant_change=layers.change.distant,

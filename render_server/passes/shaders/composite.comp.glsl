@@ -38,6 +38,7 @@ uniform sampler2D edge_correction;    // common/edge_sides.glsl
 uniform float exposure_scale;
 #include "common/camera.glsl"
 #pragma switch bool additive
+#pragma switch bool has_virtual_lights
 uniform bool relights_real;      // method `none` shows objects and keeps the real scene
 #pragma switch bool filmic   // ACES tone curve on the whole picture instead of the camera's response
 #pragma switch bool specular_surfaces
@@ -132,7 +133,11 @@ vec3 specular_change(Change c, vec3 glossy) {
 // `ratio`: of the light; all that there is where nothing is added and the surface is not specular.
 vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b, out vec3 ratio) {
     float e = 1e-3 * max(texelFetch(direct_mu, pixel, 0).a, 1e-6);
-    ratio = max((max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e) + c.distant, vec3(0.0));
+    ratio = (max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e);
+    // A ratio is right whatever the scale of the picture's own lights, which those of objects do not share: no surface reflects more
+    // of these than the greatest albedo.
+    if (has_virtual_lights) ratio = min(ratio, 1.0 + ALBEDO_RANGE.y / PI * max(c.delta, vec3(0.0)) / max(b, vec3(1e-6)));
+    ratio = max(ratio + c.distant, vec3(0.0));
     if (additive) {
         vec3 albedo = clamp(PI * b / max(c.e_mu, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
         vec3 glossy = c.hidden > 0.0 ? (1.0 - diffuse_fraction(pixel, c, normal, b)) * b : vec3(0.0);
