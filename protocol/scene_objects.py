@@ -156,6 +156,13 @@ class SceneObject(StrictModel):
     animation: Animation | None = Field(
         default=None, description="How to play a glTF asset's clip; null = as `rigid` says."
     )
+    lamps: float = Field(
+        default=1.0,
+        ge=0,
+        le=1e6,
+        allow_inf_nan=False,
+        description="Factor on the lights that come with a glTF asset (KHR_lights_punctual); 0 = they are off.",
+    )
     visible: bool = Field(default=True, description="Whether the object is rendered and affects the light.")
 
     @property

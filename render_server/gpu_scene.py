@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
+from deltalight.render_server.lights.lights import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.voxelize import Chosen, VoxelizedMesh
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS
@@ -122,6 +123,7 @@ class GeometryState:
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
     extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
+    lamps: tuple[Light, ...] = ()  # that come with virtual objects; world, camera units
     is_open: bool = False  # what is solid as cameras see it: backs are not in it
     choose_backs: ChooseBacks | None = None  # by several cameras, which tell where backs cannot be
 

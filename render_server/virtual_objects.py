@@ -14,10 +14,12 @@ from deltalight.protocol.scene_objects import Animation, AnyMaterial, SceneObjec
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import DrawnMesh, GeometryState, ObjectExtent, PlacedObject
+from deltalight.render_server.lights.lights import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip
-from deltalight.render_server.scene.gltf_meshes import GltfAsset, Pose
+from deltalight.render_server.scene.gltf_meshes import GltfAsset
+from deltalight.render_server.scene.gltf_posing import Pose
 from deltalight.render_server.scene.material_file import read_material
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import Asset, load_asset
@@ -34,6 +36,10 @@ class AnimatedObject:
         self._clip = clip
         self._pose: Pose | None = None
         self.meshes: Sequence[TriangleMesh] = ()
+
+    def lamps(self, world_from_asset: Float64[np.ndarray, "4 4"]) -> tuple[Light, ...]:
+        """Returns the asset's lights in the current pose, in the world."""
+        return () if self._pose is None else self.asset.lamps(self._pose, world_from_asset)
 
     @property
     def is_still(self) -> bool:
@@ -163,6 +169,7 @@ class VirtualObjects:
             np.vstack(points),
             materials,
             objects=tuple(objects),
+            lamps=tuple(lamp for item in self._shown for lamp in self._lamps(item)),
             swept_points=np.vstack(swept) if any(item.moves for item in objects) else None,
             extents=tuple(
                 ObjectExtent(lasting, np.stack(short_axis.bounds(self._upright(item))))
@@ -193,6 +200,16 @@ class VirtualObjects:
             moves=moving is not None and not moving.is_still,
         )
 
+    def _lamps(self, item: SceneObject) -> list[Light]:
+        """Returns the lights that come with an object, as bright as the document wants them; none if they are off."""
+        if not item.lamps:
+            return []
+        moving = self._moving.get(item.id)
+        world_from_asset = world_from_frame(item, self._board) @ item.world_from_object()
+        shining = (self._assets[item.asset] if moving is None else moving).lamps(world_from_asset)
+        factor = np.full(3, item.lamps, np.float32)
+        return [lamp if item.lamps == 1 else lamp.scaled(factor) for lamp in shining]
+
     def _given_material(self, item: SceneObject) -> Material | None:
         """Returns the document's material, if it gives one; the same object for the same document."""
         if item.material is None:
@@ -207,7 +224,10 @@ class VirtualObjects:
             return self._standing[item.id]
         meshes = [mesh.transformed(item.world_from_asset) for mesh in item.meshes]
         if item.material is not None:
-            meshes = [replace(mesh, material=item.material, colors=None, opacity=None) for mesh in meshes]
+            meshes = [
+                replace(mesh, material=item.material, colors=None, opacity=None, tangents=None)
+                for mesh in meshes
+            ]
         if not item.moves:
             self._standing[item.id] = meshes
         return meshes

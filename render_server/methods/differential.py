@@ -20,8 +20,13 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.light_maps import LitScene, object_extent, shadow_receivers
+from deltalight.render_server.lights.lights import Light, LightSet
+from deltalight.render_server.methods.light_maps import (
+    LitScene,
+    object_extent,
+    object_lamps,
+    shadow_receivers,
+)
 from deltalight.render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
@@ -166,7 +171,10 @@ class SolutionLights:
     """The lights' maps of the real scene alone (mu) and with the objects (rho)."""
 
     def __init__(self, gpu: GpuContext, settings: DifferentialMethod, resolved: ResolvedSettings) -> None:
-        self.mu, self.rho = (LightBuffers(gpu, resolved.rsm_size, settings.shadow_samples) for _ in range(2))
+        self.mu, self.rho = (
+            LightBuffers(gpu, resolved.rsm_size, settings.shadow_samples, is_joint=is_joint)
+            for is_joint in (False, True)
+        )
         self._maps = ShadowMaps(gpu)
 
     def set_environment(self, lights: LightSet) -> tuple[moderngl.TextureArray, ...]:
@@ -174,16 +182,22 @@ class SolutionLights:
         return tuple(buffers.set_environment(lights.environment) for buffers in (self.mu, self.rho))
 
     def fit_views(
-        self, lights: LightSet, real: GeometryState, extent: ObjectExtent, area: Rectangle
+        self,
+        lights: LightSet,
+        lamps: tuple[Light, ...],
+        real: GeometryState,
+        extent: ObjectExtent,
+        area: Rectangle,
     ) -> bytes:
-        """Fits the views, the same for both solutions, so that their maps differ by the objects alone.
+        """Fits the views: those of the scene's lights are the same for both, so maps differ by the objects alone.
 
         Returns their records, which tell whether the maps are still those of the views.
         """
-        receivers = shadow_receivers(real, extent.upright) if area == NOWHERE else real.points
+        is_around_objects = area == NOWHERE and not lamps
+        receivers = shadow_receivers(real, extent.upright) if is_around_objects else real.points
         receivers, points = (np.concatenate([each, extent.points]) for each in (receivers, real.points))
-        for buffers in (self.mu, self.rho):
-            buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)))
+        for buffers, own in ((self.mu, ()), (self.rho, lamps)):
+            buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)), virtual_lights=own)
         return self.rho.real_records
 
     def draw_mu(self, _views: bytes, real: GeometryState) -> LightBuffers:
@@ -258,7 +272,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     lights = g.shared("lights", lambda: SolutionLights(g.gpu, settings, resolved))
     direct = SolutionDirectLight(lights, DirectLightPair(g.gpu, size))
     environment = g.stage("environment", lights.set_environment, s.lights)
-    fitted = s.lights, s.real, object_extent(g, s), s.lit_area
+    fitted = s.lights, object_lamps(g, s), s.real, object_extent(g, s), s.lit_area
     views = g.stage("light views", lights.fit_views, *fitted, same=eq)
     mu_maps = g.stage("shadow maps mu", lights.draw_mu, views, s.real)
     rho_maps = g.stage("shadow maps rho", lights.draw_rho, views, s.real, s.objects)

@@ -27,8 +27,8 @@ SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around th
 LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
 
 Points = Float64[np.ndarray, "n 3"]
-Fitted = tuple[tuple[Light, ...], GeometryState, ObjectExtent, SurfaceTable, bool]
-"""Lights, room, objects, mirrors, and whether only the shadows of the objects count."""
+Fitted = tuple[tuple[Light, ...], tuple[Light, ...], GeometryState, ObjectExtent, SurfaceTable, bool]
+"""Lights, those that come with objects, room, objects, mirrors, and whether only the shadows of the objects count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +81,7 @@ class LightStages:
     def fit_views(
         self,
         lights: LightSet,
+        lamps: tuple[Light, ...],
         real: GeometryState,
         extent: ObjectExtent,
         surfaces: SurfaceTable,
@@ -88,10 +89,10 @@ class LightStages:
     ) -> tuple[bytes, bytes]:
         """Fits the views: of real shadows around the objects, and closely around the objects.
 
-        If an `area` of the picture is to be lit too, real shadows are those of the whole scene. Returns the records
-        of both, which tell whether their maps are still those of the views.
+        If an `area` of the picture is to be lit too, or lamps of objects shine everywhere, real shadows are those of
+        the whole scene. Returns the records of both, which tell whether their maps are still those of the views.
         """
-        fitted = lights.lights, real, extent, surfaces, area == NOWHERE
+        fitted = lights.lights, lamps, real, extent, surfaces, area == NOWHERE and not lamps
         if self._fitted is None or any(
             one is not other for one, other in zip(fitted, self._fitted, strict=True)
         ):
@@ -102,15 +103,21 @@ class LightStages:
     def _place(
         self,
         lights: tuple[Light, ...],
+        lamps: tuple[Light, ...],
         real: GeometryState,
         extent: ObjectExtent,
         surfaces: SurfaceTable,
         is_around_objects: bool,
     ) -> None:
         receivers = self._receivers_of(real, extent) if is_around_objects else real.points
-        shining = list(lights)
-        mirrors = mirror_lights(shining, surfaces, np.mean(extent.points, axis=0)) if self._mirrors else []
-        self.buffers.place(shining, real.points, receivers, extent.points, mirrors)
+        mirrors = (
+            mirror_lights([*lights, *lamps], surfaces, np.mean(extent.points, axis=0))
+            if self._mirrors
+            else []
+        )
+        self.buffers.place(
+            list(lights), real.points, receivers, extent.points, mirrors=mirrors, virtual_lights=lamps
+        )
 
     def _receivers_of(self, real: GeometryState, extent: ObjectExtent) -> Points:
         """Returns the real points on which shadows of the objects fall; the same while neither changes its place."""
@@ -190,7 +197,7 @@ def light_stages(
     )
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
-    fitted = s.lights, s.real, extent, s.surfaces, s.lit_area
+    fitted = s.lights, object_lamps(g, s), s.real, extent, s.surfaces, s.lit_area
     views = "light views real", "light views objects"
     real_views, object_views = g.stages("light views", stages.fit_views, *fitted, outputs=views, same=eq)
     real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)
@@ -219,6 +226,19 @@ def object_extent(g: Graph, s: FrameResources) -> Resource[ObjectExtent]:
     if "object extent" in g:
         return g.resource("object extent")
     return g.value("object extent", _extent_of, s.objects, same=ObjectExtent.equals)
+
+
+def object_lamps(g: Graph, s: FrameResources) -> Resource[tuple[Light, ...]]:
+    """Declares the lights that come with the objects."""
+    return g.value("object lamps", _lamps_of, s.objects, same=_same_lights)
+
+
+def _lamps_of(objects: GeometryState) -> tuple[Light, ...]:
+    return objects.lamps
+
+
+def _same_lights(old: tuple[Light, ...], new: tuple[Light, ...]) -> bool:
+    return len(old) == len(new) and all(one is other for one, other in zip(old, new, strict=True))
 
 
 def _extent_of(objects: GeometryState) -> ObjectExtent:

@@ -36,6 +36,7 @@ GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
 MIRROR_MAP_MARGIN = 1.1  # of the extent that the map has to cover
 NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
+OF_OBJECT = (0.0,) * 7 + (-2.0,) + (0.0,) * 8
 
 MapAxes = tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]
 
@@ -51,9 +52,17 @@ class LightingBlock(Block):
 
 
 class LightBuffers:
-    """GPU buffers of the lights: their shadow maps of the real scene and the objects, and their records."""
+    """GPU buffers of the lights: their shadow maps of the real scene and the objects, and their records.
 
-    def __init__(self, gpu: GpuContext, tile_size: int, shadow_samples: int) -> None:
+    Lights that come with objects shine in the light with objects alone, unless the buffers are that light's own
+    (`is_joint`).
+    """
+
+    def __init__(
+        self, gpu: GpuContext, tile_size: int, shadow_samples: int, *, is_joint: bool = False
+    ) -> None:
+        self._is_joint = is_joint
+        self._virtual_count = 0  # of lights that come with objects; they follow those of the scene
         self._gpu = gpu
         self.tile_size = tile_size
         self.shadow_samples = shadow_samples
@@ -95,7 +104,13 @@ class LightBuffers:
             "shadow_samples": self.shadow_samples,
             "has_rectangles": any(isinstance(light, RectangleLight) for light in self.lights),
             "has_mirror_images": bool(self.mirrors),
+            "has_virtual_lights": self.has_virtual_lights,
         }
+
+    @property
+    def has_virtual_lights(self) -> bool:
+        """Whether any light comes with an object."""
+        return self._virtual_count > 0
 
     def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> moderngl.TextureArray:
         """Uploads the residual environment R (octahedral), averaged over cones of doubling half-angle."""
@@ -111,14 +126,17 @@ class LightBuffers:
         real_points: Float64[np.ndarray, "n 3"],
         receivers: Float64[np.ndarray, "k 3"],
         virtual_points: Float64[np.ndarray, "m 3"],
+        *,
         mirrors: Sequence[MirrorLight] = (),
+        virtual_lights: Sequence[Light] = (),
     ) -> None:
-        """Fits each light's views.
+        """Fits the views of each light, those of the scene and those that come with objects.
 
         To the real points that may receive the objects' shadow, and to the virtual objects. Views of mirror images
         are limited to the front of their planes.
         """
-        self.mirrors = list(mirrors)
+        self.mirrors, self._virtual_count = list(mirrors), len(virtual_lights)
+        lights = [*lights, *virtual_lights]
         self._make_mirror_maps()
         shown = np.concatenate([receivers, virtual_points])
         axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
@@ -170,12 +188,13 @@ class LightBuffers:
         self.views_of_lights = []
         first_real, first_virtual = 0, len(self.real_views)
         first_mirror = len(self.lights) - len(self.mirrors)
+        first_own = -self._virtual_count if not self._is_joint else 0
         for index, (light, real_part, virtual_part) in enumerate(
             zip(self.lights, real, virtual, strict=True), start=-first_mirror
         ):
             ranges = (first_real, len(real_part), first_virtual, len(virtual_part))
             if index < 0:
-                records += _pack_light(light, ranges)
+                records += _pack_light(light, ranges, tail=OF_OBJECT if index >= first_own else NOT_MIRRORED)
             else:
                 records += _pack_mirror(self.mirrors[index], index, axes[index], ranges)
             first_real += len(real_part)
@@ -205,6 +224,13 @@ class LightBuffers:
     def _write_block(self) -> None:
         layers = 0 if self._environment is None else self._environment.layers
         self._block.write(LightingBlock(len(self.lights), layers, self._environment_half_angle))
+
+    @property
+    def real_views_of_objects(self) -> range:
+        """Numbers of the real views of lights that come with objects."""
+        first = len(self.lights) - len(self.mirrors) - self._virtual_count
+        own = self.views_of_lights[first : first + self._virtual_count]
+        return range(own[0][0].start, own[-1][0].stop) if own else range(0)
 
     @property
     def first_virtual_view(self) -> int:

@@ -1,5 +1,7 @@
 """Light into and out of light propagation volumes: injection, bounces, surface irradiance (docs/method.md 5)."""
 
+from collections.abc import Iterable
+
 import moderngl
 
 from deltalight.protocol.scene_method import DlpvMethod
@@ -32,15 +34,19 @@ class LpvInjectMaps:
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
     ) -> None:
         """Adds the light that the real scene reflects as if there were no objects."""
-        views = range(len(lights.real_views))
+        views = [view for view in range(len(lights.real_views)) if view not in lights.real_views_of_objects]
         _inject_views(self._real, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
     def add_change(
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
     ) -> None:
-        """Adds the light that the objects reflect, minus what the real scene behind them reflected."""
-        views = _virtual_views(lights)
-        _inject_views(self._change, views, lights, scene, Injected=sums, real_albedo=real_albedo)
+        """Adds the light that the objects reflect, minus what the real scene behind them reflected.
+
+        Of lights that come with objects, adds what all of the real scene reflects.
+        """
+        own: dict[str, Binding] = {"Injected": sums, "real_albedo": real_albedo}
+        _inject_views(self._real, lights.real_views_of_objects, lights, scene, **own)
+        _inject_views(self._change, _virtual_views(lights), lights, scene, **own)
 
     def add_direct(self, sums: moderngl.Buffer, lights: LightBuffers, scene: Bindings) -> None:
         """Adds the direct light that meets the objects, and subtracts what it lit before ([P2] 4.3.2)."""
@@ -58,7 +64,7 @@ def _virtual_views(lights: LightBuffers) -> range:
 
 
 def _inject_views(
-    kernel: Kernel, views: range, lights: LightBuffers, scene: Bindings, **own: Binding
+    kernel: Kernel, views: Iterable[int], lights: LightBuffers, scene: Bindings, **own: Binding
 ) -> None:
     for view in views:
         kernel.run((lights.tile_size, lights.tile_size), scene, view_index=view, **own)

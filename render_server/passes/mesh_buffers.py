@@ -18,7 +18,8 @@ from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, re
 from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 
-SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
+# Of the vertices of meshes that have either, in a buffer of their own.
+PLACEMENT_LAYOUT, PLACEMENT_ATTRIBUTES = "2f 4f", ("in_second_uv", "in_tangent")
 METALLIC, REFLECTANCE, ROUGHNESS, DOUBLE_SIDED, BY_LIGHT = (
     3,
     slice(4, 7),
@@ -53,7 +54,7 @@ class MeshBuffers:
         self._vertices = gpu.ctx.buffer(reserve=4)
         self._indices = gpu.ctx.buffer(reserve=4)
         self._sides = gpu.ctx.buffer(reserve=4)
-        self._second_uv: moderngl.Buffer | None = None
+        self._placement: moderngl.Buffer | None = None
         self._corners: moderngl.Texture | None = None
         self._shows_corners = False  # those of the triangles that were written last
         self._written: GpuMesh | None = None  # if not by a kernel
@@ -74,7 +75,7 @@ class MeshBuffers:
             "Vertices": self._vertices,
             "Indices": self._indices,
             "Sides": self._sides,
-            "SecondUv": self._second_uv,
+            "MapPlacement": self._placement,
         }
 
     @property
@@ -98,7 +99,7 @@ class MeshBuffers:
         if self.triangle_count:
             self._vertices.write(vertices)
             self._indices.write(self.triangles)
-        self._write_second_uv(mesh.second_uv)
+        self._write_placement(mesh.placement)
 
     def reserve(self, vertex_count: int, triangle_count: int, materials: GpuMesh) -> None:
         """Makes room for triangles of the materials of a mesh, which a kernel is to write (`solid`)."""
@@ -118,35 +119,38 @@ class MeshBuffers:
             self._sides.orphan(double_sided.nbytes)
         self._sides.write(double_sided.tobytes())
 
-    def _write_second_uv(self, uv: Float32[np.ndarray, "n 2"] | None) -> None:
-        if uv is None and self._second_uv is None:
+    def _write_placement(self, rows: Float32[np.ndarray, "n 6"] | None) -> None:
+        if rows is None and self._placement is None:
             return
-        release_all(*self._arrays.values(), self._second_uv)
+        release_all(*self._arrays.values(), self._placement)
         self._arrays.clear()
-        self._second_uv = None if uv is None else self._ctx.buffer(np.ascontiguousarray(uv, np.float32))
+        self._placement = None if rows is None else self._ctx.buffer(np.ascontiguousarray(rows, np.float32))
 
     def draw(self, program: moderngl.Program) -> None:
         """Draws all triangles with `program`."""
         if not self.triangle_count:
             return
         if program.glo not in self._arrays:
-            layout: list[tuple[Any, ...]] = [(self._vertices, *_layout_of(program))]
-            if self._second_uv is not None and program.get(SECOND_UV, None) is not None:
-                layout.append((self._second_uv, "2f", SECOND_UV))
+            layout: list[tuple[Any, ...]] = [
+                (self._vertices, *_layout_of(program, VERTEX_LAYOUT, VERTEX_ATTRIBUTES))
+            ]
+            if self._placement is not None:
+                form, *names = _layout_of(program, PLACEMENT_LAYOUT, PLACEMENT_ATTRIBUTES)
+                layout += [(self._placement, form, *names)] if names else []
             self._arrays[program.glo] = self._ctx.vertex_array(program, layout, self._indices)
         self._arrays[program.glo].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
 
     def release(self) -> None:
         """Frees all buffers."""
         release_all(*self._arrays.values(), self._vertices, self._indices, self._sides)
-        release_all(self._second_uv, self._corners)
+        release_all(self._placement, self._corners)
         self._arrays.clear()
-        self._second_uv = self._corners = None
+        self._placement = self._corners = None
 
 
-def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
+def _layout_of(program: moderngl.Program, layout: str, names: Sequence[str]) -> tuple[str, ...]:
     """Returns format and attributes of a vertex; attributes that the compiler removed become padding."""
-    parts = list(zip(VERTEX_LAYOUT.split(), VERTEX_ATTRIBUTES, strict=True))
+    parts = list(zip(layout.split(), names, strict=True))
     active = {name for _, name in parts if program.get(name, None) is not None}
     formats = (part if name in active else f"{int(part[0]) * 4}x" for part, name in parts)
     return " ".join(formats), *(name for _, name in parts if name in active)

@@ -28,6 +28,7 @@ LIGHTS_EXTENSION = "KHR_lights_punctual"
 DRAWN_EXTENSIONS = frozenset(
     {
         "EXT_texture_webp",
+        LIGHTS_EXTENSION,
         "KHR_materials_clearcoat",
         "KHR_materials_emissive_strength",
         "KHR_materials_ior",
@@ -43,7 +44,6 @@ DRAWN_EXTENSIONS = frozenset(
 # What a file may require although it is left out: the object's shape, place and texture do not depend on it.
 LEFT_OUT_EXTENSIONS = frozenset(
     {
-        LIGHTS_EXTENSION,
         "KHR_materials_anisotropy",
         "KHR_materials_diffuse_transmission",
         "KHR_materials_dispersion",
@@ -98,24 +98,7 @@ def read_gltf(path: Path) -> GltfDocument:
 def left_out(gltf: GltfDocument) -> str | None:
     """Returns a sentence about what a document uses and no picture shows; None if that is nothing."""
     names = [str(name) for name in gltf.root.get("extensionsUsed", []) if name not in DRAWN_EXTENSIONS]
-    names = [_lamps(gltf) if name == LIGHTS_EXTENSION else name for name in names]
-    if any(_masks_by_vertices(gltf, part) for mesh in gltf.entries("meshes") for part in mesh["primitives"]):
-        names.append("the alpha of its vertex colours in masks")
     return f"{gltf.path} is shown without {', '.join(dict.fromkeys(names))}." if names else None
-
-
-def _lamps(gltf: GltfDocument) -> str:
-    """Names the lights of a document: no object gives light to the scene but by what it emits."""
-    lights = gltf.root.get("extensions", {}).get(LIGHTS_EXTENSION, {}).get("lights", [])
-    names = [f"`{light.get('name', number)}`" for number, light in enumerate(lights)]
-    return f"its lights {', '.join(names)} ({LIGHTS_EXTENSION})" if names else LIGHTS_EXTENSION
-
-
-def _masks_by_vertices(gltf: GltfDocument, primitive: dict[str, Any]) -> bool:
-    color, material = primitive["attributes"].get("COLOR_0"), primitive.get("material")
-    if color is None or material is None or gltf.root["accessors"][color]["type"] != "VEC4":
-        return False
-    return bool(gltf.root["materials"][material].get("alphaMode") == "MASK")
 
 
 def _json(data: bytes) -> dict[str, Any]:

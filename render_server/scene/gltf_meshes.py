@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.lights.lights import Light
 from deltalight.render_server.scene.asset_check import left_out, read_gltf
 from deltalight.render_server.scene.gltf_animation import Clip, read_clips
 from deltalight.render_server.scene.gltf_document import (
@@ -19,18 +19,26 @@ from deltalight.render_server.scene.gltf_document import (
     faults_named,
     read_nodes,
 )
+from deltalight.render_server.scene.gltf_lamps import GltfLamp, read_lamps
+from deltalight.render_server.scene.gltf_posing import (
+    GltfPart,
+    Morph,
+    Pose,
+    Skin,
+    matrices_of,
+    morphed,
+    placed,
+    posed,
+)
 from deltalight.render_server.scene.materials import AlphaMode, Material
 from deltalight.render_server.scene.texture_maps import TextureReader
 from deltalight.render_server.scene.triangle_mesh import (
     MAX_COORDINATE_M,
     ConvertedMesh,
     FileGeometry,
-    Smoothing,
     TriangleMesh,
     converted,
     joined,
-    joined_triangles,
-    unit_or,
 )
 
 if TYPE_CHECKING:
@@ -43,50 +51,6 @@ SWEEP_STEPS = 64
 MAX_SWEEP_TIMES = 256
 MAX_SWEEP_VERTICES = 20_000  # sampled of larger meshes
 SWEEP_MARGIN = 0.02  # of the longest edge, for what lies between the sampled times and vertices
-
-
-@dataclass(frozen=True, eq=False)
-class Morph:
-    """Offsets of each morph target to positions and, where the file has them, to normals, at weight 1."""
-
-    positions: tuple[Float32[np.ndarray, "n 3"], ...]
-    normals: tuple[Float32[np.ndarray, "n 3"], ...] | None
-
-
-@dataclass(frozen=True, eq=False)
-class Skin:
-    """Joints of a mesh: their nodes, their inverse bind matrices, and the weight of each joint at each vertex.
-
-    `weights` is sparse (n x j); its rows sum to 1.
-    """
-
-    joints: Int64[np.ndarray, " j"]
-    joint_from_mesh: Float64[np.ndarray, "j 4 4"]
-    weights: "csr_array"
-
-
-@dataclass(frozen=True, eq=False)
-class GltfPart:
-    """One primitive at one node: its mesh in the node's frame, before morphing and skinning.
-
-    `smoothing` recomputes the normals of a posed mesh where the file has none.
-    """
-
-    node: int
-    mesh: TriangleMesh
-    smoothing: Smoothing | None
-    morph: Morph | None
-    skin: Skin | None
-
-    def of_vertices(self, rows: Int64[np.ndarray, " k"]) -> "GltfPart":
-        """Returns the part with some of its vertices only, to track their positions."""
-        morph, skin = self.morph, self.skin
-        if morph is not None:
-            morph = Morph(tuple(delta[rows] for delta in morph.positions), None)
-        if skin is not None:
-            skin = replace(skin, weights=skin.weights[rows])
-        mesh = replace(self.mesh, positions=self.mesh.positions[rows], normals=self.mesh.normals[rows])
-        return replace(self, mesh=mesh, morph=morph, skin=skin, smoothing=None)
 
 
 class PartReader:
@@ -148,7 +112,17 @@ class PartReader:
     def _read_material(self, index: int | None) -> Material:
         if index is None:
             return Material(base_color=np.ones(3, np.float32), name="default")
-        return Material.from_gltf(self._gltf.root["materials"][index], self._textures)
+        return Material.from_gltf(
+            self._gltf.root["materials"][index],
+            self._textures,
+            vertices_have_alpha=any(
+                _has_alpha(self._gltf, part["attributes"]) for part in self._primitives_of(index)
+            ),
+        )
+
+    def _primitives_of(self, material: int) -> list[dict[str, Any]]:
+        primitives = [part for mesh in self._gltf.entries("meshes") for part in mesh["primitives"]]
+        return [part for part in primitives if part.get("material") == material]
 
     def _skin(self, skin: dict[str, Any], primitive: dict[str, Any], made: ConvertedMesh) -> Skin:
         joints = np.array(skin["joints"], np.int64)
@@ -179,15 +153,24 @@ def _geometry(gltf: GltfDocument, primitive: dict[str, Any], material: Material)
         _uv(gltf, attributes, "TEXCOORD_0", count),
         _attribute(gltf, attributes, "COLOR_0", count, 3),
         _uv(gltf, attributes, "TEXCOORD_1", count) if material.has_second_uv else None,
-        _opacity(gltf, attributes, count) if material.alpha_mode == AlphaMode.BLEND else None,
+        _opacity(gltf, attributes, count) if _shows_opacity(material) else None,
+        _attribute(gltf, attributes, "TANGENT", count, 4) if material.has_normal_maps else None,
     )
+
+
+def _shows_opacity(material: Material) -> bool:
+    return material.alpha_mode == AlphaMode.BLEND or material.vertex_cutoff is not None
 
 
 def _opacity(gltf: GltfDocument, attributes: dict[str, int], count: int) -> Float32[np.ndarray, "n 1"] | None:
     """Returns the alpha of the vertices' colours; None where they have none."""
-    has_alpha = "COLOR_0" in attributes and gltf.array(attributes["COLOR_0"]).shape[1] == 4
-    rgba = _attribute(gltf, attributes, "COLOR_0", count, 4) if has_alpha else None
+    rgba = _attribute(gltf, attributes, "COLOR_0", count, 4) if _has_alpha(gltf, attributes) else None
     return None if rgba is None else rgba[:, 3:]
+
+
+def _has_alpha(gltf: GltfDocument, attributes: dict[str, int]) -> bool:
+    """Whether the vertices' colours have an alpha."""
+    return "COLOR_0" in attributes and gltf.root["accessors"][attributes["COLOR_0"]]["type"] == "VEC4"
 
 
 def _triangles(
@@ -234,9 +217,18 @@ def _morph(gltf: GltfDocument, primitive: dict[str, Any], made: ConvertedMesh, c
     if len(targets) != count:
         raise GltfFaultError("the primitives of a mesh have different numbers of morph targets")
     positions = tuple(_delta(gltf, target, "POSITION", made) for target in targets)
-    gives_normals = made.smoothing is None and any("NORMAL" in target for target in targets)
-    normals = tuple(_delta(gltf, target, "NORMAL", made) for target in targets) if gives_normals else None
-    return Morph(positions, normals)
+    normals = _deltas(gltf, targets, "NORMAL", made) if made.smoothing is None else None
+    tangents = _deltas(gltf, targets, "TANGENT", made) if made.mesh.tangents is not None else None
+    return Morph(positions, normals, tangents)
+
+
+def _deltas(
+    gltf: GltfDocument, targets: Sequence[dict[str, int]], name: str, made: ConvertedMesh
+) -> tuple[Float32[np.ndarray, "n 3"], ...] | None:
+    """Returns an attribute's offsets; None if no target has it."""
+    if not any(name in target for target in targets):
+        return None
+    return tuple(_delta(gltf, target, name, made) for target in targets)
 
 
 def _delta(
@@ -278,22 +270,6 @@ def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: i
     return matrix
 
 
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Global transforms and morph weights of all nodes."""
-
-    asset_from_node: Float64[np.ndarray, "n 4 4"]
-    weights: tuple[Float64[np.ndarray, " _"], ...]
-
-    def equals(self, other: "Pose | None") -> bool:
-        """Whether both poses are bit-identical."""
-        return (
-            other is not None
-            and np.array_equal(self.asset_from_node, other.asset_from_node)
-            and all(np.array_equal(a, b) for a, b in zip(self.weights, other.weights, strict=True))
-        )
-
-
 class GltfAsset:
     """Meshes of a document, one per material, in any pose of its clips, in the file's axes and units.
 
@@ -306,9 +282,12 @@ class GltfAsset:
         nodes: NodeTree,
         parts: list[list[GltfPart]],
         clips: tuple[Clip, ...],
+        *,
         left_out: str | None = None,
+        lamps: tuple[GltfLamp, ...] = (),
     ) -> None:
         self.clips, self.left_out = clips, left_out
+        self._lamps = lamps
         self._path = path
         self._nodes = nodes
         self._parts = parts
@@ -330,7 +309,11 @@ class GltfAsset:
 
     def meshes(self, pose: Pose) -> list[TriangleMesh]:
         """Returns the meshes in a pose."""
-        return [_posed(rest, same, pose) for rest, same in zip(self._rest, self._parts, strict=True)]
+        return [posed(rest, same, pose) for rest, same in zip(self._rest, self._parts, strict=True)]
+
+    def lamps(self, pose: Pose, world_from_asset: Float64[np.ndarray, "4 4"]) -> tuple[Light, ...]:
+        """Returns the lights in a pose, in the world."""
+        return tuple(lamp.placed(world_from_asset @ pose.asset_from_node[lamp.node]) for lamp in self._lamps)
 
     def bounds(self, clip: Clip) -> Float64[np.ndarray, "2 3"]:
         """Returns least and greatest coordinates over a whole clip, with a margin of 2 %; computed once.
@@ -345,7 +328,7 @@ class GltfAsset:
     def _swept(self, clip: Clip) -> Float64[np.ndarray, "2 3"]:
         followed = [_sampled_vertices(part, self._vertex_count) for same in self._parts for part in same]
         poses = [self.pose(clip, float(time_s)) for time_s in _sweep_times(clip)]
-        points = [_placed(_morphed(part, pose), _matrices(part, pose)) for pose in poses for part in followed]
+        points = [placed(morphed(part, pose), matrices_of(part, pose)) for pose in poses for part in followed]
         low = np.min([part.min(axis=0) for part in points], axis=0).astype(np.float64)
         high = np.max([part.max(axis=0) for part in points], axis=0).astype(np.float64)
         if not np.abs([low, high]).max() <= MAX_COORDINATE_M:
@@ -372,7 +355,14 @@ def load_gltf(path: Path) -> GltfAsset:
             together[material].append(part)
         if not together:
             raise DeltalightError(f"{path} has no triangle with an area; export a triangle mesh.")
-        return GltfAsset(path, nodes, list(together.values()), read_clips(gltf, nodes), left_out(gltf))
+        return GltfAsset(
+            path,
+            nodes,
+            list(together.values()),
+            read_clips(gltf, nodes),
+            left_out=left_out(gltf),
+            lamps=read_lamps(gltf, nodes),
+        )
 
 
 def _sweep_times(clip: Clip) -> Float64[np.ndarray, " k"]:
@@ -384,102 +374,3 @@ def _sampled_vertices(part: GltfPart, vertex_count: int) -> GltfPart:
     """Returns a part with the vertices that triangles use, or a subset where the asset has many."""
     used = np.unique(part.mesh.triangles)
     return part.of_vertices(used[:: -(-vertex_count // MAX_SWEEP_VERTICES)])
-
-
-def _posed(rest: TriangleMesh, parts: Sequence[GltfPart], pose: Pose) -> TriangleMesh:
-    """Returns the mesh of one material in a pose."""
-    shaped = [_shaped(part, pose) for part in parts]
-    return replace(
-        rest,
-        positions=np.concatenate([mesh.positions for mesh in shaped]),
-        normals=np.concatenate([mesh.normals for mesh in shaped]),
-        triangles=joined_triangles(
-            [mesh.triangles for mesh in shaped], [len(mesh.positions) for mesh in shaped]
-        ),
-    )
-
-
-def _shaped(part: GltfPart, pose: Pose) -> TriangleMesh:
-    """Morphs a part, then places it by its skin or its node. A mirroring node reverses the winding."""
-    matrices = _matrices(part, pose)
-    positions = _placed(_morphed(part, pose), matrices)
-    mirrored = part.skin is None and np.linalg.det(matrices[:3, :3]) < 0
-    triangles = np.ascontiguousarray(part.mesh.triangles[:, ::-1]) if mirrored else part.mesh.triangles
-    if part.smoothing is not None:
-        normals = part.smoothing.normals(positions, triangles)
-    else:
-        normals = _turned(_morphed_normals(part, pose), matrices, part.mesh.normals, mirrored=mirrored)
-    return replace(part.mesh, positions=positions, normals=normals, triangles=triangles)
-
-
-def _matrices(part: GltfPart, pose: Pose) -> Float64[np.ndarray, "*n 4 4"]:
-    """Returns asset_from_mesh: one matrix, or one per vertex of a skinned mesh, whose node has no effect."""
-    if part.skin is None:
-        return np.asarray(pose.asset_from_node[part.node])
-    return _blended(part.skin, pose)
-
-
-def _blended(skin: Skin, pose: Pose) -> Float64[np.ndarray, "n 4 4"]:
-    """Blends the joints' matrices linearly."""
-    asset_from_mesh = pose.asset_from_node[skin.joints] @ skin.joint_from_mesh
-    return np.asarray((skin.weights @ asset_from_mesh.reshape(-1, 16)).reshape(-1, 4, 4))
-
-
-def _placed(
-    positions: Float32[np.ndarray, "n 3"], matrices: Float64[np.ndarray, "*n 4 4"]
-) -> Float32[np.ndarray, "n 3"]:
-    """Transforms positions by one matrix, or one each."""
-    turned = (matrices[..., :3, :3] @ positions[..., None].astype(np.float64))[..., 0]
-    return np.asarray(turned + matrices[..., :3, 3], np.float32)
-
-
-def _morphed(part: GltfPart, pose: Pose) -> Float32[np.ndarray, "n 3"]:
-    if part.morph is None:
-        return part.mesh.positions
-    return _added(part.mesh.positions, part.morph.positions, pose.weights[part.node])
-
-
-def _added(
-    base: Float32[np.ndarray, "n 3"],
-    deltas: Sequence[Float32[np.ndarray, "n 3"]],
-    weights: Float64[np.ndarray, " t"],
-) -> Float32[np.ndarray, "n 3"]:
-    """Adds weighted deltas."""
-    total = base.copy()
-    for delta, weight in zip(deltas, weights, strict=True):
-        if weight != 0:
-            total += np.float32(weight) * delta
-    return total
-
-
-def _morphed_normals(part: GltfPart, pose: Pose) -> Float32[np.ndarray, "n 3"]:
-    if part.morph is None or part.morph.normals is None:
-        return part.mesh.normals
-    return _added(part.mesh.normals, part.morph.normals, pose.weights[part.node])
-
-
-def _turned(
-    normals: Float32[np.ndarray, "n 3"],
-    matrices: Float64[np.ndarray, "*n 4 4"],
-    instead: Float32[np.ndarray, "n 3"],
-    *,
-    mirrored: bool,
-) -> Float32[np.ndarray, "n 3"]:
-    """Transforms normals by one matrix, or one each, to unit length.
-
-    Uses the cofactor matrix, which is the inverse transpose but for a factor and exists for singular matrices too:
-    clips often hide things by a scale of 0. A normal of length 0 is replaced by that of `instead`.
-    """
-    # Matrix elements first (scalars, or one per vertex): twice as fast as one small product per vertex.
-    a = np.ascontiguousarray(np.moveaxis(matrices[..., :3, :3], (-2, -1), (0, 1)))
-    x, y, z = normals.T.astype(np.float64)
-    turned = np.empty((len(normals), 3))
-    for i in range(3):
-        p, q = a[(i + 1) % 3], a[(i + 2) % 3]
-        turned[:, i] = (
-            (p[1] * q[2] - p[2] * q[1]) * x
-            + (p[2] * q[0] - p[0] * q[2]) * y
-            + (p[0] * q[1] - p[1] * q[0]) * z
-        )
-    turned *= -1 if mirrored else 1
-    return unit_or(turned, instead)

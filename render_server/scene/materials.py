@@ -20,7 +20,7 @@ from deltalight.render_server.scene.textures_by_light import TextureByLight
 
 MATERIAL_FLOATS, COATING_FLOATS = 20, 8
 DARKEST_ATTENUATION = 1e-4  # black has no logarithm
-_MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
+MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
 
 
 class AlphaMode(IntEnum):
@@ -37,8 +37,9 @@ class Material:
 
     `specular`: F0 = 0.08 specular, which `ior` overrides; `f0_tint` multiplies either. `emission` is a radiance in
     camera units. `roughness` is perceptual (alpha = roughness squared). Maps multiply the values that they are named
-    after: roughness by green, metallic by blue. `alpha` multiplies that of the base colour's map. Vertex colours
-    multiply the base colour, and the emission of what `is_unlit`.
+    after: roughness by green, metallic by blue. `alpha` multiplies that of the base colour's map. `vertex_cutoff` is
+    that of a mask whose alpha vertices multiply too, else None. Vertex colours multiply the base colour, and the
+    emission of what `is_unlit`.
 
     `transmission` is the fraction of the light entering the surface that goes on through it, the rest is diffuse. The
     solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
@@ -69,6 +70,7 @@ class Material:
     double_sided: bool = False
     alpha_mode: AlphaMode = AlphaMode.OPAQUE
     alpha: float = 1.0
+    vertex_cutoff: float | None = None
     base_color_map: TextureMap | None = None
     metallic_roughness_map: TextureMap | None = None
     normal_map: TextureMap | None = None
@@ -120,6 +122,11 @@ class Material:
     def has_second_uv(self) -> bool:
         """Whether any of its maps lies on the second set of texture coordinates."""
         return any(each is not None and each.uv_set == 1 for each in self.maps)
+
+    @property
+    def has_normal_maps(self) -> bool:
+        """Whether a map bends its normals, or those of its coat."""
+        return self.normal_map is not None or self.coat_normal_map is not None
 
     @property
     def base_color_texture(self) -> Float16[np.ndarray, "h w 3"] | None:
@@ -218,8 +225,10 @@ class Material:
         return () if self.by_light is None else tuple(map(TextureMap, self.by_light.planes))
 
     @classmethod
-    def from_gltf(cls, description: dict[str, Any], textures: TextureReader) -> Self:
-        """Makes a material from an entry of a glTF document's `materials`.
+    def from_gltf(
+        cls, description: dict[str, Any], textures: TextureReader, *, vertices_have_alpha: bool = False
+    ) -> Self:
+        """Makes a material from an entry of a glTF document's `materials`, for vertices with alpha or without.
 
         Raises:
             GltfFaultError: a texture cannot be used.
@@ -266,10 +275,20 @@ class Material:
         mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
         base_map = textures.color(pbr.get("baseColorTexture"), with_alpha=mode != AlphaMode.OPAQUE)
         material = replace(material, base_color_map=base_map)
-        material = material._with_alpha(mode, float(color[3]), float(description.get("alphaCutoff", 0.5)))
+        cutoff = float(description.get("alphaCutoff", 0.5))
+        if mode == AlphaMode.MASK and vertices_have_alpha:
+            material = material._masked_by_vertices(float(color[3]), cutoff)
+        else:
+            material = material._with_alpha(mode, float(color[3]), cutoff)
         if "KHR_materials_unlit" in extensions:
             return material._unlit()
         return material if material.is_coated else material._without_coating()
+
+    def _masked_by_vertices(self, factor: float, cutoff: float) -> Self:
+        """Returns the material with a mask that vertices' alpha multiplies, so that shaders compare; all passes 0."""
+        if cutoff <= 0:
+            return self
+        return replace(self, alpha_mode=AlphaMode.MASK, alpha=min(factor, 1.0), vertex_cutoff=cutoff)
 
     def _with_alpha(self, mode: AlphaMode, factor: float, cutoff: float) -> Self:
         """Returns the material with its alpha; a mask becomes coverage, one half at the cutoff.
@@ -280,7 +299,7 @@ class Material:
             is_there = mode != AlphaMode.MASK or factor >= cutoff
             return replace(self, alpha_mode=mode, alpha=min(factor, 1.0) * is_there if mode else 1.0)
         texels = self.base_color_map.texels.copy()
-        texels[..., 3] = np.clip(0.5 + (texels[..., 3] * factor - cutoff) * _MASK_SLOPE, 0, 1)
+        texels[..., 3] = np.clip(0.5 + (texels[..., 3] * factor - cutoff) * MASK_SLOPE, 0, 1)
         return replace(self, alpha_mode=mode, base_color_map=replace(self.base_color_map, texels=texels))
 
     def _without_coating(self) -> Self:
@@ -433,14 +452,14 @@ def map_table(
 ) -> Float32[np.ndarray, "k _"]:
     """Packs alpha and the first `count` maps for a shader, 1 + 3 `count` vectors each, behind all other rows.
 
-    (alpha mode, alpha, repeats of the base colour's map a metre, 0); for each map (row of u, layer or -1),
-    (row of v, set of coordinates), (wraps, across + 3 down; columns and rows of an unfiltered texture, else 0;
-    strength).
+    (alpha mode, alpha, repeats of the base colour's map a metre, `vertex_cutoff` or 0); for each map (row of u,
+    layer or -1), (row of v, set of coordinates), (wraps, across + 3 down; columns and rows of an unfiltered texture,
+    else 0; strength).
     """
     table = np.zeros((len(materials), 4 + 12 * count), np.float32)
     table[:, 7::12] = -1
     for row, material, repeats in zip(table, materials, repeats_per_m, strict=True):
-        row[:3] = material.alpha_mode, material.alpha, repeats
+        row[:4] = material.alpha_mode, material.alpha, repeats, material.vertex_cutoff or 0.0
         for place, each in enumerate(material.maps[:count]):
             if each is not None:
                 row[4 + 12 * place :][:12] = _map_entry(each, layer_of(each))

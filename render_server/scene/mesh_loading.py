@@ -1,17 +1,19 @@
 """Loading of mesh files: GLB, glTF, OBJ, PLY, STL."""
 
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene_objects import GLTF_SUFFIXES
+from deltalight.render_server.lights.lights import Light
 from deltalight.render_server.scene.asset_check import check_mesh_file
 from deltalight.render_server.scene.gltf_meshes import GltfAsset, load_gltf
 from deltalight.render_server.scene.materials import Material
@@ -27,16 +29,22 @@ if TYPE_CHECKING:
     import trimesh
 
 
+def no_lamps(_world_from_asset: Float64[np.ndarray, "4 4"]) -> tuple[Light, ...]:
+    """Of a file that holds no lights."""
+    return ()
+
+
 @dataclass(frozen=True, eq=False)
 class Asset:
     """The meshes of a file in their rest pose, and the glTF asset that animates them if the file has clips.
 
-    `left_out` says what of the file is not shown.
+    `left_out` says what of the file is not shown. `lamps` returns the file's lights at rest, in the world.
     """
 
     meshes: list[TriangleMesh]
     animated: GltfAsset | None
     left_out: str | None = None
+    lamps: Callable[[Float64[np.ndarray, "4 4"]], tuple[Light, ...]] = no_lamps
 
     @cached_property
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
@@ -66,7 +74,9 @@ def load_asset(path: Path) -> Asset:
     """
     if check_mesh_file(path) in GLTF_SUFFIXES:
         gltf = load_gltf(path)
-        return Asset(gltf.meshes(gltf.pose(None, 0.0)), gltf if gltf.clips else None, gltf.left_out)
+        rest = gltf.pose(None, 0.0)
+        animated = gltf if gltf.clips else None
+        return Asset(gltf.meshes(rest), animated, gltf.left_out, partial(gltf.lamps, rest))
     together: dict[int, list[TriangleMesh]] = defaultdict(list)
     for key, part in _parts(_open_scene(path), path):
         together[key].append(part)

@@ -27,7 +27,8 @@ from deltalight.render_server.scene.occlusion_field import (
     fill_inside,
 )
 from deltalight.render_server.scene.texture_maps import TextureMap
-from deltalight.render_server.scene.triangle_mesh import TriangleMesh, split_triangles
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.scene.triangle_splitting import split_triangles
 
 ORDER = 3  # SH bands of incident and reflected light: both are diffuse
 LENGTH = ORDER**2

@@ -26,9 +26,9 @@ from deltalight.render_server.scene.triangle_mesh import (
     CREASE_ANGLE_DEG,
     TriangleMesh,
     face_normals,
-    split_triangles,
     unit_or,
 )
+from deltalight.render_server.scene.triangle_splitting import split_triangles
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -152,7 +152,8 @@ class TriangleMesh:
 
     `normals` are unit vectors. `uv` (0, 0) is the top-left corner of the texture array. `colors` are linear
     R G B that multiply the material's base colour. `second_uv` is what maps of set 1 lie on. `opacity` (0..1)
-    multiplies the alpha of a material that is blended.
+    multiplies the alpha of a material that is blended or masked. `tangents` point along u of normal maps (unit
+    vectors, or zero where the file gives none); w: +1 or -1, the sign of (normal x tangent) along the maps' y.
     """
 
     positions: Float32[np.ndarray, "n 3"]
@@ -163,6 +164,7 @@ class TriangleMesh:
     colors: Float32[np.ndarray, "n 3"] | None = None
     second_uv: Float32[np.ndarray, "n 2"] | None = None
     opacity: Float32[np.ndarray, "n 1"] | None = None
+    tangents: Float32[np.ndarray, "n 4"] | None = None
 
     def uv_of(self, texture: TextureMap | None) -> Float32[np.ndarray, "n 2"] | None:
         """Returns the coordinates that a map of its material lies on; None without them, or without a map."""
@@ -187,16 +189,26 @@ class TriangleMesh:
         positions = self.positions @ linear.T + matrix[:3, 3]
         normals = self.normals @ np.linalg.inv(linear)
         normals /= np.maximum(short_axis.lengths(normals)[:, None], 1e-30)
-        mirrored = np.linalg.det(linear) < 0
+        mirrored = bool(np.linalg.det(linear) < 0)
         moved = replace(
             self,
             positions=positions.astype(np.float32),
             normals=normals.astype(np.float32),
             triangles=np.ascontiguousarray(self.triangles[:, ::-1]) if mirrored else self.triangles,
+            tangents=None if self.tangents is None else turned_tangents(self.tangents, linear, mirrored),
         )
         if "_used" in vars(self):  # the same, and it takes longer to find than to move the mesh
             vars(moved)["_used"] = self._used
         return moved
+
+
+def turned_tangents(
+    tangents: Float32[np.ndarray, "n 4"], linear: Float64[np.ndarray, "*n 3 3"], mirrored: bool
+) -> Float32[np.ndarray, "n 4"]:
+    """Transforms tangents by one matrix, or one each, as directions of the surface; mirrors turn the sign of w."""
+    along = (linear @ tangents[:, :3, None].astype(np.float64))[..., 0]
+    unit = unit_or(along, np.zeros_like(along))
+    return np.column_stack([unit, -tangents[:, 3] if mirrored else tangents[:, 3]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +222,7 @@ class FileGeometry:
     colors: Float32[np.ndarray, "n 3"] | None = None
     second_uv: Float32[np.ndarray, "n 2"] | None = None
     opacity: Float32[np.ndarray, "n 1"] | None = None
+    tangents: Float32[np.ndarray, "n 4"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +239,7 @@ def converted(
 ) -> ConvertedMesh | None:
     """Converts a file's mesh; None if no triangle is left after dropping degenerate ones.
 
-    Computes missing normals (sharp at edges beyond 60 degrees).
+    Computes missing normals (sharp at edges beyond 60 degrees); tangents then do not count (glTF 2.0, 3.7.2.1).
 
     Raises:
         DeltalightError: vertices that do not exist, coordinates or normals that are not finite, or beyond 10 km.
@@ -241,9 +254,10 @@ def converted(
     if len(triangles) == 0:
         return None
     normals = _unit_normals(given.normals, len(positions), path)
-    source, smoothing = np.arange(len(positions)), None
+    source, smoothing, tangents = np.arange(len(positions)), None, given.tangents
     if normals is None:
         source, triangles, smoothing = split_at_creases(positions, triangles)
+        tangents = None
         normals = smoothing.normals(positions[source], triangles)
     mesh = TriangleMesh(
         np.ascontiguousarray(positions[source]),
@@ -254,6 +268,7 @@ def converted(
         None if given.colors is None else given.colors[source],
         None if given.second_uv is None else given.second_uv[source],
         None if given.opacity is None else given.opacity[source],
+        None if tangents is None else _unit_tangents(tangents),
     )
     return ConvertedMesh(mesh, source, smoothing)
 
@@ -282,6 +297,14 @@ def _unit_normals(
     return unit_or(normals, normals) if (np.linalg.norm(normals, axis=1) > 1e-6).all() else None
 
 
+def _unit_tangents(tangents: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
+    """Returns tangents of length 1 with w as its sign; those that are not finite or have no length become zero."""
+    usable = np.isfinite(tangents).all(axis=1, keepdims=True)
+    finite = np.where(usable, tangents, 0)
+    unit = unit_or(finite[:, :3], np.zeros_like(finite[:, :3]))
+    return np.column_stack([unit, np.where(finite[:, 3] < 0, -1, 1).astype(np.float32)])
+
+
 def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
     """Concatenates meshes of one material."""
     if len(parts) == 1:
@@ -295,6 +318,7 @@ def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
         _joined_attribute([part.colors for part in parts], parts, 1.0),
         _joined_attribute([part.second_uv for part in parts], parts, 0.0),
         _joined_attribute([part.opacity for part in parts], parts, 1.0),
+        joined_tangents(parts),
     )
 
 
@@ -311,6 +335,11 @@ def joined_triangles(
     )
 
 
+def joined_tangents(parts: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 4"] | None:
+    """Concatenates tangents; zero for parts without; None if no part has any."""
+    return _joined_attribute([part.tangents for part in parts], parts, 0.0)
+
+
 def _joined_attribute(
     values: Sequence[np.ndarray | None], parts: Sequence[TriangleMesh], default: float
 ) -> np.ndarray | None:
@@ -325,7 +354,6 @@ def _joined_attribute(
     return np.concatenate(filled)
 
 
-MAX_PIECES = 4_000_000
 VERTEX_LAYOUT = "3f 3f 2f 3f 1f"
 CLEAR_FRACTION = 0.5  # beside the material's whole number, that of a vertex of opacity 0
 VERTEX_ATTRIBUTES = ("in_position", "in_normal", "in_uv", "in_color", "in_material")
@@ -336,14 +364,15 @@ class GpuMesh:
     """Several meshes in one vertex buffer.
 
     A row of `vertices` is position 3, normal 3, uv 2, colour 3, material index 1 (`VERTEX_LAYOUT`).
-    For `material_table` see `materials.material_table`. `second_uv` is None if no vertex has one.
+    For `material_table` see `materials.material_table`. A row of `placement` is what maps need beside it: the second
+    uv 2, tangent 4, zero where there is none; None if no vertex has either.
     """
 
     vertices: Float32[np.ndarray, "n 12"]
     triangles: Int32[np.ndarray, "m 3"]
     materials: tuple[Material, ...]
     material_table: Float32[np.ndarray, "k 20"]
-    second_uv: Float32[np.ndarray, "n 2"] | None
+    placement: Float32[np.ndarray, "n 6"] | None
 
     @cached_property
     def corners(self) -> Float32[np.ndarray, "m 3 3"]:
@@ -397,8 +426,20 @@ def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
         joined_triangles([mesh.triangles for mesh in meshes], [len(mesh.positions) for mesh in meshes]),
         materials,
         material_table(materials),
-        _joined_attribute([mesh.second_uv for mesh in meshes], meshes, 0.0),
+        _placement(meshes),
     )
+
+
+def _placement(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 6"] | None:
+    second_uv = _joined_attribute([mesh.second_uv for mesh in meshes], meshes, 0.0)
+    tangents = joined_tangents(meshes)
+    if second_uv is None and tangents is None:
+        return None
+    rows = np.zeros((sum(len(mesh.positions) for mesh in meshes), 6), np.float32)
+    for columns, values in ((slice(0, 2), second_uv), (slice(2, 6), tangents)):
+        if values is not None:
+            rows[:, columns] = values
+    return rows
 
 
 def _interleaved(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 12"]:
@@ -419,49 +460,3 @@ def _interleaved(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 12"]:
         if mesh.opacity is not None:
             own[:, 11] += CLEAR_FRACTION * (1 - np.clip(mesh.opacity[:, 0], 0, 1))
     return rows
-
-
-def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> Float32[np.ndarray, "k 3 c"]:
-    """Bisects longest edges until none is longer than `max_edge` (same unit as the positions).
-
-    Columns 0..2 of a corner are its position; all other columns (normal, uv, material index...) are
-    interpolated linearly with it. Triangles that are short enough come first, unchanged and in order.
-    (llvmpipe ends loops of a shader invocation early, so voxelisation needs triangles of bounded size.)
-
-    Raises:
-        DeltalightError: more than 4 million triangles would result.
-    """
-    done: list[np.ndarray] = []
-    pending = np.ascontiguousarray(corners, np.float32)
-    _check_pieces(pending, max_edge)
-    while len(pending):
-        edges = np.roll(pending[..., :3], -1, axis=1) - pending[..., :3]
-        lengths = short_axis.lengths(edges)
-        long = short_axis.greatest(lengths) > max_edge
-        done.append(pending[~long])
-        pending = _bisected(pending[long], lengths[long].argmax(axis=1))
-    return np.concatenate(done) if done else np.zeros_like(pending)
-
-
-def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> None:
-    """Refuses by a lower bound on the number of pieces, before memory runs out.
-
-    An equilateral triangle is the largest that the limit allows; bisection makes a few times as many.
-    """
-    edges = np.roll(corners[..., :3], -1, axis=1) - corners[..., :3]
-    areas = short_axis.lengths(np.cross(edges[:, 0], edges[:, 1])) / 2
-    by_area = areas / (np.sqrt(3) / 4 * max_edge**2)
-    by_length = short_axis.greatest(short_axis.lengths(edges)) / max_edge
-    if np.maximum(by_area, by_length).sum() > MAX_PIECES:
-        raise DeltalightError(
-            f"a mesh splits into more than {MAX_PIECES} triangles; use fewer voxels or a smaller mesh."
-        )
-
-
-def _bisected(corners: Float32[np.ndarray, "m 3 c"], edge: np.ndarray) -> Float32[np.ndarray, "k 3 c"]:
-    """Cuts every triangle at the midpoint of its edge number `edge` (from corner `edge` to the next)."""
-    row = np.arange(len(corners))
-    start, end, opposite = (corners[row, (edge + step) % 3] for step in range(3))
-    middle = (start + end) * np.float32(0.5)
-    halves = [np.stack([start, middle, opposite], axis=1), np.stack([middle, end, opposite], axis=1)]
-    return np.concatenate(halves)

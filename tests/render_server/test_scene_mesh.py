@@ -12,7 +12,8 @@ from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.texture_maps import TextureMap
-from deltalight.render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu, split_triangles
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
+from deltalight.render_server.scene.triangle_splitting import split_triangles
 
 CUBE_OBJ = """
 mtllib cube.mtl
@@ -281,7 +282,7 @@ def test_merging_keeps_every_triangle_and_its_material() -> None:
     assert merged.vertices[:, 8:11].min() == 1
     assert merged.material_table[1, :3].tolist() == [1, 0, 0]
     assert merged.material_table[:, 12].tolist() == [0, 1]
-    assert merged.second_uv is None
+    assert merged.placement is None
 
 
 def area(corners: np.ndarray) -> float:

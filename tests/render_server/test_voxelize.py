@@ -36,8 +36,8 @@ from deltalight.render_server.scene.triangle_mesh import (
     GpuMesh,
     TriangleMesh,
     merge_for_gpu,
-    split_triangles,
 )
+from deltalight.render_server.scene.triangle_splitting import split_triangles
 from tests.render_server.voxel_lab import VoxelLab, gpu_mesh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

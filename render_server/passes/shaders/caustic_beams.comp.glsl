@@ -234,7 +234,7 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     vec2 s = texel_lateral(view, texel);
     vec3 flux = float(block_edge * block_edge) / float(RAY_COUNT) * texel_light(light, view, s);
     if (flux == vec3(0.0)) return;
-    flux *= real_visibility(light, spot.point, spot.normal, bias_real);
+    flux *= within_range(light, spot.point) * real_visibilities(light, spot.point, spot.normal, bias_real).y;
     float depth = (view.view_from_world * vec4(spot.point, 1.0)).z, angle = 2.0 * PI * numbers.x;
     vec2 on_lamp = tan(radius) * sqrt(numbers.y) * vec2(cos(angle), sin(angle));
     // Over the length of the objects a lamp spreads light by so many blocks; rays of a small one share a block.
@@ -254,7 +254,7 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     float fraction = float(block_edge * block_edge) / float(RAY_COUNT);
     vec3 flux = fraction * texel_light(light, view, texel_lateral(view, texel));
     if (flux == vec3(0.0)) return;
-    flux *= real_visibility(light, spot.point, spot.normal, bias_real);
+    flux *= within_range(light, spot.point) * real_visibilities(light, spot.point, spot.normal, bias_real).y;
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(spot.material, uv.xy, unpack_color(uv.z), 0.0);
     float alpha = max(m.roughness * m.roughness, LEAST_ALPHA);

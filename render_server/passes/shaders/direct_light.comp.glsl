@@ -21,7 +21,7 @@ layout(rgba16f) writeonly uniform image2D lobe_rho;
 #ifdef SHADOW_CONES
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }
 #elif defined(REAL_SHADOWS)
-vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return vec2(real_visibility(light, p, n, bias)); }
+vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return real_visibilities(light, p, n, bias); }
 #else
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return visibility(light, p, n, bias, bias); }
 #endif
@@ -48,7 +48,7 @@ void light(ivec2 pixel, ivec2 size) {
             e_mu += across * cosine * seen.x;
             vec3 arrives = arriving(listed_light(i), position.xyz, seen, beam_alpha);
             e_rho += across * cosine * arrives;
-            unshadowed += dot(across, vec3(1.0 / 3.0)) * cosine;
+            unshadowed += is_virtual(listed_light(i)) ? 0.0 : dot(across, vec3(1.0 / 3.0)) * cosine;
             if (specular_surfaces && normal.w >= 0.0) {
                 SurfaceEntry e = surfaces[int(normal.w)];
                 vec3 lobe = across * specular_times_cosine(normal.xyz, v, l, e.f0.rgb, e.surface.x, radius);

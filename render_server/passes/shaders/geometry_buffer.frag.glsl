@@ -12,6 +12,7 @@ in float clear;
 #endif
 #ifdef MATERIAL_MAPS
 in vec2 second_uv;
+in vec4 tangent;
 #endif
 layout(location = 0) out vec4 out_position;
 layout(location = 1) out vec4 out_normal;
@@ -38,6 +39,7 @@ Fragment interpolated() {
 #endif
 #ifdef MATERIAL_MAPS
     f.second_uv = second_uv;
+    f.tangent = tangent;
     f.uv_slopes = vec4(dFdx(uv), dFdy(uv));
     f.second_uv_slopes = vec4(dFdx(second_uv), dFdy(second_uv));
     f.right = right;

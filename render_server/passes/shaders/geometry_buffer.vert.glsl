@@ -10,7 +10,9 @@ in float in_material;
 #pragma switch MATERIAL_MAPS
 #else
 in vec2 in_second_uv;   // zero for meshes without
+in vec4 in_tangent;     // as well
 out vec2 second_uv;
+out vec4 tangent;
 #endif
 out vec3 world;
 out vec3 normal;
@@ -35,6 +37,7 @@ void main() {
 #endif
 #ifdef MATERIAL_MAPS
     second_uv = in_second_uv;
+    tangent = in_tangent;
 #endif
     gl_Position = clip_from_camera * camera;
 }

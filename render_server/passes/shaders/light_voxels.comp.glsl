@@ -249,7 +249,7 @@ void light(Surfel s, uint own, vec3 n) {
 #endif
     float area = s.position_area.w, opaque = 1.0;
 #if defined(VIRTUAL) && defined(MATERIAL_MAPS)
-    area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, sqrt(area));
+    area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.w, sqrt(area));
 #endif
 #if defined(VIRTUAL) && defined(TRANSMISSION)
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb, sqrt(s.position_area.w));

@@ -22,7 +22,7 @@ uniform float cell_edge;   // m
 void cover(Surfel s, vec3 n) {
     float area = s.position_area.w;
 #ifdef CUTOUTS
-    area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, sqrt(area));
+    area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.w, sqrt(area));
 #endif
     ivec3 half_cell = voxel_of_index(floatBitsToUint(s.uv_voxel.z), 2 * cells);
     for (int axis = 0; axis < 3; ++axis) {

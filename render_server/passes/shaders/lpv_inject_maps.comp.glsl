@@ -31,7 +31,7 @@ vec3 lit_side(vec3 n, vec3 to_light) { return dot(n, to_light) < 0.0 ? -n : n; }
 #ifdef REAL
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
     vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
-    vec3 reflected = texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb;
+    vec3 reflected = texel_light(light, view, s) * within_range(light, p) * texelFetch(real_albedo, texel, 0).rgb;
     inject_patch(lit_patch(view, s, p, n), lit_side(n, direction_to_light(light, p)), reflected);
 }
 #else
@@ -54,7 +54,7 @@ void inject_along(Patch lit, vec3 to_light, vec3 flux) {
 }
 
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
-    vec3 arriving = texel_light(light, view, s);
+    vec3 arriving = texel_light(light, view, s) * within_range(light, p);
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;   // the real scene is in front of the object
     vec3 to_light = direction_to_light(light, p), n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);

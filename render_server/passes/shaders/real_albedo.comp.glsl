@@ -26,7 +26,7 @@ vec3 unblocked(Light light, vec3 p, vec3 n) {
 vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
     int own = light_of_view(view_index);
-    vec3 of_own = unblocked(listed_light(own), p, n);
+    vec3 of_own = is_virtual(listed_light(own)) ? vec3(0.0) : unblocked(listed_light(own), p, n);   // the picture lacks these
     int j = 0;
     if (light_count > 1) do {
         if (j == own) e += of_own;   // sums in the lights' order

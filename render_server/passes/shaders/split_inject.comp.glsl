@@ -75,19 +75,34 @@ void add_held() {
     atomicAdd(sums[at + AREA], held_area);
 }
 
+void go_to(int slot) {
+    if (slot == held_slot) return;
+    add_held();
+    held_slot = slot;
+    held_delta = held_rho = ivec3(0);
+    held_area = 0;
+}
+
 // Flux and area per voxel face, so that fixed point serves every scale.
+ivec3 parts_of(vec3 flux) {
+    vec3 shares = flux / (PI * voxel_edge * voxel_edge);
+    return ivec3(rounded(shares.r), rounded(shares.g), rounded(shares.b));
+}
+
 void hold(int slot, bool shadowed, vec3 flux, float area) {
-    if (slot != held_slot) {
-        add_held();
-        held_slot = slot;
-        held_delta = held_rho = ivec3(0);
-        held_area = 0;
-    }
-    float face = voxel_edge * voxel_edge;
-    vec3 shares = flux / (PI * face);
-    ivec3 parts = ivec3(rounded(shares.r), rounded(shares.g), rounded(shares.b));
+    go_to(slot);
+    ivec3 parts = parts_of(flux);
     if (shadowed) held_delta -= parts; else held_rho += parts;
-    held_area += rounded(area / face);
+    held_area += rounded(area / (voxel_edge * voxel_edge));
+}
+
+// Of a light that comes with an object.
+void hold_gained(int slot, vec3 flux, float area) {
+    go_to(slot);
+    ivec3 parts = parts_of(flux);
+    held_delta += parts;
+    held_rho += parts;
+    held_area += rounded(area / (voxel_edge * voxel_edge));
 }
 
 #ifdef VIRTUAL
@@ -112,7 +127,7 @@ void split(Light light, LightView view, ivec2 texel) {
     if (real.present && real.depth < real.ray_depth - bias_real) return;
     int slot = slot_near(volume_coordinate(p));
     if (slot < 0) return;
-    vec3 flux = texel_light(light, view, s) * virtual_albedo(texel);
+    vec3 flux = texel_light(light, view, s) * within_range(light, p) * virtual_albedo(texel);
     vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
     hold(slot, false, flux, lit_area(light, view, s, p, n));
 }
@@ -131,9 +146,15 @@ void split(Light light, LightView view, ivec2 texel) {
     if (slot < 0) return;
     Hit object = first_hit(virtual_light_depth, light.views.z, light.views.w, p);
     bool shadowed = object.present && object.depth <= object.ray_depth + bias_real;
-    vec3 flux = texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb;
+    vec3 flux = texel_light(light, view, s) * within_range(light, p) * texelFetch(real_albedo, texel, 0).rgb;
     vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
-    hold(slot, shadowed, flux, lit_area(light, view, s, p, n));
+    float area = lit_area(light, view, s, p, n);
+    if (is_virtual(light)) {
+        if (shadowed) flux = vec3(0.0);
+        hold_gained(slot, flux, area);
+    } else {
+        hold(slot, shadowed, flux, area);
+    }
 }
 #endif
 

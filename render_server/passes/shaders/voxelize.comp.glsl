@@ -108,7 +108,7 @@ void emit(Piece t, int material, vec4 part, ivec3 voxel, vec3 a, vec3 b, vec3 c,
     surfels[index].position_area = vec4(volume_origin + part.xyz * voxel_edge, part.w * voxel_edge * voxel_edge);
     surfels[index].normal_material = vec4(normalize(n), float(material));
     surfels[index].uv_voxel = vec4(uv_at(t, part.xyz, a, b, c, n), uintBitsToFloat(v), double_sided[material]);
-    surfels[index].tint = vec4((t.a.tint + t.b.tint + t.c.tint) / 3.0, 1.0);
+    surfels[index].tint = (t.a.tint + t.b.tint + t.c.tint) / 3.0;
 }
 
 void clip_to_voxel(Pair pair) {

@@ -20,6 +20,7 @@ struct Fragment {
 #endif
 #ifdef MATERIAL_MAPS
     vec2 second_uv;
+    vec4 tangent;    // the file's; zero without. w: sign of (normal x tangent) along a normal map's y
     // What a pixel to the right (xy) and one down (zw) add; the same of the place.
     vec4 uv_slopes;
     vec4 second_uv_slopes;

@@ -6,7 +6,7 @@ void inject_side(Surfel s, vec3 n) {
     vec3 radiosity = sent_out(s, n);
     float area = s.position_area.w;
 #ifdef MATERIAL_MAPS
-    area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, sqrt(area));
+    area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.w, sqrt(area));
 #endif
     if (radiosity != vec3(0.0)) inject(s.position_area.xyz, n, radiosity * area);
 }

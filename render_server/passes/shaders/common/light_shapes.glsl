@@ -3,12 +3,13 @@
 
 struct Light {
     vec4 place;    // xyz: direction of travel (directional) or position in m; w: kind
-    vec4 color;    // rgb: E_perp (directional), intensity I (sphere, spot) or radiance L (rectangle), camera units
-    vec4 shape;    // x: tan(angular radius) (directional), radius in m (sphere, spot); y - z angle: fraction of I (spot)
-    vec4 axis_u;   // xyz: half an edge in m (rectangle) or direction of travel on the axis (spot)
-    vec4 axis_v;   // xyz: half the other edge in m (rectangle)
+    vec4 color;    // rgb: E_perp (directional), intensity I (sphere, spot, punctual) or radiance L (rectangle), camera units
+    vec4 shape;    // x: tan(angular radius) (directional), radius in m (sphere, spot); y - z angle: fraction of I (spot);
+                   // y + z cos(angle): root of it (punctual)
+    vec4 axis_u;   // xyz: half an edge in m (rectangle) or direction of travel on the axis (spot, punctual)
+    vec4 axis_v;   // xyz: half the other edge in m (rectangle); x: 1 / range^2, 1/m^2 (punctual)
     vec4 plane;    // of a mirror image: the plane (world) in front of which it shines
-    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; layer -1: no image. color.w: distance, m, up to
+    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; -1: no image, -2: of an object. color.w: distance, m, up to
                    // which points belong to the plane; shape.w: roughness; axis_u.w: entry of the surface table;
                    // axis_v.w: the light that it is an image of
     vec4 map_u;    // of a mirror image: its map's coordinates of a world point are dot(xyz, p) + w
@@ -25,17 +26,34 @@ Light listed_light(int i) {
         light_column(i, 6), light_column(i, 7), light_column(i, 8), ivec4(imageLoad(light_rows, ivec2(9, i))));
 }
 
-const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0;   // kinds
+const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0, PUNCTUAL = 4.0;   // kinds
 // Of the scene's lights. llvmpipe executes what one kind needs for every light, so that a scene without it does without.
 #pragma switch bool has_rectangles
 #pragma switch bool has_mirror_images
+#pragma switch bool has_virtual_lights
 
 bool is_rectangle(Light light) { return has_rectangles && light.place.w == RECTANGLE; }
 
 bool is_image(Light light) { return has_mirror_images && light.mirror.w >= 0.0; }
 
+// Whether a light comes with an object: it shines with the objects alone, and the picture was taken without it.
+bool is_virtual(Light light) { return has_virtual_lights && light.mirror.w < -1.5; }
+
+bool is_punctual(Light light) { return has_virtual_lights && light.place.w == PUNCTUAL; }
+
+// What the range of a punctual light leaves of it, 1 for others (KHR_lights_punctual, "Range Property").
+float within_range(Light light, vec3 p) {
+    vec3 d = light.place.xyz - p;
+    float part = dot(d, d) * light.axis_v.x;
+    return is_punctual(light) ? clamp(1.0 - part * part, 0.0, 1.0) : 1.0;
+}
+
 // Fraction of its intensity that a spot emits along d (unit, of travel); 1 for a sphere.
 float spot_fraction(Light light, vec3 d) {
+    if (is_punctual(light)) {
+        float root = clamp(light.shape.y + light.shape.z * dot(light.axis_u.xyz, d), 0.0, 1.0);
+        return root * root;
+    }
     float angle = 2.0 * asin(min(0.5 * distance(light.axis_u.xyz, d), 1.0));   // exact for small angles too
     return clamp(light.shape.y - light.shape.z * angle, 0.0, 1.0);
 }
@@ -92,5 +110,6 @@ vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out flo
     }
     to_light = d * inversesqrt(distance2);
     angular_radius = asin(min(light.shape.x * inversesqrt(distance2), 1.0));
-    return light.color.rgb / distance2 * spot_fraction(light, -to_light);
+    vec3 across = light.color.rgb / distance2 * spot_fraction(light, -to_light);
+    return has_virtual_lights ? across * within_range(light, p) : across;
 }

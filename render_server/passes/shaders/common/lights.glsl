@@ -36,8 +36,10 @@ vec3 light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_
     return before ? across * specular_reflectance(light.mirror.rgb, light.shape.w, cosine) : vec3(0.0);
 }
 
-// Fractions of a mirror image that its plane shows to p without and with the objects; 1 for other lights.
-vec2 mirror_fraction(Light light, vec3 p) {
+// Fractions of a light that shine towards p without and with the objects: of a mirror image, what its plane shows; of a light that
+// comes with an object none and all; 1 for others.
+vec2 shining_fraction(Light light, vec3 p) {
+    if (is_virtual(light)) return vec2(0.0, 1.0);
     if (!is_image(light)) return vec2(1.0);
     vec3 n = light.plane.xyz;
     bool distant = light.place.w == DIRECTIONAL;
@@ -304,7 +306,7 @@ bool object_may_block(Light light, vec3 p, float bias, bool in_box) {
 // The same of all lights.
 bool object_may_shadow(vec3 p, float bias, bool in_box) {
     for (int i = 0; i < light_count; ++i) {
-        vec2 shown = mirror_fraction(listed_light(i), p);
+        vec2 shown = shining_fraction(listed_light(i), p);
         if (shown.x != shown.y || object_may_block(listed_light(i), p, bias, in_box)) return true;
     }
     return false;
@@ -330,9 +332,10 @@ bool object_may_block_sphere(Light light, vec3 p, float radius, float bias) {
     return found;
 }
 
-// Whether object_may_shadow may hold of a point within `radius` of p; of images and rectangles, only the points tell.
+// Whether object_may_shadow may hold of a point within `radius` of p; of images and rectangles, only the points tell, and lights of
+// objects reach all.
 bool object_may_shadow_sphere(vec3 p, float radius, float bias) {
-    if (has_rectangles || has_mirror_images) return true;
+    if (has_rectangles || has_mirror_images || has_virtual_lights) return true;
     for (int i = 0; i < light_count; ++i)
         if (object_may_block_sphere(listed_light(i), p, radius, bias)) return true;
     return false;
@@ -418,13 +421,18 @@ vec3 arriving(Light light, vec3 p, vec2 seen, float beam_alpha) {
 #endif
 }
 
-// V_mu alone.
-float real_visibility(Light light, vec3 p, vec3 n, float bias) {
+// V_mu, and V_rho but for the objects' shadows.
+vec2 real_visibilities(Light light, vec3 p, vec3 n, float bias) {
     Occluder none;
     none.present = false;
     Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias);
-    return mirror_fraction(light, p).x * visible_fraction(light, real, none, p, n).x;
+    float seen = visible_fraction(light, real, none, p, n).x;
+    float without = shining_fraction(light, p).x * seen;
+    return vec2(without, is_virtual(light) ? seen : without);
 }
+
+// V_mu alone.
+float real_visibility(Light light, vec3 p, vec3 n, float bias) { return real_visibilities(light, p, n, bias).x; }
 
 // (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (docs/method.md
 // 3). `bias_real`, `bias_virtual` (m) move the receiver towards the light.
@@ -432,5 +440,5 @@ vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual
     Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
     int views = object_may_block(light, p, bias_virtual, false) ? light.views.w : 0;
     Occluder object = occluder(virtual_light_depth, light, light.views.z, views, p, n, bias_virtual);
-    return mirror_fraction(light, p) * visible_fraction(light, real, object, p, n);
+    return shining_fraction(light, p) * visible_fraction(light, real, object, p, n);
 }

@@ -30,7 +30,7 @@ struct MaterialEntry {
     vec4 sheen;        // rgb
 #endif
 #ifdef MATERIAL_MAPS
-    vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
+    vec4 alpha;        // mode, alpha, repeats of the base colour's map per m, cutoff where vertices' alpha is masked, else 0
     MapEntry maps[MAP_COUNT];
 #endif
 };
@@ -56,6 +56,7 @@ const int SPECULAR = 10, SPECULAR_COLOR = 11, TRANSMITTED = 12;
 #endif
 const int CLAMPED = 1, MIRRORED = 2;   // wraps; 0 repeats
 const float MASKED = 1.0, BLENDED = 2.0;   // modes of alpha
+const float MASK_SLOPE = 8.0;              // of coverage over alpha (scene/materials.py)
 const float APART = 5.588238;              // of the noise of materials and sides: what lies behind is left out elsewhere
 const float COARSEST = 32.0;   // mip level: a texture's mean
 
@@ -173,11 +174,17 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
 // Vertices hold their opacity beside the material's number, as a fraction (scene/triangle_mesh.py).
 float opacity_of_vertices(float clear) { return 1.0 - 2.0 * clear; }
 
-// Fraction of a footprint that is there.
-float opacity_of(int index, vec2 uv, float size) {
+// Maps of a mask hold coverage already, unless vertices' alpha multiplies them: then this makes it, one half at the cutoff.
+float fraction_there(MaterialEntry e, float alpha) {
+    return e.alpha.w == 0.0 ? alpha : clamp(0.5 + MASK_SLOPE * (alpha - e.alpha.w), 0.0, 1.0);
+}
+
+// Fraction of a footprint that is there; `of_vertices`: their opacity.
+float opacity_of(int index, vec2 uv, float of_vertices, float size) {
     MaterialEntry e = materials[index];
     if (e.alpha.x == 0.0) return 1.0;
-    return e.alpha.y * map_level(color_maps, e.maps[BASE_COLOR], uv, level_of(e, color_maps, size)).a;
+    vec4 texel = map_level(color_maps, e.maps[BASE_COLOR], uv, level_of(e, color_maps, size));
+    return fraction_there(e, of_vertices * e.alpha.y * texel.a);
 }
 
 // Whether a place of that opacity is left out: below a mask's half; where blended, below `even`, which takes all values 0..1.

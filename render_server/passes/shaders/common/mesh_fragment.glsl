@@ -3,7 +3,9 @@
 #include "common/solid_mesh.glsl"
 #include "common/plane.glsl"
 #ifdef MATERIAL_MAPS
-layout(std430) readonly buffer SecondUv { vec2 second_uvs[]; };   // of the vertices; none of meshes without
+// Of the vertices, none of meshes without: second texture coordinate, tangent (scene/triangle_mesh.py).
+layout(std430) readonly buffer MapPlacement { float placement[]; };
+const uint PLACEMENT_FLOATS = 6u;
 #endif
 
 vec3 corner_weights(Plane plane, vec3 ray) {
@@ -19,13 +21,23 @@ mat3 corner_vectors(uvec3 corners, uint column) {
 }
 
 #ifdef MATERIAL_MAPS
-vec2 second_uv_of(uint vertex) { return vertex < uint(second_uvs.length()) ? second_uvs[vertex] : vec2(0.0); }
+vec2 second_uv_of(uint vertex) {
+    uint i = PLACEMENT_FLOATS * vertex;
+    return i < uint(placement.length()) ? vec2(placement[i], placement[i + 1u]) : vec2(0.0);
+}
+
+vec4 tangent_of(uint vertex) {
+    uint i = PLACEMENT_FLOATS * vertex + 2u;
+    if (i >= uint(placement.length())) return vec4(0.0);
+    return vec4(placement[i], placement[i + 1u], placement[i + 2u], placement[i + 3u]);
+}
 
 // `right`, `down`: what a pixel adds to the ray.
 void find_maps(inout Fragment f, uvec3 corners, mat3 places, mat3 uv, Plane plane, vec3 weights, vec3 ray, vec3 right, vec3 down) {
     mat3x2 second = mat3x2(second_uv_of(corners.x), second_uv_of(corners.y), second_uv_of(corners.z));
     vec3 beside = corner_weights(plane, ray + right) - weights, below = corner_weights(plane, ray + down) - weights;
     f.second_uv = second * weights;
+    f.tangent = mat3x4(tangent_of(corners.x), tangent_of(corners.y), tangent_of(corners.z)) * weights;
     f.uv_slopes = vec4((uv * beside).xy, (uv * below).xy);
     f.second_uv_slopes = vec4(second * beside, second * below);
     f.right = places * beside;

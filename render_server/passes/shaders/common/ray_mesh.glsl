@@ -49,7 +49,7 @@ bool is_open_at(int at, vec2 place) {
         clear += weights[k] * fract(vertices[rows[k] + 11]);
     }
     int material = int(vertices[rows.x + 11]);
-    return is_cut_out(material, opacity_of_vertices(clear) * opacity_of(material, uv, 0.0), even_noise(PLACES * place));
+    return is_cut_out(material, opacity_of(material, uv, opacity_of_vertices(clear), 0.0), even_noise(PLACES * place));
 }
 #endif
 

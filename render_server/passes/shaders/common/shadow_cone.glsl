@@ -29,6 +29,7 @@ ShadowCone shadow_cone(Light light, vec3 p, vec3 n) {
 
 // Whether any shadow cone from p meets the objects.
 bool object_meets_cone(vec3 p, vec3 n) {
+    if (has_virtual_lights) return true;   // they reach all
     for (int i = 0; i < light_count; ++i) {
         vec2 interval = shadow_cone(listed_light(i), p, n).interval;
         if (interval.x < interval.y) return true;
@@ -41,7 +42,7 @@ const float OFF_CONE = 0.5;       // voxels, for rounding
 // Whether object_meets_cone may hold of a point within `radius` (m) of p, whatever its normal; of images and rectangles,
 // only the points tell. Cones of positions start and end SHADOW_START beside the segment from a point to the light.
 bool object_meets_cone_of_sphere(vec3 p, float radius) {
-    if (has_rectangles || has_mirror_images) return true;
+    if (has_rectangles || has_mirror_images || has_virtual_lights) return true;
     vec3 q = volume_coordinate(p);
     for (int i = 0; i < light_count; ++i) {
         Light light = listed_light(i);
@@ -61,9 +62,9 @@ bool object_meets_cone_of_sphere(vec3 p, float radius) {
 
 // (V_mu, V_rho)
 vec2 cone_visibility(Light light, vec3 p, vec3 n, float bias) {
-    float v_mu = real_visibility(light, p, n, bias);
+    vec2 seen = real_visibilities(light, p, n, bias);
     ShadowCone cone = shadow_cone(light, p, n);
-    if (v_mu == 0.0 || cone.interval.x >= cone.interval.y) return vec2(v_mu);
+    if (seen.y == 0.0 || cone.interval.x >= cone.interval.y) return seen;
     float blocked = march(joint_mipmap, cone.start, cone.d, cone.ratio, cone.interval).a;
-    return v_mu * vec2(1.0, 1.0 - blocked);
+    return seen * vec2(1.0, 1.0 - blocked);
 }

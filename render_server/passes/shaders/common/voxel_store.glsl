@@ -7,7 +7,7 @@ struct Surfel {
     vec4 position_area;    // world m, m^2
     vec4 normal_material;  // unit normal, material index
     vec4 uv_voxel;         // texture or picture coordinate, voxel index (bits), double-sided flag
-    vec4 tint;             // vertex colour
+    vec4 tint;             // vertex colour, opacity of the vertices
 };
 
 #ifdef GRID_ACCESS

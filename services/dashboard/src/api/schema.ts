@@ -3686,6 +3686,12 @@ export interface components {
              */
             readonly id: string;
             /**
+             * Lamps
+             * @description Factor on the lights that come with a glTF asset (KHR_lights_punctual); 0 = they are off.
+             * @default 1
+             */
+            readonly lamps: number;
+            /**
              * Material
              * @description null = from the asset.
              */

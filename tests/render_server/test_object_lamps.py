@@ -1,0 +1,272 @@
+"""Lamps that come with a model (KHR_lights_punctual): light of the objects' side alone, in closed forms."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.mesh_loading import load_asset
+from tests.render_server.gltf_samples import HALF, Plate
+from tests.render_server.lpv_scenes import dlpv, graph_of, injected_flux
+from tests.render_server.scenes import GREY, Fields, Stage, ambient, fields_of, floor, frame, sphere_light
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+METHODS: dict[str, dict[str, Any]] = {
+    "exact": {},
+    "differential": {"name": "differential"},
+    "paper": {"operator": "paper"},
+    "dlpv": {"name": "dlpv"},
+}
+SKY = 0.4
+ALBEDO = float(decode_lut(None)[GREY, 0]) / SKY
+POINT = {"type": "point", "intensity": 0.08, "color": [1, 0.5, 0.25]}
+COLOR = np.array([1, 0.5, 0.25])
+LAMP = np.array([0.05, 0.0, 0.25])
+HOLDER = {"translation": [0, 0.9, 0.03]}  # of a plate that is not in the way
+
+
+def lamp_model(
+    path: Path, light: dict[str, Any], lamp: dict[str, Any], plate: dict[str, Any], edge: float = 0.02
+) -> dict[str, Any]:
+    """An object: a plate and a lamp at nodes of their own; a lamp without rotation shines down."""
+    made = Plate(edge, edge)
+    made.material |= {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0}}
+    extension = "KHR_lights_punctual"
+    made.glb.document |= {"extensionsUsed": [extension], "extensions": {extension: {"lights": [light]}}}
+    made.glb.add("nodes", {**lamp, "extensions": {extension: {"light": 0}}})
+    return {"asset": str(made.write(path, plate)), "up_axis": "z"}
+
+
+class Lit:
+    """A frame's fields, its linear picture, and where the floor is seen."""
+
+    def __init__(self, gpu: GpuContext, stage: Stage, objects: list[dict[str, Any]], **method: Any) -> None:  # noqa: ANN401
+        lights = [ambient(SKY), *method.pop("lights", ())]
+        if method.get("name") == "dlpv":
+            document = dlpv(stage.document(objects, lights, floor()), **method)
+        else:
+            document = stage.document(objects, lights, floor(), **method)
+        renderer = SceneRenderer(gpu, document, with_linear=True)
+        shown = renderer.render(frame(depth=None))
+        assert shown.linear is not None
+        self.codes, self.linear = shown.color, shown.linear
+        self.fields: Fields = fields_of(renderer)
+        self.sent = 0.0  # into the volume due to the objects and their lamps, W in the picture's units
+        if method.get("name") == "dlpv":
+            self.sent = float(injected_flux(graph_of(renderer), "inject change")[..., 0].sum())
+        self.notices = [each for each in renderer.notices if "lamp.glb" in each]
+        renderer.release()
+        place = self.fields.position
+        self.on_floor = (place[..., 3] > 0) & (self.fields.matte == 0) & (np.abs(place[..., 2]) < 1e-3)
+
+    def around(self, radius: float = 0.25) -> np.ndarray:
+        away = np.linalg.norm(self.fields.position[..., :2] - LAMP[:2], axis=-1)
+        return self.on_floor & (away < radius)
+
+
+def irradiance_by(places: np.ndarray, intensity: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """I cos / d^2 of a lamp over the floor z = 0, the cosine of its angle from straight down, and the distance."""
+    d = LAMP - places[:, :3]
+    distance = np.linalg.norm(d, axis=1)
+    cosine = d[:, 2] / distance
+    return intensity * cosine / distance**2, cosine, distance
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_point_lights_the_real_floor_of_the_picture(gpu: GpuContext, tmp_path: Path, name: str) -> None:
+    """rho / pi I cos / d^2 is added to what the camera saw, rho by the light that the method thinks it saw."""
+    model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, HOLDER)
+    lit = Lit(gpu, Stage(tmp_path), [model], **METHODS[name])
+    at = lit.around()
+    expected = irradiance_by(lit.fields.position[at], POINT["intensity"])[0][:, None] * COLOR
+    gained = lit.fields.direct_rho[at] - lit.fields.direct_mu[at]
+    assert gained == pytest.approx(expected, rel=2e-3, abs=1e-4)
+    added = lit.linear[at] - ALBEDO * SKY
+    before = (lit.fields.direct_mu + lit.fields.cones_mu)[at]
+    assert before == pytest.approx(np.pi * SKY, rel=0.05)
+    assert added == pytest.approx(ALBEDO * SKY * expected / before, rel=0.015, abs=3e-3)
+    assert not lit.notices
+
+
+def drawn_lamp(gpu: GpuContext, folder: Path, light: dict[str, Any], **node: Any) -> tuple[np.ndarray, ...]:  # noqa: ANN401
+    """The light gained around the lamp, and closed forms there."""
+    model = lamp_model(folder / "lamp.glb", light, {"translation": LAMP.tolist(), **node}, HOLDER)
+    lit = Lit(gpu, Stage(folder), [model])
+    at = lit.around()
+    gained = (lit.fields.direct_rho[at] - lit.fields.direct_mu[at])[:, 0]
+    return gained, *irradiance_by(lit.fields.position[at], 1.0)
+
+
+def test_a_spot_falls_off_between_its_cones(gpu: GpuContext, tmp_path: Path) -> None:
+    """By the square of what its cosine is between those of both cones."""
+    cones = {"innerConeAngle": 0.2, "outerConeAngle": 0.6}
+    gained, by_point, cosine, _ = drawn_lamp(gpu, tmp_path, {"type": "spot", "intensity": 0.1, "spot": cones})
+    part = np.clip((cosine - np.cos(0.6)) / (np.cos(0.2) - np.cos(0.6)), 0, 1) ** 2
+    assert gained == pytest.approx(0.1 * part * by_point, rel=3e-3, abs=2e-4)
+    assert (part == 0).any()
+    assert (part == 1).any()
+
+
+def test_a_range_ends_the_light(gpu: GpuContext, tmp_path: Path) -> None:
+    gained, by_point, _, distance = drawn_lamp(
+        gpu, tmp_path, {"type": "point", "intensity": 0.1, "range": 0.3}
+    )
+    window = np.clip(1 - (distance / 0.3) ** 4, 0, 1)
+    assert gained == pytest.approx(0.1 * window * by_point, rel=3e-3, abs=2e-4)
+    assert (window == 0).any()
+
+
+def test_a_distant_light_shines_along_its_node(gpu: GpuContext, tmp_path: Path) -> None:
+    """Turned by 60 degrees about x: E cos 60. Intensity is in lux of the camera's scale."""
+    turn = [np.sin(np.radians(30)), 0, 0, np.cos(np.radians(30))]
+    gained, *_ = drawn_lamp(gpu, tmp_path, {"type": "directional", "intensity": 0.6}, rotation=turn)
+    assert np.median(gained) == pytest.approx(0.3, rel=3e-3)
+    assert np.mean(np.abs(gained - 0.3) < 1e-3) > 0.95
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_an_object_shadows_its_own_lamp(gpu: GpuContext, tmp_path: Path, name: str) -> None:
+    """A plate of 6 cm halfway between lamp and floor: a shadow of 12 cm below, in light."""
+    below = {"translation": [LAMP[0], 0, LAMP[2] / 2]}
+    model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, below, edge=0.06)
+    lit = Lit(gpu, Stage(tmp_path), [model], **METHODS[name], volume_edge_m=0.4)
+    apart = np.abs(lit.fields.position[..., :2] - LAMP[:2]).max(axis=-1)
+    gained = lit.fields.direct_rho - lit.fields.direct_mu
+    inside, outside = lit.on_floor & (apart < 0.045), lit.on_floor & (apart > 0.08) & (apart < 0.15)
+    expected = irradiance_by(lit.fields.position[outside], POINT["intensity"])[0]
+    is_cone = name == "paper"  # its shadows are cones through voxels of 12 mm
+    assert gained[inside][:, 0] == pytest.approx(0, abs=0.25 if is_cone else 1e-3)
+    assert gained[outside][:, 0] == pytest.approx(expected, rel=0.25 if is_cone else 3e-3)
+
+
+def test_a_lamp_lights_its_object(gpu: GpuContext, tmp_path: Path) -> None:
+    """A white plate straight below the lamp gains as from a light of the scene: I / (pi d^2), and bounces."""
+    at = {"translation": LAMP.tolist()}, {"translation": [LAMP[0], 0, 0.05]}
+    model = lamp_model(tmp_path / "lamp.glb", {**POINT, "color": [1, 1, 1]}, *at, edge=0.1)
+    off, scenes = {**model, "lamps": 0.0}, sphere_light(tuple(LAMP), POINT["intensity"])
+    lit, by_scene, dark = (
+        Lit(gpu, Stage(tmp_path), [each], lights=lights)
+        for each, lights in ((model, ()), (off, (scenes,)), (off, ()))
+    )
+    shown = lit.fields.matte == 1
+    gained, expected = ((each.linear - dark.linear)[shown] for each in (lit, by_scene))
+    assert gained == pytest.approx(expected, rel=0.03)
+    assert np.median(gained) == pytest.approx(POINT["intensity"] / np.pi / 0.2**2, rel=0.1)
+
+
+def test_lamps_that_are_off_leave_every_bit(gpu: GpuContext, tmp_path: Path) -> None:
+    """As the same model without lamps, and half of the factor is half of the light."""
+    lamp = {"translation": LAMP.tolist()}
+    lit, off = lamp_model(tmp_path / "lamp.glb", POINT, lamp, HOLDER), {"lamps": 0.0}
+    plain = Plate(0.02, 0.02)
+    plain.material |= {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0}}
+    dark = {"asset": str(plain.write(tmp_path / "plain.glb", HOLDER)), "up_axis": "z"}
+    full, half, none, without = (
+        Lit(gpu, Stage(tmp_path), [each]) for each in (lit, {**lit, "lamps": 0.5}, {**lit, **off}, dark)
+    )
+    assert np.array_equal(none.codes, without.codes)
+    assert np.array_equal(none.linear, without.linear)
+    at = full.around()
+    gained = [(each.fields.direct_rho - each.fields.direct_mu)[at] for each in (full, half)]
+    assert gained[1] == pytest.approx(gained[0] / 2, rel=2e-3, abs=1e-5)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Of a lamp whose edge is narrow; it shines down, or up."""
+
+    height_m: float
+    intensity: float
+    angle_rad: float
+    is_upward: bool = False
+    plate_edge_m: float = 0.1
+
+    @property
+    def flux(self) -> float:
+        return self.intensity * 2 * np.pi * (1 - np.cos(self.angle_rad + 0.005))
+
+
+def shone(gpu: GpuContext, folder: Path, name: str, of: Spot, plate: dict[str, Any]) -> tuple[Lit, Lit, Lit]:
+    """Lit by a narrow-edged spot of an object, by the same spot of the scene, and by neither."""
+    outer = of.angle_rad + 0.01
+    cones = {"innerConeAngle": of.angle_rad, "outerConeAngle": outer}
+    node = {
+        "translation": [LAMP[0], 0, of.height_m],
+        "rotation": [1, 0, 0, 0] if of.is_upward else [0, 0, 0, 1],
+    }
+    model = lamp_model(
+        folder / "lamp.glb",
+        {"type": "spot", "intensity": of.intensity, "spot": cones},
+        node,
+        plate,
+        edge=of.plate_edge_m,
+    )
+    same = {"type": "spot", "position_m": node["translation"], "direction": [0, 0, 1 if of.is_upward else -1]}
+    same |= {
+        "intensity": of.intensity,
+        "radius_m": 0,
+        "angle_deg": 2 * np.degrees(outer),
+        "blend": 0.01 / outer,
+    }
+    settings = {**METHODS[name], "volume_edge_m": 0.7}
+    return (
+        Lit(gpu, Stage(folder), [model], **settings),
+        Lit(gpu, Stage(folder), [{**model, "lamps": 0}], lights=(same,), **settings),
+        Lit(gpu, Stage(folder), [{**model, "lamps": 0}], **settings),
+    )
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_what_a_lamp_lights_of_its_object_lights_the_floor(
+    gpu: GpuContext, tmp_path: Path, name: str
+) -> None:
+    """It shines up at a white plate, whose light comes down: the floor gains what a light of the scene brings."""
+    spot = Spot(0.1, 0.4, 0.24, is_upward=True, plate_edge_m=0.16)
+    lit, by_scene, dark = shone(gpu, tmp_path, name, spot, {"translation": [LAMP[0], 0, 0.3]})
+    at = lit.on_floor & (np.linalg.norm(lit.fields.position[..., :2] - LAMP[:2], axis=-1) < 0.05)
+    gained, expected = ((each.fields.cones_rho - dark.fields.cones_rho)[at] for each in (lit, by_scene))
+    assert gained.mean() == pytest.approx(expected.mean(), rel=0.05)
+    if name in ("exact", "differential"):
+        assert gained.mean() == pytest.approx(spot.flux / np.pi / 0.3**2, rel=0.25)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_what_a_lamp_lights_of_the_room_lights_its_object(gpu: GpuContext, tmp_path: Path, name: str) -> None:
+    """It shines down at the floor, whose light falls on a plate behind.
+
+    By the form factor of a small source; in the volume of DLPV, the light that the floor sends is counted too.
+    """
+    upright = {"translation": [LAMP[0], 0.12, 0.09], "rotation": [HALF, 0, 0, HALF]}  # faces -y
+    spot = Spot(0.15, 0.3, 0.3)
+    lit, _, dark = shone(gpu, tmp_path, name, spot, upright)
+    shown = (lit.fields.matte == 1) & (dark.fields.matte == 1)
+    gained = float(np.median((lit.fields.on_object - dark.fields.on_object)[shown]))
+    far = np.hypot(0.09, 0.12)
+    expected = ALBEDO * spot.flux / np.pi / far**2 * (0.09 / far) * (0.12 / far)
+    assert gained == pytest.approx(expected, rel=0.35)
+    if name == "dlpv":
+        assert lit.sent - dark.sent == pytest.approx(ALBEDO * spot.flux, rel=0.03)
+
+
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"type": "lava"}, "neither directional nor a point nor a spot"),
+    ({"type": "point", "intensity": -1}, "makes no light"),
+    ({"type": "point", "color": [1, 1]}, "makes no light"),
+    ({"type": "point", "range": 0}, "makes no light"),
+    ({"type": "spot", "spot": {"innerConeAngle": 0.7, "outerConeAngle": 0.6}}, "not within its outer one"),
+]
+
+
+@pytest.mark.parametrize(("light", "sentence"), BAD)
+def test_lamps_that_make_no_light_are_refused_in_a_sentence(
+    tmp_path: Path, light: dict[str, Any], sentence: str
+) -> None:
+    model = lamp_model(tmp_path / "lamp.glb", light, {}, HOLDER)
+    with pytest.raises(DeltalightError, match=sentence):
+        load_asset(Path(model["asset"]))
