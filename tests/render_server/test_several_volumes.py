@@ -234,7 +234,6 @@ def test_light_does_not_jump_where_volumes_part_and_comes_back_to_the_bit(
     for (_, before, _), (_, after, _) in pairwise(steps):
         seen = floor_around(before) & floor_around(after) & (before.position[..., 0] < 0.03)
         changes.append(np.percentile(np.abs(after.cones_rho - before.cones_rho)[seen], 99))
-    print(method, np.round(changes, 4))
     assert max(changes) <= 0.1  # at each, voxels are of another size
     back, _, _ = moved_to(float(places[0]))
     renderer.release()
