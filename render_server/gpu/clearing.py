@@ -33,7 +33,10 @@ def clear_buffers(gpu: GpuContext, *starts: tuple[moderngl.Buffer, int]) -> None
     kernel = common_kernel(gpu, "clear_buffer")
     words = [size // WORD_BYTES for _, size in starts]
     threads = min(max(words), CLEARING_GROUPS * kernel.local_size[0])
-    bound: dict[str, Binding] = {**NOTHING, **dict(zip(NOTHING, (buffer for buffer, _ in starts), strict=False))}
+    bound: dict[str, Binding] = {
+        **NOTHING,
+        **dict(zip(NOTHING, (buffer for buffer, _ in starts), strict=False)),
+    }
     kernel.run((threads,), bound, word_counts=(*words, 0, 0, 0)[: len(NOTHING)])
 
 

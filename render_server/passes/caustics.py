@@ -167,9 +167,7 @@ class Caustics:
         """Fills the sums with the light of the beams where they end."""
         if self._last_sums is not None:
             self._sums, self._last_sums = self._last_sums, self._sums
-        clear_buffers(
-            self._gpu, (self._sums, self._sums.size), (self._tile_beams, self._tile_beams.size)
-        )
+        clear_buffers(self._gpu, (self._sums, self._sums.size), (self._tile_beams, self._tile_beams.size))
         grid = self._grid
         if self._reuse is not None:
             self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
