@@ -16,7 +16,8 @@ class QualityTier:
     beams. While objects move, the light that they throw back, block between surfaces and focus is found in one of
     `bounce_turns` frames; their shadows are in every one. One tile of the picture in `refresh_tiles` gets new light
     in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new light, and
-    the real scene is built anew whenever the camera moves.
+    the real scene is built anew whenever the camera moves. `distant_light`: objects also take and add light at
+    surfaces beyond their volumes.
     """
 
     cone_count: int = 64
@@ -27,12 +28,13 @@ class QualityTier:
     caustic_blocks: Literal[32, 64] = 64
     refresh_tiles: int = 0
     bounce_turns: int = 1
+    distant_light: bool = True
 
 
 BEST = QualityTier()
 TIERS: dict[Quality, QualityTier] = {
     "best": BEST,
-    "balanced": QualityTier(refresh_tiles=8),
+    "balanced": QualityTier(refresh_tiles=8, distant_light=False),
     "live": QualityTier(
         cone_count=8,
         shadow_samples=8,
@@ -42,5 +44,6 @@ TIERS: dict[Quality, QualityTier] = {
         caustic_blocks=32,
         refresh_tiles=16,
         bounce_turns=3,
+        distant_light=False,
     ),
 }

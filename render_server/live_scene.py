@@ -14,6 +14,7 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import View
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
+from deltalight.render_server.estimation.flat_things import SurfaceTables
 from deltalight.render_server.estimation.lighting import LightEstimator
 from deltalight.render_server.frame_budget import FrameBudget, HeldLevels, Level
 from deltalight.render_server.frame_graph import (
@@ -32,7 +33,7 @@ from deltalight.render_server.methods.registry import MethodChoice, choose_metho
 from deltalight.render_server.passes.composite import Composite, Crossfade, Enlarge, Picture
 from deltalight.render_server.precomputed import Precomputed
 from deltalight.render_server.real_geometry import RealGeometry
-from deltalight.render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
+from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import CameraView, PosedFrame
 from deltalight.render_server.virtual_objects import VirtualObjects
@@ -130,7 +131,7 @@ class LiveScene:
         self.timers = PassTimers(gpu)
         self._objects = VirtualObjects(gpu)
         self._real: RealGeometry | None = None
-        self._surfaces: SurfaceTable | None = None
+        self._surfaces = SurfaceTables()
         self._albedo = AlbedoEstimator(gpu)
         self._graphs: list[FrameGraph] = []  # of each camera
         self._best: list[FrameGraph] = []
@@ -207,7 +208,7 @@ class LiveScene:
                 self._real.release()
             self._real = real
             self._albedo.reset(plan.scene.real.unseen_albedo)
-            self._surfaces, self._accumulated = None, ()
+            self._surfaces, self._accumulated = SurfaceTables(), ()
         if plan.method != old.method:
             self._drop_graph()
         if plan.scene.lights != old.scene.lights:
@@ -284,7 +285,8 @@ class LiveScene:
                 "Depth showed no surface in some frames; they are passed through as the camera saw them."
             )
             return []
-        surfaces = self._surface_table(first, moved=moved)
+        declared = self._plan.scene.real.surfaces
+        surfaces = self._surfaces.update(declared, taken[0], self._real.material_names, moved=moved)
         self._set_inputs(self._graphs, self._real, sized, objects, surfaces)
         changed = self._note_change(objects, first, moved=moved)
         self._estimate_lights(self._real, first, moved=moved)
@@ -420,17 +422,6 @@ class LiveScene:
         return CompositeOptions(
             output, method.composition == "additive", method.relights_real, with_linear=False
         )
-
-    def _surface_table(self, frame: ViewFrame, *, moved: bool) -> SurfaceTable:
-        """Returns the declared surfaces, the board's sheet included; rebuilt when something moved."""
-        assert self._real is not None
-        if self._surfaces is None or moved:
-            declared = self._plan.scene.real.surfaces
-            board = frame.board if declared else None
-            found = build_surface_table(declared, board, self._real.material_names)
-            if self._surfaces is None or not found.equals(self._surfaces):
-                self._surfaces = found
-        return self._surfaces
 
     def _fit_graphs(self, views: Sequence[CameraView]) -> None:
         """Provides the graphs for these pictures' sizes; new ones if lens or size changed.

@@ -2,7 +2,8 @@
 
 How far is unknown. A plane seen over a length L continues for at least d beyond the border with probability
 L / (L + d), because the border cuts it at a place that is independent of it (Gott 1993, Nature 363, for lengths in
-place of times). Its radiance there follows from the lights and from its reflectance where it is seen.
+place of times). L is the longest extent that is seen of it: a wall of which the picture shows a wide, low strip is
+unlikely to end just above. Its radiance there follows from the lights and from its reflectance where it is seen.
 """
 
 from collections.abc import Sequence
@@ -252,12 +253,22 @@ def _continuation_probability(
     """Returns the probability that a plane extends to positions on it.
 
     The visible length is twice that from the centre of the visible part to where the line to the position leaves the
-    view.
+    view, or the longest extent of the visible part if that is longer.
     """
-    start = frustum.inside(seen.position.mean(axis=0)[None])
+    middle = seen.position.mean(axis=0)
+    start = frustum.inside(middle[None])
     end = frustum.inside(places)
     in_view = np.divide(start, start - end, out=np.ones_like(end), where=end < 0).min(axis=1)
-    return np.asarray(2 * in_view / (1 + in_view))
+    away_m = np.linalg.norm(places - middle, axis=1)
+    length_m = np.maximum(2 * in_view * away_m, _longest_extent(seen.position))
+    return np.asarray(length_m / (length_m + (1 - in_view) * away_m))
+
+
+def _longest_extent(positions: Float64[np.ndarray, "k 3"]) -> float:
+    """Returns the extent (m) of positions along the direction in which they scatter most."""
+    away = positions - positions.mean(axis=0)
+    _, axes = np.linalg.eigh(away.T @ away)
+    return float(np.ptp(away @ axes[:, -1]))
 
 
 def _expected_radiance(

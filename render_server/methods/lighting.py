@@ -334,10 +334,15 @@ class Shading:
         return self._object_rays.reflection
 
     def compare(
-        self, grid: LowResGrid, direct: DirectLight, cones: ConeFields, reflection: moderngl.Texture | None
+        self,
+        grid: LowResGrid,
+        direct: DirectLight,
+        cones: ConeFields,
+        reflection: moderngl.Texture | None,
+        distant: moderngl.Texture | None = None,
     ) -> ChangeRatio:
         """Finds where light changes, and by which ratio."""
-        self._change.run(grid, direct, cones, reflection)
+        self._change.run(grid, direct, cones, reflection, distant)
         return self._change
 
     def trace_screen(
@@ -426,6 +431,7 @@ def shading_stages(
     voxels: Resource[VoxelMipmap] | None = None,
     marching: Resource[dict[str, Binding]] | None = None,
     light_directly: Callable[..., DirectLight] | None = None,
+    find_distant: Callable[..., moderngl.Texture] | None = None,
 ) -> Layers:
     """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects.
 
@@ -476,7 +482,10 @@ def shading_stages(
     light = light_directly or shading.light_directly
     direct = g.stage("direct light", light, scene, grid, caustics, shown, *kept)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
-    change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
+    distant: list[Resource[moderngl.Texture]] = []
+    if find_distant is not None:
+        distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
+    change = g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
     behind = (s.objects, scene, direct, cones, bvh, s.observation, marching)
     mirrored = g.stage("mirrored objects", shading.mirror_objects, s.objects, scene, grid, bvh, marching)
     screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)

@@ -27,11 +27,13 @@ class ChangeRatio:
     """The change of light on the reduced grid: extends into holes of the depth map, limits composition to changes.
 
     `ratio`: rgb E_rho / E_mu, a: 0 unknown, 1 unchanged, 2 changed. `texels`: work list of texels near a change.
+    `distant`: the relative change beyond the volumes, of the last run (`DistantChange`).
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._gpu = gpu
         self.ratio = texture_2d(gpu, size, 4, "f2")
+        self.distant: moderngl.Texture | None = None
         self.texels = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
         self._ratio = Kernel(gpu, "change_ratio", RATIO=1)
         self._near = Kernel(gpu, "change_ratio", FILL_RADIUS=FILL_RADIUS)
@@ -42,8 +44,10 @@ class ChangeRatio:
         direct: DirectLight,
         cones: ConeFields,
         reflection: moderngl.Texture | None,
+        distant: moderngl.Texture | None = None,
     ) -> None:
         """Computes the ratio from one frame's fields; `reflection` as in RelitLayers."""
+        self.distant = distant
         self._ratio.run(
             grid.size,
             sample_pixels=grid.pixels,
@@ -56,6 +60,8 @@ class ChangeRatio:
             cone_specular_rho=cones.specular_rho,
             reflection=reflection,
             has_reflection=reflection is not None,
+            distant_change=distant,
+            DISTANT_CHANGE=distant is not None,
             change_ratio_out=self.ratio,
             Texels=None,
         )
@@ -141,6 +147,8 @@ class Composite:
             Texels=layers.change.texels,
             reflection=layers.reflection,
             has_reflection=layers.reflection is not None,
+            distant_change=layers.change.distant,
+            DISTANT_CHANGE=layers.change.distant is not None,
             code_out=self.code,
             linear_out=self.linear,
             ratio_out=self._ratio,

@@ -1,11 +1,15 @@
 """The camera's noise, measured in pictures of a still scene, and put on the virtual part of a picture ([D] 6.2).
 
 In the sensor's linear units (1 = white) the variance of a pixel of intensity I is a + b I by channel: read noise and
-the photons' (Foi et al. 2008). Demosaicking and compression correlate neighbours; noise is modelled as white noise
-after a filter [k 1 k] along rows and columns, whose correlation of neighbours is 2 k / (1 + 2 k^2).
+the photons' (Foi et al. 2008). A camera whose response is not known exactly departs from that line, so the variance
+is kept as a curve over intensity: the line, times what bins of intensity show beside it. Demosaicking and compression
+correlate neighbours: the model is white noise after a filter [k 1 k] along rows and columns, whose correlation
+of neighbours is 2 k / (1 + 2 k^2).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import cv2
 import numpy as np
@@ -19,31 +23,51 @@ CODES = (4, 251)
 BLOCK_PX = 16
 STILL_SIGMAS = 4.0
 """A block has moved if its mean changed by more, in standard errors."""
+MOST_SHIFTED = 0.1
+"""A block has moved if a shift of the picture explains more of its change than this, as a share."""
 LEAST_STILL = 0.5
 """Share of the blocks that must not have moved."""
+UNSEEN_SHIFT_PX, UNSEEN_SHARE = 0.2, 0.05
+"""A shift that small may go unseen: pixels whose variance it would raise by more than that share are too steep."""
 MOST_PAIRS = 16
 GAUSSIAN = 1.4826
 """Standard deviation over median absolute deviation."""
 MOST_CORRELATION = 0.7
+LEVELS = np.linspace(0, 1, 33) ** 2
+"""Intensities at which variances are kept."""
 
 Color = UInt8[np.ndarray, "h w 3"]
+Plane = Float64[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """`read` a and `shot` b, R G B, in units of sensor white; `correlation` of neighbours along rows and columns."""
+    """`variances` at LEVELS of intensity, R G B, in units of sensor white; `correlation` along rows and columns.
 
-    read: Float64[np.ndarray, " 3"]
-    shot: Float64[np.ndarray, " 3"]
+    The correlation is that of neighbours.
+    """
+
+    variances: Float64[np.ndarray, "k 3"]
     correlation: tuple[float, float]
+
+    @classmethod
+    def of_line(
+        cls,
+        read: Float64[np.ndarray, " 3"],
+        shot: Float64[np.ndarray, " 3"],
+        correlation: tuple[float, float],
+    ) -> Self:
+        """Return the noise of variance read + shot I."""
+        return cls(read + shot * LEVELS[:, None], correlation)
 
     def variance(self, intensity: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         """Return the variance at linear intensities, R G B."""
-        return np.asarray(np.maximum(self.read + self.shot * intensity, 0))
+        curves = [np.interp(intensity[..., c], LEVELS, self.variances[:, c]) for c in range(3)]
+        return np.stack(curves, axis=-1)
 
     def before_filter(self, kept: Float64[np.ndarray, " 3"]) -> "NoiseModel":
         """Return the independent noise that becomes this in a filter that keeps such shares of variance, R G B."""
-        return NoiseModel(self.read / kept, self.shot / kept, (0.0, 0.0))
+        return NoiseModel(self.variances / kept, (0.0, 0.0))
 
 
 def estimate_noise(
@@ -53,28 +77,69 @@ def estimate_noise(
     lut = decode_lut(response)
     pair = [lut[each, np.arange(3)].astype(np.float64) for each in (first, second)]
     difference, mean = (pair[0] - pair[1]) / np.sqrt(2), (pair[0] + pair[1]) / 2
-    still = _still_pixels(difference)
+    change = _Change.of(difference.mean(axis=2), mean.mean(axis=2))
+    still = change.still
     exposed = ((np.minimum(first, second) >= CODES[0]) & (np.maximum(first, second) <= CODES[1])).all(axis=2)
-    used = still & exposed
+    used = still & exposed & change.flat
     if still.mean() < LEAST_STILL or used.sum() < LEAST_PIXELS:
         return None
     bins = _bins((first[used].astype(np.float64) + second[used]) / 2)
     steps = np.gradient(lut.astype(np.float64), axis=0)
-    lines = [
-        _fit_line(bins[:, c], mean[used, c], difference[used, c], lut[:, c], steps[:, c]) for c in range(3)
+    curves = [
+        _fit_curve(bins[:, c], mean[used, c], difference[used, c], lut[:, c], steps[:, c]) for c in range(3)
     ]
-    read, shot = np.array(lines).T
-    return NoiseModel(read, shot, (_correlation(difference, used, 1), _correlation(difference, used, 0)))
+    correlation = _correlation(difference, used, 1), _correlation(difference, used, 0)
+    return NoiseModel(np.stack(curves, axis=1), correlation)
 
 
-def _still_pixels(difference: Float64[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels whose block's mean changed by no more than noise explains."""
-    luma = difference.mean(axis=2)
-    block = (BLOCK_PX, BLOCK_PX)
-    mean, square = cv2.blur(luma, block), cv2.blur(luma**2, block)
-    # Correlated neighbours make means noisier than independent ones: by up to a factor of 2 along each axis.
-    error = 2 * np.sqrt(np.maximum(square - mean**2, 0)) / BLOCK_PX
-    return np.asarray(np.abs(mean) <= STILL_SIGMAS * error)
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """How two pictures differ: `luma` by pixel, and by the block around it.
+
+    `mean` and `variance` are those of the change, `gradients` (columns, rows) those of the picture.
+    """
+
+    mean: Plane
+    variance: Plane
+    luma: Plane
+    gradients: tuple[Plane, Plane]
+
+    @classmethod
+    def of(cls, luma: Plane, picture: Plane) -> "_Change":
+        mean = _block_mean(luma)
+        variance = np.maximum(_block_mean(luma**2) - mean**2, 0)
+        columns, rows = (cv2.Sobel(picture, -1, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
+        return cls(mean, variance, luma, (columns, rows))
+
+    @cached_property
+    def still(self) -> Bool[np.ndarray, "h w"]:
+        """The pixels whose block changed by no more than noise explains: neither its mean, nor by a shift."""
+        # Correlated neighbours make means noisier than independent ones: by up to a factor of 2 along each axis.
+        error = 2 * np.sqrt(self.variance) / BLOCK_PX
+        is_even = np.abs(self.mean) <= STILL_SIGMAS * error
+        return np.asarray(is_even & (self._shifted <= MOST_SHIFTED * self.variance))
+
+    @property
+    def flat(self) -> Bool[np.ndarray, "h w"]:
+        """The pixels that a shift too small to be seen would hardly change."""
+        columns, rows = (cv2.GaussianBlur(each, (0, 0), 1.0) for each in self.gradients)
+        by_shift = UNSEEN_SHIFT_PX**2 * (columns**2 + rows**2)
+        return np.asarray((by_shift <= UNSEEN_SHARE * self.variance) | (self.variance == 0))
+
+    @property
+    def _shifted(self) -> Plane:
+        """Variance that the best shift of each block explains (Lucas and Kanade 1981)."""
+        columns, rows = self.gradients
+        xx, xy, yy = (_block_mean(a * b) for a, b in ((columns, columns), (columns, rows), (rows, rows)))
+        off = self.luma - self.mean
+        x, y = (_block_mean(each * off) for each in (columns, rows))
+        least = 1e-3 * self.variance + 1e-12  # where there is no gradient, nothing shows a shift
+        xx, yy = xx + least, yy + least
+        return np.asarray((x * x * yy - 2 * x * y * xy + y * y * xx) / (xx * yy - xy * xy))
+
+
+def _block_mean(values: Plane) -> Plane:
+    return np.asarray(cv2.blur(values, (BLOCK_PX, BLOCK_PX)))
 
 
 def _bins(codes: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n 3"]:
@@ -88,14 +153,14 @@ def _bins(codes: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n 3"]:
     )
 
 
-def _fit_line(
+def _fit_curve(
     which: Int64[np.ndarray, " n"],
     mean: Float64[np.ndarray, " n"],
     difference: Float64[np.ndarray, " n"],
     lut: Float64[np.ndarray, " 256"],
     steps: Float64[np.ndarray, " 256"],
-) -> tuple[float, float]:
-    """Return a and b of the variances of bins of intensity, without what rounding to codes adds."""
+) -> Float64[np.ndarray, " k"]:
+    """Return variances at LEVELS by those of bins of intensity, without what rounding to codes adds."""
     rows: list[tuple[float, float, float]] = []
     for number in range(BINS):
         inside = which == number
@@ -107,7 +172,18 @@ def _fit_line(
         rows.append((centre, max(_robust_variance(difference[inside]) - rounding, 0.0), np.sqrt(count)))
     centres, variances, weights = np.array(rows).T
     scale = weights / np.maximum(variances, 1e-3 * variances.max() + 1e-12)  # relative errors count alike
-    return _non_negative_line(centres, variances, scale)
+    a, b = _non_negative_line(centres, variances, scale)
+    beside = _smoothed(variances / np.maximum(a + b * centres, 1e-12), weights**2)
+    return np.asarray((a + b * LEVELS) * np.interp(LEVELS, centres, beside))
+
+
+def _smoothed(
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Return means of each value and its neighbours, [1 2 1]: single bins hold few pixels."""
+    kernel = np.array([1.0, 2.0, 1.0])
+    inside = slice(1, -1)  # `same` would be as long as the kernel for fewer values
+    return np.asarray((np.convolve(values * weights, kernel) / np.convolve(weights, kernel))[inside])
 
 
 def _non_negative_line(
@@ -210,8 +286,6 @@ class CameraNoise:
         """The mean of what was found; None before."""
         if not self._found:
             return None
-        read, shot = (
-            np.mean([getattr(each, name) for each in self._found], axis=0) for name in ("read", "shot")
-        )
+        variances = np.mean([each.variances for each in self._found], axis=0)
         rows, columns = np.mean([each.correlation for each in self._found], axis=0)
-        return NoiseModel(read, shot, (float(rows), float(columns)))
+        return NoiseModel(variances, (float(rows), float(columns)))

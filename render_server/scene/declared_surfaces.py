@@ -14,7 +14,8 @@ from deltalight.protocol.scene_objects import Region, SheetRegion, Surface
 from deltalight.render_server.scene.depth_surface import DepthSurface
 
 MAX_SURFACES = 16
-MAX_ROWS = MAX_SURFACES + 17  # with the board's paper and its grey cards
+MAX_FOUND = 4  # sheets that nobody declared
+MAX_ROWS = MAX_SURFACES + 17 + MAX_FOUND  # with the board's paper and its grey cards
 PLANE, BOX, MATERIAL, SHEET = 0.0, 1.0, 2.0, 3.0
 SHEET_TOLERANCE_M = 0.005
 # What leans on a plane by more than 45 degrees is no part of it (a cosine; common/measured_surfaces.glsl).
@@ -32,9 +33,9 @@ class SurfaceTable:
     A row of `packed` is five vectors (SurfaceEntry of passes/shaders/common/surfaces.glsl): (F0 R G B, metallic);
     (roughness, 0, 0, 0); (albedo R G B, 1 if declared); and two for the region, whose kind is the last component of
     the first. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper corner, 0); 2
-    material of the given model: (its index, 0, 0, kind), zeros; 3 diffuse sheet in the plane z = 0: (centre x, y,
-    tolerance, kind), (unit direction of an edge x, y, half the edge, half the other edge). The board's paper, its
-    grey cards and declared sheets come first.
+    material of the given model: (its index, 0, 0, kind), zeros; 3 diffuse sheet: (centre, kind), (unit direction of
+    an edge, half the edge), with (unit normal, half the other edge) and (1, tolerance, 0, 0) in place of the first
+    two. The board's paper, its grey cards, declared and found sheets come first.
     """
 
     packed: Float32[np.ndarray, "n 5 4"]
@@ -61,6 +62,15 @@ class SurfaceTable:
         """Whether any of them reflects, other than sheets."""
         return bool((self.packed[:, 3, 3] < SHEET).any())
 
+    @property
+    def sheets(self) -> Float64[np.ndarray, "s 4 3"]:
+        """Corners of the sheets, world, m."""
+        rows = self.packed[self.packed[:, 3, 3] == SHEET].astype(np.float64)
+        normal, edge = rows[:, 0, :3], rows[:, 4, :3]
+        one, other = edge * rows[:, 4, 3:], np.cross(normal, edge) * rows[:, 0, 3:]
+        middle = rows[:, None, 3, :3]
+        return np.asarray(middle + np.stack([-one - other, one - other, one + other, other - one], axis=1))
+
     def lookup(
         self, points: Float[np.ndarray, "k 3"], materials: Int32[np.ndarray, " k"] | None = None
     ) -> Int32[np.ndarray, " k"]:
@@ -86,8 +96,9 @@ def _inside(
     elif first[3] == BOX:
         inside = short_axis.all_of((points >= first[:3]) & (points <= second[:3]))
     elif first[3] == SHEET:
-        on_edges = np.abs((points[:, :2] - first[:2]) @ np.array([second[:2], (-second[1], second[0])]).T)
-        inside = short_axis.all_of(on_edges <= second[2:]) & (np.abs(points[:, 2]) <= first[2])
+        normal, edge = row[0, :3], second[:3]
+        along = np.abs((points - first[:3]) @ np.array([edge, np.cross(normal, edge), normal]).T)
+        inside = short_axis.all_of(along <= np.array([second[3], row[0, 3], row[1, 1]]))
     elif materials is None:
         inside = np.zeros(len(points), bool)
     else:
@@ -96,9 +107,14 @@ def _inside(
 
 
 def build_surface_table(
-    surfaces: Sequence[Surface], board: BoardSpec | None = None, material_names: Sequence[str] = ()
+    surfaces: Sequence[Surface],
+    board: BoardSpec | None = None,
+    material_names: Sequence[str] = (),
+    found: Sequence[Float64[np.ndarray, "4 3"]] = (),
 ) -> SurfaceTable:
     """Compiles the declared surfaces; `material_names` are those of the given model, by index.
+
+    `found` are outlines (world, m) of at most MAX_FOUND sheets that nobody declared.
 
     F0 is 0.08 specular, mixed by `metallic` with the albedo (0.9 where none is given).
 
@@ -112,6 +128,7 @@ def build_surface_table(
         )
     rows = [] if board is None else [_sheet_row(quad) for quad in _sheets(board)]
     rows += [_sheet_row(_outline(each.region.sheet)) for each in surfaces if each.region.sheet is not None]
+    rows += [_sheet_row(outline) for outline in found]
     rows += [_row(surface, material_names) for surface in surfaces if surface.region.sheet is None]
     return SurfaceTable(np.array(rows, np.float32).reshape(-1, 5, 4))
 
@@ -218,8 +235,12 @@ def _outline(sheet: SheetRegion) -> Float64[np.ndarray, "4 3"]:
 def _sheet_row(outline: Float64[np.ndarray, "4 3"]) -> list[list[float]]:
     """Returns the row of a rectangular sheet of which everything within 5 mm is taken for paper."""
     centre, edge, other = outline.mean(axis=0), outline[1] - outline[0], outline[3] - outline[0]
-    length = float(np.linalg.norm(edge))
-    nothing = [0.0] * 4
-    place = [*centre[:2].tolist(), SHEET_TOLERANCE_M, SHEET]
-    extent = [*(edge[:2] / length).tolist(), length / 2, float(np.linalg.norm(other)) / 2]
-    return [nothing, [1.0, 0.0, 0.0, 0.0], nothing, place, extent]
+    length, breadth = float(np.linalg.norm(edge)), float(np.linalg.norm(other))
+    normal = np.cross(edge, other) / (length * breadth)
+    return [
+        [*normal.tolist(), breadth / 2],
+        [1.0, SHEET_TOLERANCE_M, 0.0, 0.0],
+        [0.0] * 4,
+        [*centre.tolist(), SHEET],
+        [*(edge / length).tolist(), length / 2],
+    ]

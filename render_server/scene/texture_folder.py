@@ -14,7 +14,7 @@ from deltalight.protocol.errors import DeltalightError
 
 INFO_NAME = "info.json"
 _LARGEST_INFO_BYTES = 1 << 20
-_LARGEST_PICTURE_PIXELS = 64_000_000
+LARGEST_PICTURE_PIXELS = 64_000_000
 
 
 def read_info(folder: Path, what: str) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def read_codes(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """
     try:
         with Image.open(path) as image:
-            if image.width * image.height > _LARGEST_PICTURE_PIXELS:
+            if image.width * image.height > LARGEST_PICTURE_PIXELS:
                 raise DeltalightError(f"{path} has {image.width}x{image.height} pixels, which is too many.")
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

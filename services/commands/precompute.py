@@ -12,8 +12,8 @@ def precompute(
     source: Annotated[
         Path,
         typer.Argument(
-            help="Scene document, with its assets where it refers to them; a measured BRDF (.brdf); or the folder of "
-            "a polynomial texture map or an ABTF (info.json)."
+            help="Scene document, with its assets where it refers to them; a measured BRDF (.brdf); a polynomial "
+            "texture map (.ptm); or the folder of one or of an ABTF (info.json)."
         ),
     ],
     out: Annotated[
@@ -30,13 +30,14 @@ def precompute(
     documents.
     """
     from deltalight.render_server.scene.brdf_measurements import BRDF_SUFFIX
+    from deltalight.render_server.scene.textures_by_light import is_texture_by_light
 
-    if source.is_dir() or source.suffix.lower() == BRDF_SUFFIX:
+    if is_texture_by_light(source) or source.suffix.lower() == BRDF_SUFFIX:
         _precompute_material(source, out)
     elif out is not None:
         raise DeltalightError(
-            f"{source} is treated as a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or the"
-            " folder of a texture by the light; leave it out."
+            f"{source} is treated as a scene document, and --out is for a measured BRDF ({BRDF_SUFFIX}) or a"
+            " texture by the light; leave it out."
         )
     else:
         _precompute_scene(source)
@@ -55,23 +56,24 @@ def _precompute_scene(path: Path) -> None:
 
 def _precompute_material(source: Path, out: Path | None) -> None:
     from deltalight.render_server.scene.material_file import MATERIAL_SUFFIX
+    from deltalight.render_server.scene.textures_by_light import is_texture_by_light
 
     if out is None or out.suffix != MATERIAL_SUFFIX:
         raise DeltalightError(
             f"{source} is a measured material; say where it goes: --out {source.stem}{MATERIAL_SUFFIX}."
         )
-    if source.is_dir():
+    if is_texture_by_light(source):
         _convert_textures(source, out)
     else:
         _fit_brdf(source, out)
 
 
-def _convert_textures(folder: Path, out: Path) -> None:
+def _convert_textures(source: Path, out: Path) -> None:
     from deltalight.render_server.scene.material_file import write_material
     from deltalight.render_server.scene.texture_stack import TextureStack
     from deltalight.render_server.scene.textures_by_light import read_texture_by_light
 
-    texture = read_texture_by_light(folder)
+    texture = read_texture_by_light(source)
     write_material(out, texture)
     height, width = texture.albedo.shape[:2]
     albedo = " ".join(f"{each:.3f}" for each in texture.albedo.mean(axis=(0, 1), dtype=float))

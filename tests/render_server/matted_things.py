@@ -52,13 +52,14 @@ def hairy_head(pattern: str, seed: int = 0) -> Thing:
     return _before(pattern, _head(random), HAIR, random)
 
 
-def hand(pattern: str, seed: int = 0) -> Thing:
-    """A hand whose four fingers are 9 pixels wide, with gaps of 6, before `pattern`."""
+def hand(pattern: str, seed: int = 0, aside_px: int = 0) -> Thing:
+    """A hand whose four fingers are 9 pixels wide, with gaps of 6, before `pattern`, moved to the right."""
     picture = np.zeros((HEIGHT * OVERSAMPLING, WIDTH * OVERSAMPLING), np.uint8)
-    left, top, right, bottom = np.array([50, 75, 106, HEIGHT]) * OVERSAMPLING
+    left, top, right, bottom = np.array([50 + aside_px, 75, 106 + aside_px, HEIGHT]) * OVERSAMPLING
     picture[top:bottom, left : right + 1] = 255
     for finger in range(4):
-        ends = np.array([[55 + 15 * finger, 80], [53 + 17 * finger, 30 + 5 * abs(finger - 1)]])
+        root, tip = 55 + 15 * finger + aside_px, 53 + 17 * finger + aside_px
+        ends = np.array([[root, 80], [tip, 30 + 5 * abs(finger - 1)]])
         cv2.polylines(picture, [ends * OVERSAMPLING], False, 255, 9 * OVERSAMPLING)
     return _before(pattern, _averaged(picture), SKIN, np.random.default_rng(seed))
 

@@ -8,17 +8,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
-from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.matted_things import FAR_M, NEAR_M, PATTERNS, Thing, hairy_head, hand
 from tests.render_server.scenes import (
+    COARSE,
     HEIGHT,
     WIDTH,
     ObjectsRenderer,
     Stage,
     ambient,
+    array_of,
     ball,
     camera,
     cube,
@@ -29,6 +33,8 @@ from tests.render_server.scenes import (
     look_at,
     noisy,
     plain,
+    shifted,
+    sphere_light,
     unlit,
 )
 from tests.render_server.test_antialiasing import ABOVE, GLOW
@@ -156,3 +162,32 @@ def test_what_ends_at_the_border_of_the_picture(objects: ObjectsRenderer, stage:
     found = objects.linear(matted(document, 16), view)
     assert np.isfinite(found).all()
     assert found[:, 20:] == pytest.approx(GLOW, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quality", ["live", "best"])
+def test_a_moving_hand_leaves_nothing_behind(gpu: GpuContext, stage: Stage, quality: str) -> None:
+    """Its matte is that of the newest frame, and so is its shadow on an object, with `live` 0.4 s later at most."""
+    wall = stage.virtual(shifted(trimesh.creation.box((2.5, 2.0, 0.02)), 0, 0, 0), (0.6, 0.6, 0.6))
+    plain_room = stage.document([wall], [sphere_light((0.5, 0.3, 2.9), 3.0, 0.03), ambient(0.3)], **COARSE)
+    document = matted(plain_room.replaced(method=plain_room.method.replaced(quality=quality)))
+    renderer, off = SceneRenderer(gpu, document), []
+    for number in range(4):
+        thing = hand("plain", aside_px=6 * number - 9)
+        view = thing.view(pose=ABOVE, frame_id=number, timestamp_ns=150_000_000 * number)
+        color, alpha = shown(renderer, view)
+        alone = SceneRenderer(gpu, document)
+        fresh_color, fresh_alpha = shown(alone, view)
+        alone.release()
+        np.testing.assert_array_equal(alpha, fresh_alpha)
+        off.append(np.count_nonzero(color != fresh_color))
+    renderer.release()
+    assert off[0] == off[3] == 0
+    assert quality == "live" or not any(off)
+
+
+def shown(renderer: SceneRenderer, view: ViewFrame) -> tuple[np.ndarray, np.ndarray]:
+    """The picture, and which share of each pixel objects cover."""
+    color = renderer.render(view).color
+    assert renderer.graph is not None
+    return color, array_of(renderer.graph["object surface"].coverage.texture)[..., 0]

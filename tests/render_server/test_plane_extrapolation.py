@@ -139,6 +139,19 @@ def test_a_wall_goes_on_with_the_probability_that_its_seen_length_gives() -> Non
     assert found.radiance.reshape(-1, 3)[met] == pytest.approx(0.3, rel=1e-5)
 
 
+def test_a_long_wall_is_likely_to_be_high() -> None:
+    """Of a wall the view shows 2 m by 0.2 m: it reaches d above that with probability 2 / (2 + d)."""
+    low = ViewFrustum(SIGHT.camera_from_world, *(sign * np.array([0.5, 0.05]) for sign in (-1, 1)))
+    strip = shown((*wall(1, 1.0, -1.0, evenly((-1, 0.4), (1, 0.6))), 0.3))
+    found = extrapolate_planes(*strip, (), low, centre=CENTRE, size=SIZE).probability.reshape(-1)
+    place = CENTRE + DIRECTIONS / np.where(DIRECTIONS[:, 1:2] > 0, DIRECTIONS[:, 1:2], np.inf)
+    above = (DIRECTIONS[:, 1] > 0) & (np.abs(place[:, 0]) < 0.1) & (place[:, 2] > 0.7)
+    away = np.linalg.norm(place[above] - CENTRE - (0, 1, 0), axis=1)
+    beyond = away * (1 - 0.1 / (place[above, 2] - CENTRE[2]))
+    assert above.sum() >= 2
+    assert found[above] == pytest.approx(2 / (2 + beyond), rel=1e-3)
+
+
 def test_what_a_wall_shines_with_is_what_the_light_makes_there() -> None:
     position, intensity, albedo = np.array([1.5, 0.2, 1.5]), np.array([2.0, 1.5, 1.0]), 0.4
     lamp = SphereLight(position.astype(np.float32), intensity.astype(np.float32), 0.02)

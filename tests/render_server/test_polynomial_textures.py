@@ -19,6 +19,7 @@ from deltalight.render_server.scene.polynomial_texture import (
     polynomial_terms,
     read_polynomial_texture,
 )
+from deltalight.render_server.scene.ptm_file import read_ptm
 from tests.render_server.gltf_samples import Plate
 from tests.render_server.scenes import (
     HEIGHT,
@@ -189,3 +190,68 @@ def test_bad_maps(tmp_path: Path, change: Callable[[Path], None], sentence: str)
     change(folder)
     with pytest.raises(DeltalightError, match=sentence):
         read_polynomial_texture(folder)
+
+
+SCALE, BIAS = np.array([2.0, 2.5, 1.5, 3.0, 2.25, 2.0]), np.array([200, 180, 120, 90, 110, 3])
+
+
+def ptm_bytes(kind: str, *blocks: np.ndarray, line_end: str = "\n") -> bytes:
+    """A `.ptm` file of blocks (h, w, n) of bytes whose first row is the picture's top."""
+    height, width = blocks[0].shape[:2]
+    numbers = (" ".join(str(number) for number in each) for each in (SCALE, BIAS))
+    lines = ("PTM_1.2", f"PTM_FORMAT_{kind}", f"{width}", f"{height}", *(f"{line} " for line in numbers))
+    header = "".join(line + line_end for line in lines)
+    return header.encode() + b"".join(np.ascontiguousarray(block[::-1]).tobytes() for block in blocks)
+
+
+def coded_block(seed: int, values: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (6, 8, values)).astype(np.uint8)
+
+
+def luminance_under(block: np.ndarray, u: float, v: float) -> np.ndarray:
+    """C = a0 u^2 + a1 v^2 + a2 u v + a3 u + a4 v + a5, each a = (byte - bias) scale (Malzbender and Gelb 2001)."""
+    return ((block - BIAS) * SCALE) @ np.array([u * u, v * v, u * v, u, v, 1.0])
+
+
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+def test_a_ptm_file_of_luminances_scales_its_colors(tmp_path: Path, line_end: str) -> None:
+    luminance, colors = coded_block(1, 6), coded_block(2, 3)
+    (tmp_path / "coin.ptm").write_bytes(ptm_bytes("LRGB", luminance, colors, line_end=line_end))
+    found = read_ptm(tmp_path / "coin.ptm")
+    light = np.array([0.3, -0.4, np.sqrt(0.75)])
+    shown = np.tensordot(polynomial_terms(light[None])[0], found.coefficients.astype(float), 1)
+    wanted = luminance_under(luminance, 0.3, -0.4)[..., None] / 255 * colors / 255
+    assert shown == pytest.approx(wanted, abs=0.004)  # of half floats up to 2.9
+
+
+def test_a_ptm_file_of_colors(tmp_path: Path) -> None:
+    blocks = [coded_block(seed, 6) for seed in range(3)]
+    (tmp_path / "coin.ptm").write_bytes(ptm_bytes("RGB", *blocks))
+    found = read_ptm(tmp_path / "coin.ptm")
+    light = np.array([-0.5, 0.2, np.sqrt(0.71)])
+    shown = np.tensordot(polynomial_terms(light[None])[0], found.coefficients.astype(float), 1)
+    wanted = np.stack([luminance_under(block, -0.5, 0.2) / 255 for block in blocks], axis=-1)
+    assert shown == pytest.approx(wanted, abs=0.004)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda content: content.replace(b"PTM_1.2", b"PTM_1.1"), "no uncompressed PTM of RGB or LRGB"),
+        (lambda content: content.replace(b"_LRGB", b"_JPEG_LRGB"), "no uncompressed PTM of RGB or LRGB"),
+        (lambda content: content[:-1], r"has 431 bytes of 8x6 texels, not 432; it is damaged"),
+        (lambda content: content[:40], "lacks its size, scales or biases"),
+        (lambda content: content.replace(b"\n8\n", b"\n-8\n"), "lacks its size, scales or biases"),
+        (lambda content: content.replace(b"2.5", b"nan"), "lacks its size, scales or biases"),
+        (lambda content: content.replace(b"2.5", b"1e9"), "coefficients beyond 65504 times white"),
+        (lambda content: content.replace(b"2.5", b"1e300"), "coefficients beyond 65504 times white"),
+        (lambda content: b"", "no uncompressed PTM of RGB or LRGB"),  # noqa: ARG005
+    ],
+)
+def test_bad_ptm_files(tmp_path: Path, change: Callable[[bytes], bytes], sentence: str) -> None:
+    path = tmp_path / "coin.ptm"
+    path.write_bytes(change(ptm_bytes("LRGB", coded_block(1, 6), coded_block(2, 3))))
+    with pytest.raises(DeltalightError, match=sentence):
+        read_ptm(path)
+    with pytest.raises(DeltalightError, match=r"missing\.ptm cannot be read"):
+        read_ptm(tmp_path / "missing.ptm")

@@ -134,6 +134,21 @@ def test_pictures_under_lights_of_several_angles_become_a_material(cli: RunCli, 
     assert out.read_bytes() == before
 
 
+def test_a_ptm_file_becomes_a_material(cli: RunCli, tmp_path: Path) -> None:
+    source, out = tmp_path / "coin.PTM", tmp_path / "coin.dlmat"
+    grey = bytes([0, 0, 0, 0, 0, 128])  # 128 / 255 in all light
+    scale, bias = "1 1 1 1 1 1", "0 0 0 0 0 0"
+    white = bytes([255, 255, 255])
+    source.write_bytes(f"PTM_1.2\nPTM_FORMAT_LRGB\n4 3\n{scale}\n{bias}\n".encode() + 12 * grey + 12 * white)
+    done = cli("precompute", str(source), "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    assert "coin.dlmat: polynomials of 4x3 texels, reflects 0.432 0.432 0.432 of" in done.stdout
+    source.write_bytes(source.read_bytes()[:-2])
+    refused = cli("precompute", str(source), "--out", str(out))
+    assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)
+    assert "it is damaged, so copy it again" in refused.stderr
+
+
 def test_a_measured_brdf_becomes_a_material(cli: RunCli, tmp_path: Path) -> None:
     source, out = brdf_file(tmp_path, grey_brdf(0.4, (0.2, 0.1, 0.5))), tmp_path / "paint.dlmat"
     done = cli("precompute", str(source), "--out", str(out))

@@ -20,6 +20,10 @@ uniform sampler2D cone_specular_rho;
 uniform sampler2D reflection;   // a: fraction of a smooth surface's lobe that objects fill
 #pragma texels rgba16f direct_mu direct_rho cone_mu cone_rho cone_specular_mu cone_specular_rho reflection
 #pragma switch bool has_reflection
+#pragma switch DISTANT_CHANGE
+#ifdef DISTANT_CHANGE
+layout(rgba16f) readonly uniform image2D distant_change;   // distant_upsample.comp.glsl
+#endif
 uniform int scale;
 #include "common/least_change.glsl"
 
@@ -49,7 +53,13 @@ vec4 value(ivec2 texel) {
     vec3 e_rho = texelFetch(direct_rho, at, 0).rgb + mu.rgb + rho.a * (rho.rgb - mu.rgb);
     bool changed = differs(e_mu, e_rho, e_mu) || texelFetch(cone_specular_mu, texel, 0) != texelFetch(cone_specular_rho, texel, 0)
         || block_changed(texel, mu.rgb);
-    return vec4((e_rho + LEAST_IRRADIANCE) / (e_mu + LEAST_IRRADIANCE), changed ? 2.0 : 1.0);
+    vec3 ratio = (e_rho + LEAST_IRRADIANCE) / (e_mu + LEAST_IRRADIANCE);
+#ifdef DISTANT_CHANGE
+    vec3 distant = imageLoad(distant_change, texel).rgb;
+    ratio = max(ratio + distant, vec3(0.0));
+    changed = changed || distant != vec3(0.0);
+#endif
+    return vec4(ratio, changed ? 2.0 : 1.0);
 }
 #else
 uniform sampler2D change_ratio;

@@ -15,6 +15,10 @@ layout(rgba32f) writeonly uniform image2D ratio_out;   // a: 1 where the picture
 layout(rgba16f) readonly uniform image2D lobe_mu;
 layout(rgba16f) readonly uniform image2D lobe_rho;
 layout(rgba16f) readonly uniform image2D virtual_radiance;
+#pragma switch DISTANT_CHANGE
+#ifdef DISTANT_CHANGE
+layout(rgba16f) readonly uniform image2D distant_change;   // distant_upsample.comp.glsl
+#endif
 uniform usampler2D picture;
 uniform sampler2D linear_picture;
 uniform sampler2D object_coverage;
@@ -43,11 +47,13 @@ uniform bool store_linear;       // for views and files; the picture itself need
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
 // `gained`: what objects bring into a smooth surface by rays; `hidden`: fraction of what it reflected that they hide.
-struct Change { vec3 e_mu; vec3 delta; vec3 s_mu; vec3 s_rho; vec3 gained; float hidden; bool any_change; };
+// `distant`: relative change of light beyond the objects' volumes.
+struct Change { vec3 e_mu; vec3 delta; vec3 s_mu; vec3 s_rho; vec3 gained; float hidden; vec3 distant; bool any_change; };
 
 // Indirect part: E_mu of the cones, and fade (E_rho - E_mu).
 void add_cones(ivec2 pixel, vec4 position, vec3 normal, inout Change c) {
     vec3 e_mu = vec3(0.0), delta = vec3(0.0), s_mu = vec3(0.0), s_rho = vec3(0.0);
+    vec3 distant = vec3(0.0);
     float total = 0.0;
     for (int j = 0; j < 4; ++j) {
         float w;
@@ -61,6 +67,9 @@ void add_cones(ivec2 pixel, vec4 position, vec3 normal, inout Change c) {
         vec4 rho = texelFetch(cone_rho, texel, 0);
         e_mu += w * mu.rgb;
         delta += w * rho.a * (rho.rgb - mu.rgb);
+#ifdef DISTANT_CHANGE
+        distant += w * imageLoad(distant_change, texel).rgb;
+#endif
         if (specular_surfaces) {
             vec3 specular_mu = texelFetch(cone_specular_mu, texel, 0).rgb;
             s_mu += w * specular_mu;
@@ -71,6 +80,7 @@ void add_cones(ivec2 pixel, vec4 position, vec3 normal, inout Change c) {
     if (total == 0.0) return;
     c.e_mu += e_mu / total;
     c.delta += delta / total;
+    c.distant = distant / total;
     c.s_mu = s_mu / total;
     c.s_rho = s_rho / total;
 }
@@ -78,7 +88,7 @@ void add_cones(ivec2 pixel, vec4 position, vec3 normal, inout Change c) {
 Change change_at(ivec2 pixel, vec4 position, vec4 normal) {
     vec3 e_mu = texelFetch(direct_mu, pixel, 0).rgb;
     vec3 none = vec3(0.0);
-    Change c = Change(e_mu, texelFetch(direct_rho, pixel, 0).rgb - e_mu, none, none, none, 0.0, false);
+    Change c = Change(e_mu, texelFetch(direct_rho, pixel, 0).rgb - e_mu, none, none, none, 0.0, none, false);
     add_cones(pixel, position, normal.xyz, c);
     if (specular_surfaces && normal.w >= 0.0) {
         SurfaceEntry e = surfaces[int(normal.w)];
@@ -96,7 +106,7 @@ Change change_at(ivec2 pixel, vec4 position, vec4 normal) {
         c.s_mu = vec3(0.0);
         c.s_rho = vec3(0.0);
     }
-    c.any_change = c.delta != vec3(0.0) || c.s_mu != c.s_rho || c.hidden > 0.0;
+    c.any_change = c.delta != vec3(0.0) || c.distant != vec3(0.0) || c.s_mu != c.s_rho || c.hidden > 0.0;
     return c;
 }
 
@@ -122,11 +132,11 @@ vec3 specular_change(Change c, vec3 glossy) {
 // `ratio`: of the light; all that there is where nothing is added and the surface is not specular.
 vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b, out vec3 ratio) {
     float e = 1e-3 * max(texelFetch(direct_mu, pixel, 0).a, 1e-6);
-    ratio = (max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e);
+    ratio = max((max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e) + c.distant, vec3(0.0));
     if (additive) {
         vec3 albedo = clamp(PI * b / max(c.e_mu, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
         vec3 glossy = c.hidden > 0.0 ? (1.0 - diffuse_fraction(pixel, c, normal, b)) * b : vec3(0.0);
-        return max(vec3(0.0), b + albedo / PI * c.delta + specular_change(c, glossy));
+        return max(vec3(0.0), b * (1.0 + c.distant) + albedo / PI * c.delta + specular_change(c, glossy));
     }
     vec3 w = diffuse_fraction(pixel, c, normal, b), glossy = (1.0 - w) * b;
     return w * b * ratio + max(vec3(0.0), glossy + specular_change(c, glossy));

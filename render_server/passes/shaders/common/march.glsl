@@ -199,7 +199,7 @@ float march_near(
     return travelled(w);
 }
 
-#ifdef SEVERAL_VOLUMES
+#if defined(SEVERAL_VOLUMES) || defined(ENDS_AHEAD)
 bool in_far(vec3 at, Walk w, float end) { return is_within(at, far_size) && travelled(w) < end; }
 #else
 bool in_far(vec3 at, Walk w, float end) { return is_within(at, far_size); }

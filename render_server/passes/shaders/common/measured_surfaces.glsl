@@ -4,7 +4,7 @@
 #include "common/surfaces.glsl"
 
 uniform float noise_sigma;      // m at 1 m
-uniform vec2 plane_fits[33];    // of each entry: height of the measured plane over the declared one, m; its noise at 1 m
+uniform vec2 plane_fits[37];    // of each entry: height of the measured plane over the declared one, m; its noise at 1 m
 #include "common/camera.glsl"
 
 const float SIGMAS = 3.0;
@@ -25,9 +25,15 @@ vec3 on_plane(SurfaceEntry e, vec3 p, vec3 ray) {
     return abs(slope) > 1e-4 ? p - ray * (plane_height(e, p) / slope) : p;
 }
 
-bool is_paper(vec3 p) {
+// Where a point measured at depth z lies, as far as noise explains, in the plane of a sheet.
+vec3 towards_sheet(SurfaceEntry sheet, vec3 p, vec3 ray, float z) {
+    float slope = dot(ray, sheet_normal(sheet)), noise = SIGMAS * noise_sigma * z * z;
+    return abs(slope) > 1e-4 ? p - ray * clamp(sheet_height(sheet, p) / slope, -noise, noise) : p;
+}
+
+bool is_paper(vec3 p, vec3 ray, float z) {
     for (int i = 0; i < surface_count && surfaces[i].region[0].w == SHEET; ++i)
-        if (on_sheet(surfaces[i], p)) return true;
+        if (on_sheet(surfaces[i], towards_sheet(surfaces[i], p, ray, z))) return true;
     return false;
 }
 
@@ -35,13 +41,12 @@ bool is_paper(vec3 p) {
 // unknown.
 int measured_entry(int first, vec3 p, float z, vec3 normal, float material) {
     vec3 ray = ray_of(p, z);
-    float noise = abs(ray.z) > 1e-4 ? SIGMAS * noise_sigma * z * z : 0.0;
-    if (is_paper(noise > 0.0 ? p - ray * clamp(p.z / ray.z, -noise, noise) : p)) return -1;
+    if (is_paper(p, ray, z)) return -1;
     for (int i = first; i < surface_count; ++i) {
         SurfaceEntry e = surfaces[i];
         if (e.region[0].w == SHEET || !in_region(e, p, material)) continue;
         if (e.region[0].w != PLANE) return i;
-        if (is_paper(on_plane(e, p, ray))) return -1;
+        if (is_paper(on_plane(e, p, ray), ray, z)) return -1;
         if (normal == vec3(0.0) || abs(dot(normal, e.region[1].xyz)) >= FLUSH) return i;
     }
     return -1;

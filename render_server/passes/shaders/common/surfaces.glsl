@@ -10,11 +10,15 @@ uniform int surface_count;
 
 const float PLANE = 0.0, BOX = 1.0, MATERIAL = 2.0, SHEET = 3.0;
 
-// Rectangle of paper in the plane z = 0, in which everything is diffuse.
+vec3 sheet_normal(SurfaceEntry e) { return e.f0.xyz; }
+
+float sheet_height(SurfaceEntry e, vec3 p) { return dot(p - e.region[0].xyz, sheet_normal(e)); }
+
+// Rectangle of paper, in which everything is diffuse.
 bool on_sheet(SurfaceEntry e, vec3 p) {
-    vec2 from = p.xy - e.region[0].xy, edge = e.region[1].xy;
-    vec2 along = vec2(dot(from, edge), dot(from, vec2(-edge.y, edge.x)));
-    return all(lessThanEqual(abs(along), e.region[1].zw)) && abs(p.z) <= e.region[0].z;
+    vec3 from = p - e.region[0].xyz, edge = e.region[1].xyz;
+    vec3 along = abs(vec3(dot(from, edge), dot(from, cross(sheet_normal(e), edge)), sheet_height(e, p)));
+    return all(lessThanEqual(along, vec3(e.region[1].w, e.f0.w, e.surface.y)));
 }
 
 float plane_height(SurfaceEntry e, vec3 p) { return dot(p - e.region[0].xyz, e.region[1].xyz); }

@@ -1,0 +1,53 @@
+"""Change of light beyond the objects' volumes, found on a sparse lattice and interpolated on the reduced grid."""
+
+from collections.abc import Mapping
+
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings, Kernel
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.shading import DirectLight
+
+LATTICE_STEP = 4  # texels of the reduced grid from one point of the lattice to the next
+AIMED_CONES = 16  # of a point of the lattice, at each volume
+
+
+class DistantChange:
+    """Relative change of the light at real surfaces beyond the volumes (`change`, RGBA16F, docs/method.md 4.5).
+
+    `size` is that of the reduced grid, `defines` are those of march.glsl.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
+        self._points = (-(-size[0] // LATTICE_STEP), -(-size[1] // LATTICE_STEP))
+        self.change = texture_2d(gpu, size, 4, "f2")
+        self._lattice = texture_2d(gpu, self._points, 4, "f2")
+        self._pixels = texture_2d(gpu, self._points, 4, "i2")
+        own = {"REAL": 1, "LATTICE_STEP": LATTICE_STEP}
+        self._find = Kernel(gpu, "distant_change", **own, **defines, ENDS_AHEAD=1, AIMED_CONES=AIMED_CONES)
+        self._upsample = Kernel(gpu, "distant_upsample", **own)
+
+    def run(self, direct: DirectLight, cones: ConeFields, grid: LowResGrid, scene: Bindings) -> None:
+        """Finds the change; `scene` brings the bindings that cones march with."""
+        self._find.run(
+            self._points,
+            grid.bindings,
+            scene,
+            direct_mu=direct.light.mu,
+            cone_mu=cones.mu,
+            cone_rho=cones.rho,
+            lattice_change=self._lattice,
+            lattice_pixels=self._pixels,
+        )
+        self._upsample.run(
+            grid.size,
+            grid.bindings,
+            scene,
+            lattice_change=self._lattice,
+            lattice_pixels=self._pixels,
+            distant_change_out=self.change,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.change, self._lattice, self._pixels, self._find, self._upsample)
