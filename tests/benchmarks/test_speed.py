@@ -273,7 +273,9 @@ def test_a_gpu_is_asked_for_no_more_dispatches(method: str, gpu: GpuContext, tak
     renderer = SceneRenderer(replace(gpu, is_software=False), scene)
     found = []
     for motion in ("camera", "object"):
-        counts = count_motion(renderer, list(steps_of(motion, take, scene, 18)), 3)  # `live` has turns of three
+        counts = count_motion(
+            renderer, list(steps_of(motion, take, scene, 18)), 3
+        )  # `live` has turns of three
         assert (counts.per_frame["reads"], counts.per_frame["buffer_clears"]) == (0, 0)
         found.append(counts.per_frame["dispatches"])
     renderer.release()
