@@ -133,6 +133,8 @@ READS = (*BYTE_READS, *READS_INTO, (moderngl.Framebuffer, "read"))
 CLEARS = ((moderngl.Framebuffer, "clear"), (moderngl.Buffer, "clear"), (GpuContext, "clear_start"))
 # What a driver may work at when it is told: software renderers do.
 WAITS = ((moderngl.Context, "memory_barrier"), (moderngl.Query, "__enter__"), (moderngl.Query, "__exit__"))
+COPIES = ((moderngl.Context, "copy_buffer"), (moderngl.Context, "copy_framebuffer"))
+TEXTURE_WRITES = tuple((owner, "write") for owner in TEXTURES)
 MIPMAPS = tuple((owner, "build_mipmaps") for owner in TEXTURES)
 
 
@@ -181,15 +183,16 @@ class ReadBacks:
 
     @contextmanager
     def without_gpu(self) -> Iterator[None]:
-        """Leaves out dispatches, draws, clears, mip levels, barriers and timer queries.
+        """Leaves out dispatches, draws, clears, copies on the GPU, mip levels, barriers and timer queries.
 
         Reads return what was remembered, else zeros.
         """
-        left_out = (*DISPATCHES, *DRAWS, *CLEARS, *MIPMAPS, *READS_INTO, *WAITS)
+        left_out = (*DISPATCHES, *DRAWS, *CLEARS, *COPIES, *MIPMAPS, *READS_INTO, *WAITS)
         idle = [(owner, name, _idle) for owner, name in left_out]
         reads = [(owner, name, self._recalling) for owner, name in BYTE_READS]
         untimed = (moderngl.Query, "elapsed", lambda _: property(lambda _: 0))
-        with wrapped([*idle, *reads, untimed]):
+        uploads = [(owner, name, _uploading) for owner, name in TEXTURE_WRITES]
+        with wrapped([*idle, *uploads, *reads, untimed]):
             yield
 
     def _recalling(self, original: Callable[..., bytes]) -> Callable[..., bytes]:
@@ -208,5 +211,16 @@ def _idle(original: Callable[..., Any]) -> Callable[..., None]:
     @wraps(original)
     def call(*_: object, **__: object) -> None:
         pass
+
+    return call
+
+
+def _uploading(original: Callable[..., Any]) -> Callable[..., None]:
+    """Writes what the CPU has; from a buffer, the GPU copies."""
+
+    @wraps(original)
+    def call(texture: Any, data: Any, *given: Any, **named: Any) -> None:  # noqa: ANN401 (as the wrapped method)
+        if not isinstance(data, moderngl.Buffer):
+            original(texture, data, *given, **named)
 
     return call

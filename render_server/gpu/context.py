@@ -55,6 +55,7 @@ NO_ERROR, OUT_OF_MEMORY = "GL_NO_ERROR", "GL_OUT_OF_MEMORY"  # as moderngl names
 
 OBJECT_KINDS = ("Buffer", "Texture", "Sampler", "Program", "Shader", "Framebuffer", "VertexArray", "Query")
 COPY_WRITE_BUFFER, R32UI, RED_INTEGER, UNSIGNED_INT = 0x8F37, 0x8236, 0x8D94, 0x1405  # OpenGL's numbers
+MOST_GROUP_COUNTERS = 256
 HIGHEST_NAME = 8192  # drivers name objects from 1 on and use freed names again; some hundreds live at a time
 
 
@@ -190,6 +191,11 @@ class GpuContext:
     def empty_buffer(self) -> moderngl.Buffer:
         """A buffer of zeros that stands where a kernel reads from none."""
         return self.ctx.buffer(bytes(256))
+
+    @cached_property
+    def group_counters(self) -> moderngl.Buffer:
+        """Counters of workgroups that are done, all 0 between dispatches: the last one of each sets its own back."""
+        return self.ctx.buffer(bytes(4 * MOST_GROUP_COUNTERS))
 
     @cached_property
     def discarded_buffer(self) -> moderngl.Buffer:

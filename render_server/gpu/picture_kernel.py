@@ -28,6 +28,7 @@ from deltalight.render_server.gpu.texel_images import until_bracket, with_images
 from deltalight.render_server.gpu.textures import image_format, release_target
 
 Box = tuple[int, int, int, int]  # x, y, width, height in pixels
+TARGETS_KEPT = 2  # framebuffers of a kernel: what is filled in turns has two
 VERTEX_SHADER = """#version 430
 void main() { gl_Position = vec4(4.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1) - 1.0, 0.0, 1.0); }
 """
@@ -83,11 +84,10 @@ class _Drawn(Program):
 
 
 class _DrawnKernel(Shader):
-    """The programs of a kernel that is drawn, and the framebuffer of its outputs."""
+    """The programs of a kernel that is drawn, and the framebuffers of its outputs."""
 
     def __init__(self, gpu: GpuContext, name: str | Path, defines: Mapping[str, float | str]) -> None:
-        self._outputs: tuple[moderngl.Texture, ...] = ()
-        self._target: moderngl.Framebuffer | None = None
+        self._targets: dict[tuple[moderngl.Texture, ...], moderngl.Framebuffer] = {}
         super().__init__(gpu, name, defines)
 
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
@@ -122,20 +122,21 @@ class _DrawnKernel(Shader):
         return texture
 
     def _target_of(self, outputs: tuple[moderngl.Texture, ...]) -> moderngl.Framebuffer:
-        """Returns the framebuffer of these textures, mostly those of the last run."""
-        if self._target is None or list(map(id, outputs)) != list(map(id, self._outputs)):
-            self._release_target()
-            self._target, self._outputs = self._gpu.ctx.framebuffer(outputs), outputs
-        return self._target
+        """Returns the framebuffer of these textures, mostly one of the last runs'."""
+        if outputs not in self._targets:
+            if len(self._targets) == TARGETS_KEPT:
+                self._release_targets()
+            self._targets[outputs] = self._gpu.ctx.framebuffer(outputs)
+        return self._targets[outputs]
 
-    def _release_target(self) -> None:
-        if self._target is not None:
-            release_target(self._target)
-        self._target, self._outputs = None, ()
+    def _release_targets(self) -> None:
+        for target in self._targets.values():
+            release_target(target)
+        self._targets.clear()
 
     def release(self) -> None:
-        """Leaves the programs to other kernels of the same source, and frees the framebuffer."""
-        self._release_target()
+        """Leaves the programs to other kernels of the same source, and frees the framebuffers."""
+        self._release_targets()
         super().release()
 
 

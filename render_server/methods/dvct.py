@@ -187,6 +187,8 @@ class ExactCones:
         self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
         self._real = TraceRealCones(gpu, size, defines, reuses=reuses)
         self._virtual = TraceVirtualCones(gpu, size, defines, reuses=reuses)
+        if reuses:
+            fields.keep_virtual(gpu)
 
     def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
         """Returns the bindings that cones march with."""

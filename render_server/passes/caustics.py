@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import moderngl
 
-from deltalight.render_server.gpu.clearing import clear_buffer
+from deltalight.render_server.gpu.clearing import clear_buffers
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
@@ -118,7 +118,7 @@ class Caustics:
         lower = "output.width and output.height"
         self._sums = gpu.storage_buffer(size, lower)
         self._last_sums = gpu.storage_buffer(size, lower) if reuses else None
-        self._reuse = Kernel(gpu, "reuse_light", CAUSTICS=1) if reuses else None
+        self._reuse = Kernel(gpu, "reuse_caustics") if reuses else None
         self._count = gpu.ctx.buffer(reserve=4)
         self._beams: moderngl.Texture | None = None
         self._places: moderngl.Texture | None = None
@@ -167,7 +167,7 @@ class Caustics:
         """Fills the sums with the light of the beams where they end."""
         if self._last_sums is not None:
             self._sums, self._last_sums = self._last_sums, self._sums
-        clear_buffer(self._gpu, self._sums)
+        clear_buffers(self._gpu, (self._sums, self._sums.size), (self._tile_beams, self._tile_beams.size))
         grid = self._grid
         if self._reuse is not None:
             self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
@@ -188,7 +188,6 @@ class Caustics:
         """Adds the wide beams, in each tile of the reduced grid those that may reach what it samples."""
         assert self._places is not None
         most, (across, down) = self._places.height * BEAMS_A_ROW, self._tiles
-        clear_buffer(self._gpu, self._tile_beams)
         own: Bindings = {
             "tiles": self._tiles,
             "beam_words": most // WORD_BITS,

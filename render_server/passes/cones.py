@@ -70,7 +70,8 @@ class LowResGrid:
 class ConeFields:
     """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone).
 
-    With `remembers`, the irradiance of the last frame too.
+    With `remembers`, the irradiance of the last frame too. `kept_virtual` is that at objects as far as the last frame
+    knows it (a: 1), and 0 elsewhere; None: nothing is kept there.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], *, remembers: bool = False) -> None:
@@ -80,15 +81,26 @@ class ConeFields:
         self.specular_rho = texture_2d(gpu, size, 4, "f2")
         self.virtual = texture_2d(gpu, size, 4, "f2")
         self.virtual_specular = texture_2d(gpu, size, 4, "f2")
+        self.kept_virtual: moderngl.Texture | None = None
         self.last: tuple[moderngl.Texture, ...] = ()
         if remembers:
             self.last = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(3))
+
+    def keep_virtual(self, gpu: GpuContext) -> None:
+        """Lets the irradiance at objects that the last frame knows be kept."""
+        self.kept_virtual = texture_2d(gpu, self.virtual.size, 4, "f2")
 
     def remember(self) -> dict[str, Binding]:
         """Makes the irradiance the last frame's, and returns its bindings."""
         now = self.mu, self.rho, self.virtual
         (self.mu, self.rho, self.virtual), self.last = self.last, now
-        return {"last_cone_mu": now[0], "last_cone_rho": now[1], "last_irradiance": now[2]}
+        return {
+            "last_cone_mu": now[0],
+            "last_cone_rho": now[1],
+            "last_irradiance": now[2],
+            "kept_irradiance": self.kept_virtual,
+            "REUSES_IRRADIANCE": self.kept_virtual is not None,
+        }
 
     def release(self) -> None:
         """Frees the textures."""
@@ -100,7 +112,7 @@ class ConeFields:
             self.virtual,
             self.virtual_specular,
         )
-        release_all(*of_frame, *self.last)
+        release_all(*of_frame, *self.last, self.kept_virtual)
 
 
 def reuse_define(reuses: bool) -> dict[str, int]:
@@ -165,16 +177,15 @@ class TraceRealCones:
 class TraceVirtualCones:
     """Traces the cones of the exact operator at virtual surfaces, through rho; `size` and `defines` as at real ones.
 
-    With `reuses`, only where the last frame saw other surfaces.
+    With `reuses`, only where the light that `fields` keep of the last frame does not serve.
     """
 
     def __init__(
         self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
     ) -> None:
-        self._gpu = gpu
+        self._gpu, self._reuses = gpu, reuses
         self._irradiance = texture_2d(gpu, size, 4, "f2")
         self._target = gpu.ctx.framebuffer([self._irradiance])
-        self._reuse = Kernel(gpu, "reuse_light") if reuses else None
         self._trace = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
         self._filter = Kernel(gpu, "bilateral_cone_filter", **reuse_define(reuses))
 
@@ -182,29 +193,33 @@ class TraceVirtualCones:
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
         """Traces E_rho, filters it, and traces the specular cone."""
-        self._target.use()
-        self._target.clear()
-        listed: Bindings = {**grid.bindings, "Texels": grid.virtual_texels}
-        if self._reuse is not None:
-            self._reuse.run(grid.size, listed, scene, irradiance=self._irradiance)
+        traced = self._begin(fields)
         self._trace.run(
             (list_threads(self._gpu, grid.texel_count),),
-            listed,
+            grid.bindings,
             scene,
-            irradiance_rho=self._irradiance,
+            Texels=grid.virtual_texels,
+            irradiance_rho=traced,
             specular_rho=fields.virtual_specular,
             mipmap_mu=mu.texture,
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
-        self._filter.run(
-            grid.size, grid.bindings, scene, traced_rho=self._irradiance, irradiance_rho=fields.virtual
-        )
+        self._filter.run(grid.size, grid.bindings, scene, traced_rho=traced, irradiance_rho=fields.virtual)
+
+    def _begin(self, fields: ConeFields) -> moderngl.Texture:
+        """Returns the texture to trace into, which holds what is kept of the last frame and 0 elsewhere."""
+        if self._reuses:
+            assert fields.kept_virtual is not None
+            return fields.kept_virtual
+        self._target.use()
+        self._target.clear()
+        return self._irradiance
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self._target)
-        release_all(self._irradiance, self._reuse, self._trace, self._filter)
+        release_all(self._irradiance, self._trace, self._filter)
 
 
 class TraceConesPaper:

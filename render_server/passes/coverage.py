@@ -5,13 +5,13 @@ from collections.abc import Sequence
 
 import moderngl
 
-from deltalight.render_server.gpu.clearing import clear_buffer
+from deltalight.render_server.gpu.clearing import clear_buffers
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import (
+    GROUPS_BYTES,
     LIST_HEADER_BYTES,
     MOST_WALKERS,
-    ListGroups,
     list_threads,
 )
 from deltalight.render_server.gpu.picture_kernel import PictureKernel
@@ -52,6 +52,7 @@ class EdgeTriangles:
         self._least_nodes = NODES_PER_TILE * counts[0]
         self.tiles = gpu.ctx.buffer(reserve=TILE_BYTES * sum(counts))
         self.nodes = gpu.ctx.buffer(reserve=NODES_HEADER_BYTES)
+        self.groups = gpu.ctx.buffer(reserve=GROUPS_BYTES)
         self._thin = Kernel(gpu, "edge_triangles", FIND_THIN=1)
         self._listed = Kernel(gpu, "edge_triangles")
 
@@ -65,29 +66,33 @@ class EdgeTriangles:
         """The tiles and their lists."""
         return {**self.bindings, "EdgeNodes": self.nodes}
 
-    def clear(self) -> None:
-        """Marks no tile, and empties all lists."""
-        clear_buffer(self._gpu, self.tiles)
-        self._gpu.clear_start(self.nodes, NODES_HEADER_BYTES)
+    def clear(self, pixels: moderngl.Buffer) -> None:
+        """Marks no tile, and empties all lists, that of `pixels` too."""
+        starts = (self.tiles, self.tiles.size), (self.nodes, NODES_HEADER_BYTES), (pixels, LIST_HEADER_BYTES)
+        clear_buffers(self._gpu, *starts)
 
     def find_thin(self, mesh: MeshBuffers, view: CameraView, raster: GeometryBuffer, scene: Bindings) -> None:
         """Marks the tiles with triangles of `mesh` that may lie between the samples that `raster` has."""
         self._run(self._thin, mesh, view, scene, {**self.bindings, **raster.bindings})
 
-    def list_triangles(self, mesh: MeshBuffers, view: CameraView, scene: Bindings) -> None:
-        """Lists the triangles of `mesh` that may show in tiles that are marked."""
+    def list_triangles(
+        self, mesh: MeshBuffers, view: CameraView, pixels: moderngl.Buffer, scene: Bindings
+    ) -> None:
+        """Lists the triangles of `mesh` that may show in tiles that are marked.
+
+        `groups` then are the workgroups of edge_samples that walk the list `pixels`, EDGE_GROUP of them each.
+        """
         nodes = self._least_nodes + NODES_PER_TRIANGLE * mesh.triangle_count
         size = NODES_HEADER_BYTES + NODE_BYTES * nodes
         if self.nodes.size < size:
             self.nodes.orphan(size)
             self._gpu.clear_start(self.nodes, NODES_HEADER_BYTES)
-        self._run(self._listed, mesh, view, scene, self.lists)
+        own: Bindings = {**self.lists, "Texels": pixels, "Groups": self.groups, "per_group": EDGE_GROUP}
+        self._run(self._listed, mesh, view, scene, own)
 
     def _run(
         self, kernel: Kernel, mesh: MeshBuffers, view: CameraView, scene: Bindings, own: Bindings
     ) -> None:
-        if not mesh.triangle_count:
-            return
         kernel.run(
             (min(mesh.triangle_count, MOST_WALKERS),),
             scene,
@@ -99,7 +104,7 @@ class EdgeTriangles:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.tiles, self.nodes, self._thin, self._listed)
+        release_all(self.tiles, self.nodes, self.groups, self._thin, self._listed)
 
 
 class SampleCoverage:
@@ -119,7 +124,7 @@ class SampleCoverage:
         self._filled: Rectangle = (0, 0, *size)  # what may hold anything
         self.pixels = gpu.ctx.buffer(reserve=LIST_HEADER_BYTES + 4 * math.prod(size))
         self.triangles = EdgeTriangles(gpu, raster)
-        self._first, self._groups = PictureKernel(gpu, "sample_coverage"), ListGroups(gpu, EDGE_GROUP)
+        self._first = PictureKernel(gpu, "sample_coverage")
         self._further = Kernel(
             gpu, "edge_samples", SAMPLES=len(PATTERN), OFFSETS_PX=_as_glsl(PATTERN), NEAR=NEAR_M
         )
@@ -143,12 +148,12 @@ class SampleCoverage:
         offset = (x / STEPS, y / STEPS)
         touched = union(self._filled, in_picture)  # what was filled before is emptied
         self._filled = in_picture
-        self._gpu.clear_start(self.pixels, LIST_HEADER_BYTES)
-        self.triangles.clear()
+        self.triangles.clear(self.pixels)
         geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster)
         if scene["PACKS_EXTENDED"]:
             self.surface.with_extended()
-        self.triangles.find_thin(mesh, view, raster, scene)
+        if mesh.triangle_count:
+            self.triangles.find_thin(mesh, view, raster, scene)
         self._first.run(
             touched,
             raster.bindings,
@@ -160,10 +165,19 @@ class SampleCoverage:
             offset=offset,
             weight=1.0 / len(PATTERN),
         )
-        self.triangles.list_triangles(mesh, view, scene)
-        groups = self._groups.count(self.pixels)
+        if mesh.triangle_count:
+            self._add_samples(mesh, view, scene)
+
+    def _add_samples(self, mesh: MeshBuffers, view: CameraView, scene: Bindings) -> None:
+        """Adds the further samples of the pixels that are listed."""
+        self.triangles.list_triangles(mesh, view, self.pixels, scene)
         self._further.run_counted(
-            groups, scene, mesh.solid, self._written, self.triangles.lists, mesh_corners=mesh.corners
+            self.triangles.groups,
+            scene,
+            mesh.solid,
+            self._written,
+            self.triangles.lists,
+            mesh_corners=mesh.corners,
         )
 
     @property
@@ -182,7 +196,7 @@ class SampleCoverage:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.surface, self.texture, self.second_surface, self.pixels, self.triangles)
-        release_all(self._first, self._further, self._groups)
+        release_all(self._first, self._further)
 
 
 def _as_glsl(pattern: Sequence[tuple[int, int]]) -> str:

@@ -9,7 +9,7 @@ from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
-from deltalight.render_server.scene.depth_surface import jump_terms, window_radius
+from deltalight.render_server.scene.depth_surface import MAX_RADIUS, jump_terms, window_radius
 
 
 def upload_depth(texture: moderngl.Texture, depth: DepthImage) -> None:
@@ -27,8 +27,7 @@ class DepthFit:
         self._row_moments = texture_2d(gpu, size, 4, "f4")
         self._row_depth = texture_2d(gpu, size, 2, "f4")
         self._fits = texture_2d(gpu, size, 4, "f4")
-        self._invert = Kernel(gpu, "depth_inverse")
-        self._sum_rows = Kernel(gpu, "depth_rows")
+        self._sum_rows = Kernel(gpu, "depth_rows", MAX_RADIUS=MAX_RADIUS)
         self._fit = Kernel(gpu, "depth_columns")
 
     def take(self, depth: DepthImage, camera: CameraModel) -> dict[str, Binding]:
@@ -43,10 +42,13 @@ class DepthFit:
             "window_radius": window_radius(depth, camera),
             "window_fits": self._fits,
         }
-        jumps = {"jump_threshold": jump_terms(depth, camera)}
-        self._invert.run(self._size, jumps, depth_map=self._depth, inverse_out=self._inverse)
         self._sum_rows.run(
-            self._size, found, jumps, row_moments_out=self._row_moments, row_depth_out=self._row_depth
+            self._size,
+            found,
+            jump_threshold=jump_terms(depth, camera),
+            inverse_out=self._inverse,
+            row_moments_out=self._row_moments,
+            row_depth_out=self._row_depth,
         )
         self._fit.run(
             self._size,
@@ -60,4 +62,4 @@ class DepthFit:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self._depth, self._inverse, self._row_moments, self._row_depth, self._fits)
-        release_all(self._invert, self._sum_rows, self._fit)
+        release_all(self._sum_rows, self._fit)

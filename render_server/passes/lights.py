@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import is_
 
 import moderngl
 import numpy as np
@@ -19,10 +18,10 @@ from deltalight.render_server.lights.mirror_lights import MirrorLight
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.passes.shadow_maps import (
     NEAREST_M,
+    FittedViews,
     LightView,
     ShadowMapAtlas,
     frame_along,
-    light_views,
     mirror_views,
     pack_view,
     texel_size_m,
@@ -72,8 +71,7 @@ class LightBuffers:
         self.real_views: list[LightView] = []
         self.virtual_views: list[LightView] = []
         self.views_of_lights: list[tuple[range, range]] = []
-        # Points and lights, and the views of these points that were last fitted.
-        self._object_views: tuple[tuple[object, ...], list[list[LightView]]] | None = None
+        self._views_around_objects, self._views_of_objects = FittedViews(), FittedViews()
         # Records of the views as shaders read them: they change when these do.
         self.real_records = self.virtual_records = b""
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
@@ -140,8 +138,8 @@ class LightBuffers:
         self._make_mirror_maps()
         shown = np.concatenate([receivers, virtual_points])
         axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
-        real = [light_views(light, receivers, real_points) if len(receivers) else [] for light in lights]
-        virtual = self._views_of_objects(lights, virtual_points)
+        real = self._views_around_objects.of(lights, receivers, real_points)
+        virtual = self._views_of_objects.of(lights, virtual_points, virtual_points)
         for mirror in mirrors:
             real.append(mirror_views(mirror, receivers, real_points, mirror.tolerance_m))
             virtual.append(mirror_views(mirror, virtual_points, virtual_points))
@@ -152,16 +150,6 @@ class LightBuffers:
         self.virtual_atlas = self._atlas_for(self.virtual_atlas, len(self.virtual_views))
         self._write_records(real, virtual, axes)
         self._write_block()
-
-    def _views_of_objects(
-        self, lights: list[Light], points: Float64[np.ndarray, "m 3"]
-    ) -> list[list[LightView]]:
-        """Returns each light's views of the objects: the same while these and the lights are."""
-        lit, known = (points, *lights), self._object_views
-        if known is None or len(known[0]) != len(lit) or not all(map(is_, known[0], lit)):
-            views = [light_views(light, points, points) if len(points) else [] for light in lights]
-            known = self._object_views = lit, views
-        return list(known[1])
 
     def _make_mirror_maps(self) -> None:
         old, count = self.mirror_visibility, len(self.mirrors)

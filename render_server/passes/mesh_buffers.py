@@ -56,6 +56,9 @@ class MeshBuffers:
         self._sides = gpu.ctx.buffer(reserve=4)
         self._placement: moderngl.Buffer | None = None
         self._corners: moderngl.Texture | None = None
+        self._corner_texels = np.zeros(
+            (0, 3, 4), np.float32
+        )  # kept, for new memory takes longer than its contents
         self._shows_corners = False  # those of the triangles that were written last
         self._written: GpuMesh | None = None  # if not by a kernel
         self._arrays: dict[int, moderngl.VertexArray] = {}
@@ -84,9 +87,11 @@ class MeshBuffers:
         assert self._written is not None
         if self._corners is None or not self._shows_corners:
             rows = max(-(-len(self.triangles) // CORNERS_ROW), 1)
-            texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
-            texels[: len(self.triangles), :, :3] = self._written.corners
-            self._corners = rewritten(self._gpu, self._corners, (3 * CORNERS_ROW, rows), "f4", texels)
+            if len(self._corner_texels) != rows * CORNERS_ROW:
+                self._corner_texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
+            self._corner_texels[: len(self.triangles), :, :3] = self._written.corners
+            size = 3 * CORNERS_ROW, rows
+            self._corners = rewritten(self._gpu, self._corners, size, "f4", self._corner_texels)
             self._shows_corners = True
         return self._corners
 

@@ -18,13 +18,15 @@ from deltalight.render_server.scene.depth_surface import DepthSurface
 class RealSurface:
     """World position + depth (RGBA32F; w = 0 unknown) and normal + surface entry (RGBA16F) on the picture's grid.
 
+    Positions are filled into two textures in turn, so that what was there before can be looked up without a copy.
     `fits_depth`: the GPU fits normals to depth; default: if it is one, because Mesa's software renderer takes longer
     for it than numpy.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], *, fits_depth: bool | None = None) -> None:
         self.size = size
-        self.position = texture_2d(gpu, size, 4, "f4")
+        self.position, self._last_position = (texture_2d(gpu, size, 4, "f4") for _ in range(2))
+        self._fillings = 0
         self.normal = texture_2d(gpu, size, 4, "f2")
         self._gpu = gpu
         self._fits_depth = not gpu.is_software if fits_depth is None else fits_depth
@@ -41,8 +43,12 @@ class RealSurface:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Its textures by GLSL name."""
-        return {"real_surface_position": self.position, "real_surface_normal": self.normal}
+        """Its textures by GLSL name; `real_surface_fillings`: how often it was filled, for LightHistory."""
+        return {
+            "real_surface_position": self.position,
+            "real_surface_normal": self.normal,
+            "real_surface_fillings": self._fillings,
+        }
 
     def from_depth(
         self,
@@ -60,6 +66,7 @@ class RealSurface:
             found = self._fitted_by_cpu(depth, fitted)
         else:
             found = self._fitted_by_gpu(depth) if on_gpu is None else on_gpu
+        self._begin()
         self._from_depth.run((0, 0, *self.size), scene, found, **self._images())
 
     def _fitted_by_gpu(self, depth: DepthImage) -> dict[str, Binding]:
@@ -84,6 +91,8 @@ class RealSurface:
         surface differs by more (something moved), and takes the surface, the mean of many frames, where it agrees.
         None: every pixel takes the surface.
         """
+        if tolerance is None:
+            self._begin()
         self._from_model.run(
             self.size,
             scene,
@@ -94,10 +103,15 @@ class RealSurface:
             **self._images(),
         )
 
+    def _begin(self) -> None:
+        """Begins to fill it: the positions stay in the other texture until the next time."""
+        self.position, self._last_position = self._last_position, self.position
+        self._fillings += 1
+
     def _images(self) -> dict[str, Binding]:
         return {"position_out": self.position, "normal_out": self.normal}
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.position, self.normal, self._depth, *self._slopes, self._fit)
+        release_all(self.position, self._last_position, self.normal, self._depth, *self._slopes, self._fit)
         release_all(self._from_depth, self._from_model)

@@ -145,9 +145,7 @@ class LightHistory:
         self._reached = gpu.ctx.buffer(reserve=4)
         size = grid.picture_size
         self._last_light = LightPair(gpu, size)
-        self._positions = [texture_2d(gpu, size, 4, "f4") for _ in range(2)]
-        self._kept = [gpu.ctx.framebuffer([each]) for each in self._positions]
-        self._seen_positions: moderngl.Framebuffer | None = None
+        self._positions: tuple[Binding, int] = None, 0  # of the last frame, and how often they were filled
         self._real_texels, self._object_texels = (
             [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)] for _ in range(2)
         )
@@ -164,13 +162,14 @@ class LightHistory:
         the rest.
         """
         (last, matrix), self._seen = self._seen, (light, view.camera_from_world)
+        positions = self._last_positions(scene)
+        if positions is None:
+            last = None
         knows_direct, knows_bounced, knows_unblocked = False, False, False
         if last is not None and light is not None:
             knows_direct, knows_bounced = last.direct is light.direct, last.bounced is light.bounced
             knows_unblocked = last.unblocked is light.unblocked
         self._turn = (self._turn + 1) % self._turns
-        self._positions.reverse()
-        self._kept.reverse()
         self._real_texels.reverse()
         self._object_texels.reverse()
         direct = self._direct
@@ -179,7 +178,7 @@ class LightHistory:
             "has_history": knows_bounced,
             "keeps_unblocked": knows_unblocked and not knows_direct,
             "last_camera_from_world": matrix,
-            "last_position": self._positions[1],
+            "last_position": positions,
             "last_real_texels": self._real_texels[1],
             "last_object_texels": self._object_texels[1],
             "stale_texels": self._stale,
@@ -194,7 +193,6 @@ class LightHistory:
         grid, direct = self._grid, self._direct
         shared: Bindings = {**found, **grid.bindings}
         direct.select(grid, self._reached, scene)
-        self._keep(scene["real_surface_position"])
         grid.empty_list(direct.texels)
         grid.empty_list(direct.spared)
         self._reproject.run(
@@ -220,20 +218,17 @@ class LightHistory:
             object_texels_out=self._object_texels[0],
         )
 
-    def _keep(self, positions: Binding) -> None:
-        """Copies the positions that the next frame looks up."""
-        if self._seen_positions is None or self._seen_positions.color_attachments[0] is not positions:
-            release_all(self._seen_positions)
-            self._seen_positions = self._gpu.ctx.framebuffer([positions])
-        self._gpu.ctx.copy_framebuffer(self._kept[0], self._seen_positions)
+    def _last_positions(self, scene: Bindings) -> Binding:
+        """Returns the positions that the last frame saw; None if they were overwritten, which takes two fillings."""
+        (positions, then), now = self._positions, scene["real_surface_fillings"]
+        assert isinstance(now, int)
+        self._positions = scene["real_surface_position"], now
+        return positions if now - then <= 1 else None
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(
             self._last_light,
-            *self._positions,
-            *self._kept,
-            self._seen_positions,
             *self._real_texels,
             *self._object_texels,
             self._reached,

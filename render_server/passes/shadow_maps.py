@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import is_
 
 import moderngl
 import numpy as np
@@ -150,6 +151,29 @@ def light_views(
     # The lamp's own housing and the wall behind it are left out.
     front = light.front - np.array([0.0, 0.0, 0.0, NEAREST_M])
     return _before(front, receivers, occluders, partial(_lamp_views, light))
+
+
+class FittedViews:
+    """Each light's views (`light_views`), kept while lights and points are the very same objects."""
+
+    def __init__(self) -> None:
+        self._fitted: Sequence[object] = ()
+        self._views: list[list[LightView]] = []
+
+    def of(
+        self,
+        lights: Sequence[Light],
+        receivers: Float64[np.ndarray, "n 3"],
+        occluders: Float64[np.ndarray, "m 3"],
+    ) -> list[list[LightView]]:
+        """Returns the views of each light; none if there are no receivers."""
+        wanted = receivers, occluders, *lights
+        if len(self._fitted) != len(wanted) or not all(map(is_, self._fitted, wanted)):
+            self._fitted = wanted
+            self._views = [
+                light_views(each, receivers, occluders) if len(receivers) else [] for each in lights
+            ]
+        return list(self._views)
 
 
 def mirror_views(

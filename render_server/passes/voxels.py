@@ -28,7 +28,6 @@ LEAST_SURFELS = 1024
 LARGEST_ITEM_BYTES = (
     96  # of what is kept a surfel or slot: SUMS_PER_SLOT, SURFEL_LIGHT_BYTES (voxel_light.py)
 )
-FUSED_LEVELS = 4  # of filter_voxels: a tile of 8 cells an edge, then 4, 2 and 1
 LOWER_VOLUME, LOWER_SURFELS = "method.volume_size", "method.volume_size or method.triangle_budget"
 
 
@@ -298,15 +297,15 @@ class ResolveVoxels:
 
 
 class FilterVoxels:
-    """Filters the levels of an anisotropic mipmap, several in a dispatch on a GPU (docs/method.md 4.4).
+    """Filters the levels of an anisotropic mipmap, all in one dispatch on a GPU (docs/method.md 4.4).
 
     In software each is a dispatch: workgroups that wait for their own stores take 3.5 times as long there. Level 1 is
     filtered around the touched voxels alone (ClearVoxels empties what they leave).
     """
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._at_once = 1 if gpu.is_software else FUSED_LEVELS
-        self._kernel = Kernel(gpu, "filter_voxels", **({} if gpu.is_software else {"FUSED": 1}))
+        self._gpu, self._is_fused = gpu, not gpu.is_software
+        self._kernel = Kernel(gpu, "filter_voxels", **({"FUSED": 1} if self._is_fused else {}))
         self._threads = list_threads(gpu)
         self._listed = Kernel(gpu, "filter_voxels", LISTED=1) if gpu.is_software else None
 
@@ -315,23 +314,23 @@ class FilterVoxels:
 
         `stores`: all whose voxels level 0 holds; without any, every cell may hold something.
         """
-        done = self._filter_listed(mipmap, volume, stores)
-        levels = volume.placement.levels
-        slabs = DIRECTIONS * len(volume.placements)
-        for first in range(1 + done, levels, self._at_once):
-            cells = volume.placement.size >> first
-            several: Bindings = {}
-            if self._at_once > 1:
-                tile = self._kernel.local_size[0]
-                cells = math.ceil(cells / tile) * tile  # whole tiles
-                several = {"level_count": min(self._at_once, levels - first), "Occupied": mipmap.occupied}
-            self._kernel.run(
-                (cells, cells, cells * slabs),
-                volume.bindings,
-                several,
-                mipmap=mipmap.texture,
-                first_level=first,
-            )
+        first, levels = 1 + self._filter_listed(mipmap, volume, stores), volume.placement.levels
+        for level in (first,) if self._is_fused else range(first, levels):
+            self._filter(mipmap, volume, level, {"level_count": levels - level})
+
+    def _filter(self, mipmap: VoxelMipmap, volume: PlacedVolume, level: int, counted: Bindings) -> None:
+        """Filters from a level on, one or all of the levels that are `counted`."""
+        tile = self._kernel.local_size[0] if self._is_fused else 1
+        cells = math.ceil((volume.placement.size >> level) / tile) * tile  # whole tiles
+        fused: Bindings = {"Occupied": mipmap.occupied, "TilesDone": self._gpu.group_counters}
+        self._kernel.run(
+            (cells, cells, cells * DIRECTIONS * len(volume.placements)),
+            volume.bindings,
+            counted,
+            fused,
+            mipmap=mipmap.texture,
+            first_level=level,
+        )
 
     def _filter_listed(self, mipmap: VoxelMipmap, volume: PlacedVolume, stores: Sequence[VoxelStore]) -> int:
         """Filters the levels where walking the voxels' list is faster; returns how many."""

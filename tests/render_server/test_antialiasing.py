@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import moderngl
 import numpy as np
 import pytest
 import trimesh
@@ -11,6 +12,7 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES
 from deltalight.render_server.passes import coverage
 from deltalight.render_server.passes.coverage import PATTERN, STEPS, EdgeTriangles
 from deltalight.render_server.renderer import SceneRenderer
@@ -205,8 +207,9 @@ def knotted(detail: int) -> trimesh.Trimesh:
     )
 
 
-def everywhere(triangles: EdgeTriangles) -> None:
+def everywhere(triangles: EdgeTriangles, pixels: moderngl.Buffer) -> None:
     """Marks all tiles, so that every sample of every pixel is found."""
+    pixels.write(bytes(LIST_HEADER_BYTES), offset=0)
     triangles.tiles.write(b"\3\0\0\0\0\0\0\0" * (triangles.tiles.size // 8))
     triangles.nodes.write(b"\0" * 8)
 

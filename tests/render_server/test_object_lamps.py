@@ -15,6 +15,7 @@ from deltalight.render_server.scene.mesh_loading import load_asset
 from tests.render_server.gltf_samples import HALF, Plate
 from tests.render_server.lpv_scenes import dlpv, graph_of, injected_flux
 from tests.render_server.scenes import GREY, Fields, Stage, ambient, fields_of, floor, frame, sphere_light
+from tests.render_server.test_aroof import aroof
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 METHODS: dict[str, dict[str, Any]] = {
@@ -50,6 +51,8 @@ class Lit:
         lights = [ambient(SKY), *method.pop("lights", ())]
         if method.get("name") == "dlpv":
             document = dlpv(stage.document(objects, lights, floor()), **method)
+        elif method.get("name") == "aroof":
+            document = aroof(stage.document(objects, lights, floor()))
         else:
             document = stage.document(objects, lights, floor(), **method)
         renderer = SceneRenderer(gpu, document, with_linear=True)
@@ -92,6 +95,27 @@ def test_a_point_lights_the_real_floor_of_the_picture(gpu: GpuContext, tmp_path:
     assert before == pytest.approx(np.pi * SKY, rel=0.05)
     assert added == pytest.approx(ALBEDO * SKY * expected / before, rel=0.015, abs=3e-3)
     assert not lit.notices
+
+
+def test_the_volume_of_the_papers_dlpv_holds_a_lamps_direct_light(gpu: GpuContext, tmp_path: Path) -> None:
+    """Where the volume is, the floor gains what the lamp sends."""
+    above = {"translation": np.add(LAMP, (0, 0, 0.03)).tolist()}  # the volume is the plate's
+    model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, above)
+    lit = Lit(gpu, Stage(tmp_path), [model], name="dlpv", operator="paper")
+    at = lit.around(0.15)
+    expected = irradiance_by(lit.fields.position[at], POINT["intensity"])[0][:, None] * COLOR
+    assert lit.linear[at] - ALBEDO * SKY == pytest.approx(ALBEDO / np.pi * expected, rel=0.01)
+
+
+def test_aroof_adds_a_lamps_direct_light(
+    gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path))
+    model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, HOLDER)
+    lit = Lit(gpu, Stage(tmp_path), [model], name="aroof")
+    at = lit.around()
+    expected = irradiance_by(lit.fields.position[at], POINT["intensity"])[0][:, None] * COLOR
+    assert lit.linear[at] - ALBEDO * SKY == pytest.approx(ALBEDO / np.pi * expected, rel=0.015)
 
 
 def drawn_lamp(gpu: GpuContext, folder: Path, light: dict[str, Any], **node: Any) -> tuple[np.ndarray, ...]:  # noqa: ANN401

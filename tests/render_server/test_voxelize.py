@@ -1,5 +1,6 @@
 """Voxelisation is exact: no area is lost or made, and a closed mesh gives a closed shell (docs/method.md 4.2)."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -272,11 +273,15 @@ def test_levels_filtered_together_are_those_of_one_after_the_other(
             level_zero.astype(np.float16).tobytes(), viewport=(0, 0, 0, *level_zero.shape[2::-1])
         )
         filtering = FilterVoxels(each)
-        filtering.run(mipmap, volume)
-        found.append(mipmap.texture.read())
+        for _ in range(2):  # the second time, counts of tiles that are done begin anew
+            width, height, depth = mipmap.texture.size
+            above = (0, 0, DIRECTIONS * size, width, height, depth - DIRECTIONS * size)
+            mipmap.texture.write(b"\x3c" * (8 * math.prod(above[3:])), viewport=above)
+            filtering.run(mipmap, volume)
+            found.append(mipmap.texture.read())
         clear_volume(gpu, mipmap.texture)
         filtering.release()
-    assert found[0] == found[1]
+    assert len(set(found)) == 1
     release_all(mipmap, volume)
 
 

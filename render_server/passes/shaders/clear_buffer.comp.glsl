@@ -1,9 +1,17 @@
-// Sets the first words of a buffer to zero. Neighbouring invocations store neighbouring words, which a GPU joins; buffers
-// need not end on a multiple of 16 bytes, as vectors would.
+// Sets the first words of up to four buffers to zero. Neighbouring invocations store neighbouring words, which a GPU joins;
+// buffers need not end on a multiple of 16 bytes, as vectors would.
 layout(local_size_x = 256) in;
 layout(std430) writeonly buffer Cleared { uint cleared[]; };
-uniform uint word_count;
+layout(std430) writeonly buffer Cleared1 { uint cleared_1[]; };
+layout(std430) writeonly buffer Cleared2 { uint cleared_2[]; };
+layout(std430) writeonly buffer Cleared3 { uint cleared_3[]; };
+uniform ivec4 word_counts;
 
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < word_count; i += gl_NumWorkGroups.x * 256u) cleared[i] = 0u;
+    uint first = gl_GlobalInvocationID.x, apart = gl_NumWorkGroups.x * 256u;
+    uvec4 counts = uvec4(word_counts);
+    for (uint i = first; i < counts.x; i += apart) cleared[i] = 0u;
+    for (uint i = first; i < counts.y; i += apart) cleared_1[i] = 0u;
+    for (uint i = first; i < counts.z; i += apart) cleared_2[i] = 0u;
+    for (uint i = first; i < counts.w; i += apart) cleared_3[i] = 0u;
 }

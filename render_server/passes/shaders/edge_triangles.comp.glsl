@@ -1,6 +1,7 @@
 // Triangles of the objects at the edges that the picture has of them. FIND_THIN: marks the tiles of the raster in which a triangle may
 // show that no texel's centre there shows, because it is thinner than a texel. Otherwise: lists the triangles that may show in a marked
-// tile; a large one in the lists of larger tiles, marked or not.
+// tile; a large one in the lists of larger tiles, marked or not; and counts the workgroups of edge_samples.comp.glsl, whose list is
+// complete by now.
 #include "common/plane.glsl"
 #include "common/raster_tiles.glsl"
 #include "common/walk.glsl"
@@ -114,6 +115,7 @@ void main() {
     if (i < triangle_count) do find_thin(corners_of(i)); while ((i += items_apart()) < triangle_count);
 }
 #else
+#include "common/counted_groups.glsl"
 layout(std430) buffer EdgeNodes { uint node_count; uint unused; uvec2 nodes[]; };   // triangle, next node + 1
 
 const float MARGIN = 0.02;   // texels, for rounding
@@ -148,6 +150,7 @@ void list(uint triangle) {
 }
 
 void main() {
+    if (gl_GlobalInvocationID.x == 0u) count_groups();
     uint i = first_item();
     if (i < triangle_count) do list(i); while ((i += items_apart()) < triangle_count);
 }
