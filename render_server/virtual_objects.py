@@ -18,6 +18,7 @@ from deltalight.render_server.lights.lights import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip
+from deltalight.render_server.scene.gltf_lamps import MOST_LAMPS
 from deltalight.render_server.scene.gltf_meshes import GltfAsset
 from deltalight.render_server.scene.gltf_posing import Pose
 from deltalight.render_server.scene.material_file import read_material
@@ -95,13 +96,15 @@ class VirtualObjects:
         self._board: BoardSpec | None = None
         self._moving: dict[str, AnimatedObject] = {}
         self._standing: dict[str, list[TriangleMesh]] = {}
+        self._resting_lamps: dict[str, tuple[SceneObject, BoardSpec | None, list[Light]]] = {}
         self.state: GeometryState | None = None
 
     def load(self, objects: Sequence[SceneObject]) -> None:
         """Loads the assets of all visible objects, so that a bad file is reported before the first frame.
 
         Raises:
-            DeltalightError: an asset or a precomputed material cannot be read, or an asset lacks the requested clip.
+            DeltalightError: an asset or a precomputed material cannot be read, an asset lacks the requested clip, or
+                there are too many lamps.
         """
         for item in objects:
             if item.visible:
@@ -111,6 +114,15 @@ class VirtualObjects:
                 if moving is not None:
                     _ = moving.bounds
                 self._check_material(item)
+        self._check_lamps(objects)
+
+    def _check_lamps(self, objects: Sequence[SceneObject]) -> None:
+        lit = (item for item in objects if item.visible and item.lamps)
+        count = sum(len(self._assets[item.asset].lamps(np.eye(4))) for item in lit)
+        if count > MOST_LAMPS:
+            raise DeltalightError(
+                f"the objects bring {count} lamps, more than {MOST_LAMPS}; switch some off with `lamps: 0`."
+            )
 
     def _check_material(self, item: SceneObject) -> None:
         material = self._given_material(item)
@@ -146,6 +158,8 @@ class VirtualObjects:
             animated = {item.id: self._animated(item) for item in shown}
             self._moving = {name: moving for name, moving in animated.items() if moving is not None}
             self._standing = {}
+            names = {item.id for item in shown}
+            self._resting_lamps = {name: kept for name, kept in self._resting_lamps.items() if name in names}
             self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
         moved = [moving.advance_to(capture_ns) for moving in self._moving.values()]
         if is_new or any(moved):
@@ -202,13 +216,16 @@ class VirtualObjects:
 
     def _lamps(self, item: SceneObject) -> list[Light]:
         """Returns the lights that come with an object, as bright as the document wants them; none if they are off."""
-        if not item.lamps:
-            return []
         moving = self._moving.get(item.id)
+        kept = self._resting_lamps.get(item.id)
+        if moving is None and kept is not None and kept[:2] == (item, self._board):
+            return kept[2]
         world_from_asset = world_from_frame(item, self._board) @ item.world_from_object()
         shining = (self._assets[item.asset] if moving is None else moving).lamps(world_from_asset)
         factor = np.full(3, item.lamps, np.float32)
-        return [lamp if item.lamps == 1 else lamp.scaled(factor) for lamp in shining]
+        lamps = [lamp.scaled(factor) for lamp in shining] if item.lamps else []
+        self._resting_lamps[item.id] = item, self._board, lamps
+        return lamps
 
     def _given_material(self, item: SceneObject) -> Material | None:
         """Returns the document's material, if it gives one; the same object for the same document."""

@@ -30,6 +30,7 @@ EDGE_NOISES = 4.0  # how many times the median change from pixel to pixel makes 
 LEAST_EDGE = 0.02  # relative change from pixel to pixel, below which there is none
 DARK = 0.05  # of sensor white: below, changes count absolutely, because noise does not become less
 LEAST_AREA_PX, LEAST_KNOWN_PX = 200, 100
+MOST_AREAS = 16  # of a plane, the largest; tiles and bricks have many more
 LEAST_SPREAD = 0.02  # of sensor white: what depth errors and reflections out of sight leave uncertain
 CONTRADICTION = 3.0  # how many times as much as the picture the reflection varies; at most 1.2 in mirrors
 LEAST_FILL = 0.7  # of its rectangle: other shapes are no sheets
@@ -110,9 +111,9 @@ def find_sheets(seen: PosedFrame, plane: MirrorPlane, declared: SurfaceTable) ->
     if reflection is None:
         return []
     bare = reflection.on_plane & ~np.any([_inside(seen, each) for each in declared.sheets], axis=0)
-    found = []
-    for area in _even_areas(reflection.picture, bare):
-        if _contradicts(reflection, area):
+    found, smooth = [], cv2.GaussianBlur(reflection.picture, (0, 0), 1.0)
+    for area in _even_areas(smooth, bare):
+        if _contradicts(reflection, smooth, area):
             sheet = _sheet(seen, plane, reflection, area)
             found += [] if sheet is None else [sheet]
     return sorted(found, key=_area_m2, reverse=True)
@@ -123,32 +124,30 @@ def _reduced(seen: PosedFrame) -> PosedFrame:
     return seen.at((WIDTH_PX, max(round(height * WIDTH_PX / width), 1))) if width > WIDTH_PX else seen
 
 
-def _even_areas(picture: Float32[np.ndarray, "h w 3"], bare: Mask) -> Iterator[Mask]:
-    """Yields the areas of a bare plane that sharp edges of the picture enclose."""
-    log = np.log(cv2.GaussianBlur(picture, (0, 0), 1.0) + DARK)
+def _even_areas(smooth: Float32[np.ndarray, "h w 3"], bare: Mask) -> Iterator[Mask]:
+    """Yields the areas of a bare plane that sharp edges of the picture enclose, the largest ones."""
+    log = np.log(smooth + DARK)
     steps = [cv2.Sobel(log, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (0, 1)]
     change = np.abs(np.dstack(steps)).max(axis=2)
     if not bare.any():
         return
     least = max(EDGE_NOISES * float(np.median(change[bare])), LEAST_EDGE)
     even = (bare & (change <= least)).astype(np.uint8)
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(even, connectivity=4)
-    for label in range(1, count):
-        if statistics[label, cv2.CC_STAT_AREA] >= LEAST_AREA_PX:
-            yield labels == label
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(even, connectivity=4)
+    sizes = statistics[1:, cv2.CC_STAT_AREA]
+    for index in np.argsort(-sizes, kind="stable")[:MOST_AREAS]:
+        if sizes[index] >= LEAST_AREA_PX:
+            yield labels == index + 1
 
 
-def _contradicts(reflection: PlaneReflection, area: Mask) -> bool:
+def _contradicts(reflection: PlaneReflection, smooth: Float32[np.ndarray, "h w 3"], area: Mask) -> bool:
     """Returns whether the predicted reflection varies much over an area, and the picture hardly."""
     inner = cv2.erode(area.astype(np.uint8), np.ones((2 * ERROR_PX + 1,) * 2), borderValue=0) > 0
     rows, columns = np.nonzero(inner & reflection.known)
     if len(rows) < LEAST_KNOWN_PX:
         return False
     even = np.column_stack([np.ones(len(rows)), columns, rows])
-    expected, found = (
-        _spread(values[rows, columns], even)
-        for values in (reflection.expected, cv2.GaussianBlur(reflection.picture, (0, 0), 1.0))
-    )
+    expected, found = (_spread(values[rows, columns], even) for values in (reflection.expected, smooth))
     return expected >= max(LEAST_SPREAD, CONTRADICTION * found)
 
 
@@ -169,7 +168,7 @@ def _sheet(seen: PosedFrame, plane: MirrorPlane, reflection: PlaneReflection, ar
     corners = cv2.boxPoints(cv2.minAreaRect((1e3 * points).astype(np.float32))).astype(np.float64) / 1e3
     outline = plane.point + corners @ axes
     inside = _inside(seen, outline)
-    if np.count_nonzero(whole & inside) < LEAST_FILL * np.count_nonzero(inside):
+    if not inside.any() or np.count_nonzero(whole & inside) < LEAST_FILL * np.count_nonzero(inside):
         return None
     return FlatThing(outline, np.median(reflection.picture[area], axis=0).astype(np.float64))
 

@@ -441,15 +441,7 @@ def shading_stages(
     marching = marching or g.value("marching", no_bindings, volume)
     g.section("shading")
     scene = plain = g.value(
-        "shading scene",
-        shading.scene,
-        s.geometry,
-        s.objects,
-        s.view,
-        volume,
-        s.lit_area,
-        *lit.all,
-        s.lights,
+        "shading scene", shading.scene, s.geometry, s.objects, s.view, volume, s.lit_area, *lit.all, s.lights
     )
     bvh = object_bvh(g, s)
     trace_beams: Callable[..., SentBeams | None] = no_beams

@@ -183,9 +183,9 @@ class TraceVirtualCones:
     def __init__(
         self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
     ) -> None:
-        self._gpu, self._reuses = gpu, reuses
-        self._irradiance = texture_2d(gpu, size, 4, "f2")
-        self._target = gpu.ctx.framebuffer([self._irradiance])
+        self._gpu = gpu
+        self._irradiance = None if reuses else texture_2d(gpu, size, 4, "f2")
+        self._target = None if self._irradiance is None else gpu.ctx.framebuffer([self._irradiance])
         self._trace = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
         self._filter = Kernel(gpu, "bilateral_cone_filter", **reuse_define(reuses))
 
@@ -209,7 +209,7 @@ class TraceVirtualCones:
 
     def _begin(self, fields: ConeFields) -> moderngl.Texture:
         """Returns the texture to trace into, which holds what is kept of the last frame and 0 elsewhere."""
-        if self._reuses:
+        if self._irradiance is None or self._target is None:
             assert fields.kept_virtual is not None
             return fields.kept_virtual
         self._target.use()
@@ -218,7 +218,8 @@ class TraceVirtualCones:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_target(self._target)
+        if self._target is not None:
+            release_target(self._target)
         release_all(self._irradiance, self._trace, self._filter)
 
 

@@ -13,6 +13,8 @@ from deltalight.render_server.lights.punctual_light import PunctualLight
 from deltalight.render_server.scene.asset_check import LIGHTS_EXTENSION
 from deltalight.render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeTree
 
+MOST_LAMPS = 64  # as a scene may list
+LEAST_RANGE_M = 1e-6
 _ORIGIN, _AWAY = np.zeros(3, np.float32), np.array([0, 0, -1], np.float32)
 
 
@@ -39,7 +41,8 @@ def read_lamps(gltf: GltfDocument, nodes: NodeTree) -> tuple[GltfLamp, ...]:
     """Returns the lights of the nodes that are shown.
 
     Raises:
-        GltfFaultError: a light that does not exist, of an unknown type, or with values that make no light.
+        GltfFaultError: a light that does not exist, of an unknown type, or with values that make
+            no light; or too many.
     """
     described: Sequence[dict[str, Any]] = (
         gltf.root.get("extensions", {}).get(LIGHTS_EXTENSION, {}).get("lights", [])
@@ -52,6 +55,8 @@ def read_lamps(gltf: GltfDocument, nodes: NodeTree) -> tuple[GltfLamp, ...]:
             if type(index) is not int or not 0 <= index < len(described):
                 raise GltfFaultError(f"node {node} names a light that does not exist")
             lamps.append(GltfLamp(node, _light(described[index], index)))
+    if len(lamps) > MOST_LAMPS:
+        raise GltfFaultError(f"it has {len(lamps)} lights; at most {MOST_LAMPS} can be drawn")
     return tuple(lamps)
 
 
@@ -62,7 +67,10 @@ def _light(description: dict[str, Any], index: int) -> PunctualLight | Direction
     )
     range_m = float(description.get("range", math.inf))
     is_usable = (
-        strength.shape == (3,) and np.isfinite(strength).all() and (strength >= 0).all() and range_m > 0
+        strength.shape == (3,)
+        and np.isfinite(strength).all()
+        and (strength >= 0).all()
+        and range_m >= LEAST_RANGE_M
     )
     if not is_usable:
         raise GltfFaultError(f"{name} has a colour, an intensity or a range that makes no light")
@@ -82,4 +90,4 @@ def _cone(spot: dict[str, Any], name: str) -> tuple[float, float]:
         raise GltfFaultError(
             f"{name} has an inner cone that is not within its outer one of at most 90 degrees"
         )
-    return inner, outer
+    return inner, min(outer, math.pi / 2)  # single precision rounds it up

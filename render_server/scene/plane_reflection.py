@@ -7,9 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from deltalight.protocol.frames import linear_color
+from deltalight.render_server.scene.depth_surface import noise_sigma
 from deltalight.render_server.view import PosedFrame
 
 CELL_PX = 2  # of the grid that mirrored points fall on, which are farther apart than pixels
+NOISES = 3.0  # standard deviations of depth beside the plane's tolerance
 FRONT = 1.05  # up to which multiple of the least depth in a cell points count as the nearest surface
 
 
@@ -54,16 +56,17 @@ def plane_reflection(seen: PosedFrame, plane: MirrorPlane) -> PlaneReflection | 
     side = np.sign((pose[:3, 3] - plane.point) @ plane.normal)
     height = ((points - plane.point) @ plane.normal) * side
     picture = linear_color(seen.frame, seen.frame.color)
-    above = valid & (height > plane.tolerance_m)
+    cosine = np.abs(rays @ plane.normal) / np.linalg.norm(rays, axis=2)
+    tolerance = plane.tolerance_m + NOISES * noise_sigma(depth) * depth.depth_m**2 * cosine
+    above = valid & (height > tolerance)
     images = points[above] - (2 * side * height[above])[:, None] * plane.normal
     mirrored = _mirrored(seen, images, picture[above], plane.roughness)
     if mirrored is None:
         return None
     radiance, known = mirrored
-    cosine = np.abs(rays @ plane.normal) / np.linalg.norm(rays, axis=2)
     fresnel = plane.f0 + (1 - plane.f0) * (1 - cosine[..., None]) ** 5
     expected = (fresnel * radiance).astype(np.float32)
-    return PlaneReflection(valid & (np.abs(height) <= plane.tolerance_m), picture, expected, known)
+    return PlaneReflection(valid & (np.abs(height) <= tolerance), picture, expected, known)
 
 
 def _mirrored(

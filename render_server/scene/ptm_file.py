@@ -21,6 +21,7 @@ _VERSION = b"PTM_1.2"
 _SEPARATE = b"PTM_FORMAT_RGB"  # six coefficients for each colour
 _LUMINANCE = b"PTM_FORMAT_LRGB"  # six of luminance, and a colour that they scale
 _TEXEL_BYTES = {_SEPARATE: 3 * TERMS, _LUMINANCE: TERMS + 3}
+_LARGEST_BYTES = 3 * TERMS * LARGEST_PICTURE_PIXELS + 4096
 _HEADER_NUMBERS = 2 + 2 * TERMS  # width and height, scales, biases
 _ORDER = [5, 3, 4, 0, 2, 1]  # its lu^2, lv^2, lu lv, lu, lv, 1 as ours
 _ADVICE = "save it again as PTM_1.2 in PTM_FORMAT_LRGB or PTM_FORMAT_RGB"
@@ -67,6 +68,8 @@ def read_ptm(path: Path) -> PolynomialTexture:
         DeltalightError: it cannot be read, is damaged, or is of another kind.
     """
     try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise DeltalightError(f"{path} has more than {LARGEST_PICTURE_PIXELS} texels; reduce it first.")
         content = path.read_bytes()
     except OSError as error:
         raise DeltalightError(f"{path} cannot be read ({error.strerror}); give another file.") from error

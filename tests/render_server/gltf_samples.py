@@ -1,4 +1,4 @@
-"""Small glTF files: a bar on two bones, a cube with morph targets, a box on a moving arm; a plate with textures."""
+"""Small glTF files: a bar on two bones, a cube with morph targets, a box on a moving arm."""
 
 import json
 from collections.abc import Callable
@@ -9,11 +9,9 @@ import numpy as np
 import trimesh
 
 from deltalight.benchmarks.glb_builder import GlbBuilder
-from deltalight.benchmarks.gltf_plate import Plate, even
 from deltalight.render_server.scene.gltf_meshes import load_gltf
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
-__all__ = ["Plate", "even"]
 HALF = np.sqrt(0.5)
 QUARTER_TURN = (0.0, 0.0, HALF, HALF)  # about z, x y z w
 IDENTITY = (0.0, 0.0, 0.0, 1.0)

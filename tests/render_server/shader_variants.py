@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from deltalight.benchmarks.gltf_plate import Plate, even
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
@@ -27,7 +28,6 @@ from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.material_file import write_material
 from tests.render_server.brdf_samples import grey_brdf
-from tests.render_server.gltf_samples import Plate, even
 from tests.render_server.protected_scenes import Case, frames_of, scene_of
 from tests.render_server.scenes import Stage
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from jaxtyping import Float32, Float64
 
+from deltalight.benchmarks.gltf_plate import Plate, even
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.gltf_samples import Plate, even
 from tests.render_server.scenes import (
     FOCAL,
     GREY,

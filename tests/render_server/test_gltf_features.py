@@ -33,5 +33,5 @@ def test_a_feature_looks_as_by_plain_means(
         drawn(name, apply)
         for name, apply in (("feature", feature.feature), ("plain", feature.plain), ("white", white))
     )
-    assert np.abs(shown - expected).max() <= 2
+    assert np.abs(shown - expected).max() <= 1
     assert np.abs(expected - plain).max() > 30, "the look is one that a white plate does not have"

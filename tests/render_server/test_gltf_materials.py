@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deltalight.benchmarks.gltf_plate import Plate, even
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene_objects import Surface
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.gltf_samples import Plate, even
 from tests.render_server.scenes import (
     FOCAL,
     HEIGHT,

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from deltalight.benchmarks.gltf_plate import Plate, even
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene import texture_maps
 from deltalight.render_server.scene.mesh_loading import load_asset
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge
 from deltalight.services.storage.asset_facts import mesh_facts
-from tests.render_server.gltf_samples import Plate, edited, even
+from tests.render_server.gltf_samples import edited
 
 SLOTS: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "base colour": lambda m, info: m.update(pbrMetallicRoughness={"baseColorTexture": info}),

@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deltalight.benchmarks.gltf_plate import Plate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.mesh_loading import load_asset
-from tests.render_server.gltf_samples import HALF, Plate
+from tests.render_server.gltf_samples import HALF
 from tests.render_server.lpv_scenes import dlpv, graph_of, injected_flux
 from tests.render_server.scenes import GREY, Fields, Stage, ambient, fields_of, floor, frame, sphere_light
 from tests.render_server.test_aroof import aroof
@@ -283,6 +285,9 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"type": "point", "intensity": -1}, "makes no light"),
     ({"type": "point", "color": [1, 1]}, "makes no light"),
     ({"type": "point", "range": 0}, "makes no light"),
+    ({"type": "point", "range": 1e-200}, "makes no light"),
+    ({"type": "point", "intensity": "bright"}, "lamp.glb"),
+    ({"type": "point", "intensity": float("inf")}, "lamp.glb"),
     ({"type": "spot", "spot": {"innerConeAngle": 0.7, "outerConeAngle": 0.6}}, "not within its outer one"),
 ]
 
@@ -294,3 +299,56 @@ def test_lamps_that_make_no_light_are_refused_in_a_sentence(
     model = lamp_model(tmp_path / "lamp.glb", light, {}, HOLDER)
     with pytest.raises(DeltalightError, match=sentence):
         load_asset(Path(model["asset"]))
+
+
+def test_more_lamps_than_a_scene_may_list_are_refused(gpu: GpuContext, tmp_path: Path) -> None:
+    """In one file, and of all objects together, but for those whose lamps are off."""
+    model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, HOLDER)
+    objects = [{**model, "id": f"lamp{number}"} for number in range(65)]
+    with pytest.raises(DeltalightError, match="bring 65 lamps, more than 64; switch some off"):
+        SceneRenderer(gpu, Stage(tmp_path).document(objects, [], floor()))
+    objects[7]["lamps"] = 0
+    SceneRenderer(gpu, Stage(tmp_path).document(objects, [], floor())).release()
+
+
+def test_a_spot_of_a_hemisphere_in_single_precision(gpu: GpuContext, tmp_path: Path) -> None:
+    """float32(pi) / 2 lies above pi / 2."""
+    cones = {"innerConeAngle": 0.0, "outerConeAngle": float(np.float32(np.pi)) / 2}
+    gained, by_point, cosine, _ = drawn_lamp(gpu, tmp_path, {"type": "spot", "intensity": 0.1, "spot": cones})
+    assert gained == pytest.approx(0.1 * cosine**2 * by_point, rel=3e-3, abs=2e-4)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_brightest_lamp_makes_white_and_not_nothing(gpu: GpuContext, tmp_path: Path, name: str) -> None:
+    """54 kcd, as programs export a lamp of 1000 W; its object is near it."""
+    light = {"type": "point", "intensity": 5.4e4}
+    model = lamp_model(
+        tmp_path / "lamp.glb", light, {"translation": LAMP.tolist()}, {"translation": [0, 0, 0.2]}, 0.1
+    )
+    lit = Lit(gpu, Stage(tmp_path), [model], **METHODS[name])
+    assert np.isfinite(lit.linear).all()
+    assert np.isfinite(lit.fields.direct_rho).all()
+    assert (lit.codes[lit.around(0.1)] == 255).mean() > 0.2  # the plate's shadow is dark
+
+
+def test_lamps_of_a_resting_object_stay_the_same_lights_while_another_moves(
+    gpu: GpuContext, tmp_path: Path
+) -> None:
+    """So nothing about them is found again."""
+    stage = Stage(tmp_path)
+    lamp = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, HOLDER)
+    other = {**lamp_model(tmp_path / "other.glb", POINT, {}, HOLDER), "lamps": 0}
+
+    def with_other(x: float, intensity: float = 1.0) -> SceneDocument:
+        moved = {**other, "id": "other", "pose": {"translation_m": [x, 0, 0]}}
+        return stage.document([{**lamp, "id": "lamp", "lamps": intensity}, moved], [ambient(SKY)], floor())
+
+    renderer = SceneRenderer(gpu, with_other(0.0))
+    seen = []
+    for document in (with_other(0.0), with_other(0.1), with_other(0.1, 0.5)):
+        renderer.set_scene(document)
+        renderer.render(frame(depth=None))
+        seen.append(graph_of(renderer)["object lamps"])
+    renderer.release()
+    assert seen[1][0] is seen[0][0]
+    assert seen[2][0].intensity == pytest.approx(0.5 * seen[0][0].intensity)

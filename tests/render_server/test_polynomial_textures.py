@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from deltalight.benchmarks.gltf_plate import Plate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.render_server.gpu.context import GpuContext
@@ -20,7 +21,6 @@ from deltalight.render_server.scene.polynomial_texture import (
     read_polynomial_texture,
 )
 from deltalight.render_server.scene.ptm_file import read_ptm
-from tests.render_server.gltf_samples import Plate
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,

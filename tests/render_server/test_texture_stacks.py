@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from deltalight.benchmarks.gltf_plate import Plate
 from deltalight.benchmarks.relief_materials import latitude_longitude
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame, decode_lut
@@ -22,7 +23,6 @@ from deltalight.render_server.scene.material_file import read_material, write_ma
 from deltalight.render_server.scene.polynomial_texture import PolynomialTexture, polynomial_terms
 from deltalight.render_server.scene.texture_stack import LAYERS, TextureStack, read_texture_stack
 from deltalight.render_server.scene.textures_by_light import TextureByLight
-from tests.render_server.gltf_samples import Plate
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from jaxtyping import Float64
 
+from deltalight.benchmarks.gltf_plate import Plate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene import SceneDocument
@@ -17,7 +18,6 @@ from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.asset_check import left_out, read_gltf
 from deltalight.render_server.scene.mesh_loading import load_mesh
-from tests.render_server.gltf_samples import Plate
 from tests.render_server.scenes import (
     COARSE,
     EYE,

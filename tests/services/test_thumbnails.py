@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from deltalight.benchmarks.gltf_plate import Plate
 from deltalight.protocol.frames import srgb_code
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrdf
@@ -24,7 +25,6 @@ from deltalight.services.storage.thumbnails import (
     MARGIN,
     SIZE,
 )
-from tests.render_server.gltf_samples import Plate
 from tests.services.api_samples import UPLOAD, running_api, sentence
 from tests.services.storage_samples import TETRAHEDRON, glb, trusting_probe, upload
 from tests.services.test_gltf_zip import FILES, packed

@@ -136,8 +136,10 @@ vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b, out vec3 ratio) {
     ratio = (max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e);
     // A ratio is right whatever the scale of the picture's own lights, which those of objects do not share: no surface reflects more
     // of these than the greatest albedo.
-    if (has_virtual_lights) ratio = min(ratio, 1.0 + ALBEDO_RANGE.y / PI * max(c.delta, vec3(0.0)) / max(b, vec3(1e-6)));
-    ratio = max(ratio + c.distant, vec3(0.0));
+    vec3 gained = max(c.delta + c.distant * c.e_mu, vec3(0.0));
+    ratio += c.distant;
+    if (has_virtual_lights) ratio = min(ratio, 1.0 + ALBEDO_RANGE.y / PI * gained / max(b, vec3(1e-6)));
+    ratio = max(ratio, vec3(0.0));
     if (additive) {
         vec3 albedo = clamp(PI * b / max(c.e_mu, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
         vec3 glossy = c.hidden > 0.0 ? (1.0 - diffuse_fraction(pixel, c, normal, b)) * b : vec3(0.0);

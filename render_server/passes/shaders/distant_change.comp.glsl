@@ -18,7 +18,7 @@ uniform sampler2D cone_rho;   // a: 1 inside a volume
 uniform float noise_sigma;   // m at 1 m
 #include "common/camera.glsl"
 
-const float LEAST_IRRADIANCE = 1e-4;
+const float LEAST_IRRADIANCE = 1e-4, GREATEST_CHANGE = 1e4;   // half floats hold it
 
 // As in trace_cones: four adjacent points share four times as many directions, and distant_upsample takes the mean.
 int part_of(ivec2 point) { return (point.x & 1) + 2 * (point.y & 1); }
@@ -57,9 +57,25 @@ float greatest_share(vec3 to_ball, float radius, vec3 n) {
     return height > 0.0 ? sine * sine * min(height / apart, 1.0) : 0.0;
 }
 
-// Change by what is in this volume, of the irradiance at q (voxels). Cones are stratified over the ball's cap, or over the
-// hemisphere where the ball surrounds the point.
-vec3 change_by_volume(vec3 q, vec3 n, int part) {
+// Whether a ray meets what a volume before this one holds: near each other, both hold the same objects.
+bool counted_before(int number, vec3 p, vec3 d) {
+    bool met = false;
+    for (int i = 0; i < number; ++i) {
+        work_in_volume(i);
+        vec4 ball = ball_around_support();
+        vec3 to_ball = ball.xyz - volume_coordinate(p);
+        float along = dot(to_ball, d);
+        met = met || (along > 0.0 && dot(to_ball, to_ball) - along * along < ball.w * ball.w);
+    }
+    work_in_volume(number);
+    return met;
+}
+
+// Change by what is in a volume, of the irradiance at p. Cones are stratified over the ball's cap, or over the hemisphere
+// where the ball surrounds the point.
+vec3 change_by_volume(int number, vec3 p, vec3 n, int part) {
+    work_in_volume(number);
+    vec3 q = volume_coordinate(p);
     vec4 ball = ball_around_support();
     vec3 to_ball = ball.xyz - q, sum = vec3(0.0);
     if (greatest_share(to_ball, ball.w, n) < LEAST_CHANGE) return sum;
@@ -70,26 +86,23 @@ vec3 change_by_volume(vec3 q, vec3 n, int part) {
     mat3 basis = basis_around(surrounds ? n : normalize(to_ball));
     int k = 0;
     do {
-        float number = float(4 * k + part), at = (number + 0.5) / float(4 * AIMED_CONES), phi = number * GOLDEN_ANGLE;
+        float index = float(4 * k + part), at = (index + 0.5) / float(4 * AIMED_CONES), phi = index * GOLDEN_ANGLE;
         float z = surrounds ? sqrt(1.0 - at) : 1.0 - at * cap;
         vec3 d = basis * vec3(sqrt(max(1.0 - z * z, 0.0)) * vec2(cos(phi), sin(phi)), z);
         float weight = surrounds ? PI / float(AIMED_CONES) : 2.0 * PI * share * dot(d, n);
-        if (weight > 0.0) sum += weight * change_along(q, d, ratio);
+        if (weight > 0.0 && !counted_before(number, p, d)) sum += weight * change_along(q, d, ratio);
     } while (++k < AIMED_CONES);
     return sum;
 }
 
 vec3 relative_change(SurfacePoint s, int part) {
     vec3 change = vec3(0.0);
-    for (int i = 0; i < volume_count; ++i) {
-        work_in_volume(i);
-        change += change_by_volume(volume_coordinate(s.position), s.normal, part);
-    }
+    for (int i = 0; i < volume_count; ++i) change += change_by_volume(i, s.position, s.normal, part);
     if (change == vec3(0.0)) return change;
     vec3 e_mu, e_rho;
     enter_volume(s.position);
     diffuse(volume_coordinate(s.position), s.normal, ConeSet(4, part, 0.5, 0.0), true, e_mu, e_rho);
-    return max(change / (direct_irradiance(s) + e_mu + LEAST_IRRADIANCE), vec3(-1.0));
+    return change / (direct_irradiance(s) + e_mu + LEAST_IRRADIANCE);
 }
 
 // Inside a volume, cones know it already.
@@ -110,5 +123,5 @@ void main() {
         else change = relative_change(surface_point(texel), part_of(point));
     }
     imageStore(lattice_pixels, point, ivec4(pixel, 0, 0));
-    imageStore(lattice_change, point, vec4(change, texel.x >= 0 ? 1.0 : 0.0));
+    imageStore(lattice_change, point, vec4(clamp(change, vec3(-1.0), vec3(GREATEST_CHANGE)), texel.x >= 0 ? 1.0 : 0.0));
 }

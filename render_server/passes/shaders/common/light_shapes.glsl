@@ -41,11 +41,14 @@ bool is_virtual(Light light) { return has_virtual_lights && light.mirror.w < -1.
 
 bool is_punctual(Light light) { return has_virtual_lights && light.place.w == PUNCTUAL; }
 
-// What the range of a punctual light leaves of it, 1 for others (KHR_lights_punctual, "Range Property").
+const float GREATEST_IRRADIANCE = 256.0;   // by a light of an object: half floats and fixed-point sums hold that of several
+
+// What the range of a punctual light leaves of it (KHR_lights_punctual, "Range Property"), and the bound of its irradiance; 1 for others.
 float within_range(Light light, vec3 p) {
     vec3 d = light.place.xyz - p;
-    float part = dot(d, d) * light.axis_v.x;
-    return is_punctual(light) ? clamp(1.0 - part * part, 0.0, 1.0) : 1.0;
+    float distance2 = dot(d, d), part = distance2 * light.axis_v.x;
+    float greatest = max(max(light.color.r, light.color.g), max(light.color.b, 1e-20));
+    return is_punctual(light) ? clamp(1.0 - part * part, 0.0, 1.0) * min(GREATEST_IRRADIANCE * distance2 / greatest, 1.0) : 1.0;
 }
 
 // Fraction of its intensity that a spot emits along d (unit, of travel); 1 for a sphere.

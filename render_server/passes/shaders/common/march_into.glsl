@@ -3,7 +3,7 @@
 
 // Through this volume from `start` (voxels) on the ray q + t d, and on through the coarse scene.
 Crossed march_through(sampler3D mipmap, vec3 q, vec3 d, float start, float ratio, Crossed sum) {
-    bool differs;
+    bool differs = false;
     float t = start;
     if (sum.coverage < WALL) t += march_near(mipmap, q + start * d, d, start, ratio, sum, differs);
     vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
