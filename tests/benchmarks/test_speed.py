@@ -257,10 +257,10 @@ def test_counted_frames_agree_with_what_the_graph_ran(
 
 
 MOST_DISPATCHES = {  # in a frame on a GPU, while the camera moves and while an object does
-    "exact:quality=live,volume_size=32": (36, 48),
-    "exact:volume_size=32": (85, 86),
-    "paper:volume_size=32": (45, 45),
-    "dlpv:volume_size=16": (120, 120),
+    "exact:quality=live,volume_size=32": (36, 46),
+    "exact:volume_size=32": (87, 86),
+    "paper:volume_size=32": (42, 42),
+    "dlpv:volume_size=16": (99, 93),
 }
 
 
@@ -269,14 +269,15 @@ MOST_DISPATCHES = {  # in a frame on a GPU, while the camera moves and while an 
 def test_a_gpu_is_asked_for_no_more_dispatches(method: str, gpu: GpuContext, take: Take) -> None:
     """Each costs a GPU a barrier and Python tens of microseconds, whatever it computes."""
     (variant,) = parse_variants(method, RENDERED)
-    scene = variant.applied(demo_scene("dvct"), None)
+    demo = demo_scene("dvct")  # without estimates of light, which read back whenever they are due
+    scene = variant.applied(demo.replaced(lights=demo.lights.replaced(surroundings="none")), None)
     renderer = SceneRenderer(replace(gpu, is_software=False), scene)
     found = []
     for motion in ("camera", "object"):
         counts = count_motion(
             renderer, list(steps_of(motion, take, scene, 18)), 3
         )  # `live` has turns of three
-        assert (counts.per_frame["reads"], counts.per_frame["buffer_clears"]) == (0, 0)
+        assert counts.per_frame["buffer_clears"] == 0
         found.append(counts.per_frame["dispatches"])
     renderer.release()
     assert all(np.less_equal(found, MOST_DISPATCHES[method])), found
