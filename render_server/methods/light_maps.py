@@ -234,6 +234,7 @@ def object_lamps(g: Graph, s: FrameResources) -> Resource[tuple[Light, ...]]:
 
 
 def _lamps_of(objects: GeometryState) -> tuple[Light, ...]:
+    """The lights that come with the objects, in the world."""
     return objects.lamps
 
 
