@@ -213,24 +213,6 @@ class ExactCones:
         release_all(self._real, self._virtual)
 
 
-class DistantCones:
-    """Aims cones at the volumes from surfaces beyond them."""
-
-    def __init__(self, gpu: GpuContext, settings: DvctMethod, size: tuple[int, int]) -> None:
-        self._distant = DistantChange(gpu, size, march_defines(settings))
-
-    def trace(
-        self, scene: Bindings, grid: LowResGrid, direct: DirectLight, cones: ConeFields, marching: Bindings
-    ) -> moderngl.Texture:
-        """Traces the relative change of light on the reduced grid."""
-        self._distant.run(direct, cones, grid, {**scene, **marching})
-        return self._distant.change
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        self._distant.release()
-
-
 class UnchangedCones:
     """Marches the cones at real surfaces through mu alone, so that no voxels of the objects need light.
 
@@ -315,7 +297,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     volume = g.value("volume", placed_volume, "voxelize real")
     distant: Callable[..., moderngl.Texture] | None = None
     if settings.tier.distant_light:
-        distant = DistantCones(g.gpu, settings, shading.grid.size).trace
+        distant = DistantChange(g.gpu, shading.grid.size, march_defines(settings)).trace
     layers = shading_stages(
         g, s, shading, lit, volume, trace, voxels=rho, marching=marching, find_distant=distant
     )

@@ -453,21 +453,10 @@ def shading_stages(
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     kept: list[Resource[Any]] = []
     if shading.reuses_light:
-        # What light at real surfaces depends on, besides the camera: another value whenever any of it changes.
-        shared: tuple[Resource[Any], ...] = (s.surfaces, s.lit_area, s.lights, lit.environment)
-        unblocked = g.value("unblocked light state", _new_object, *shared, lit.real_maps, *lit.mirrored)
-        bounced = g.value("bounced light state", _new_object, *shared, volume, shown, marching, beams)
-        direct = g.value("direct light state", _new_object, unblocked, bounced, s.objects, lit.object_maps)
-        states = g.value("light state", LightState, unblocked, direct, bounced)
-        scene, *kept = g.stages(
-            "light reuse",
-            shading.reuse_light,
-            scene,
-            grid,
-            states,
-            s.view,
-            outputs=("reusing scene", "kept light"),
-        )
+        states = _light_states(g, s, lit, volume, shown, marching, beams)
+        reused = scene, grid, states, s.view
+        outputs = "reusing scene", "kept light"
+        scene, *kept = g.stages("light reuse", shading.reuse_light, *reused, outputs=outputs)
     own_light = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
@@ -488,6 +477,17 @@ def shading_stages(
 
     layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
     return replace(layers, direct_mu=own_light, transmit=transmit)
+
+
+def _light_states(
+    g: Graph, s: FrameResources, lit: LitScene, *bounces: Resource[Any]
+) -> Resource[LightState]:
+    """What light at real surfaces depends on, besides the camera: another value whenever any of it changes."""
+    shared: tuple[Resource[Any], ...] = (s.surfaces, s.lit_area, s.lights, lit.environment)
+    unblocked = g.value("unblocked light state", _new_object, *shared, lit.real_maps, *lit.mirrored)
+    bounced = g.value("bounced light state", _new_object, *shared, *bounces)
+    direct = g.value("direct light state", _new_object, unblocked, bounced, s.objects, lit.object_maps)
+    return g.value("light state", LightState, unblocked, direct, bounced)
 
 
 def _new_object(*_: object) -> object:

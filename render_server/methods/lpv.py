@@ -29,13 +29,13 @@ from deltalight.render_server.methods.volume_placement import SizeOf, volume_pla
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import (
-    Light,
     LightVolume,
     LpvBoxFilter,
     LpvJoin,
     LpvPropagate,
     LpvShow,
     LpvStart,
+    PropagatedLight,
     injected_sums,
     lobe_weights,
     moment_weights,
@@ -224,13 +224,13 @@ class LitCells:
     """What a form of the method hands to shading: a reader of fields, V_rho and its volume, that of the change."""
 
     read: Callable[[LpvFields, Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]]
-    rho: Resource[Light]
+    rho: Resource[PropagatedLight]
     rho_volume: Resource[PlacedVolume]
     volume: Resource[PlacedVolume]
     shown: Resource[VoxelMipmap]
 
 
-def joined(g: Graph, name: str, light: Resource[PerVolume[LightVolume]]) -> Resource[Light]:
+def joined(g: Graph, name: str, light: Resource[PerVolume[LightVolume]]) -> Resource[PropagatedLight]:
     """Declares the light of all volumes as surfaces read it."""
     return g.stage(name, g.shared(name, partial(LpvJoin, g.gpu)).run, light)
 

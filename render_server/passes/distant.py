@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+import moderngl
+
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
@@ -13,26 +15,29 @@ AIMED_CONES = 16  # of a point of the lattice, at each volume
 
 
 class DistantChange:
-    """Relative change of the light at real surfaces beyond the volumes (`change`, RGBA16F, docs/method.md 4.5).
+    """Relative change of the light at real surfaces beyond the volumes (RGBA16F, docs/method.md 4.5).
 
     `size` is that of the reduced grid, `defines` are those of march.glsl.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
         self._points = (-(-size[0] // LATTICE_STEP), -(-size[1] // LATTICE_STEP))
-        self.change = texture_2d(gpu, size, 4, "f2")
+        self._change = texture_2d(gpu, size, 4, "f2")
         self._lattice = texture_2d(gpu, self._points, 4, "f2")
         self._pixels = texture_2d(gpu, self._points, 4, "i2")
         own = {"REAL": 1, "LATTICE_STEP": LATTICE_STEP}
         self._find = Kernel(gpu, "distant_change", **own, **defines, ENDS_AHEAD=1, AIMED_CONES=AIMED_CONES)
         self._upsample = Kernel(gpu, "distant_upsample", **own)
 
-    def run(self, direct: DirectLight, cones: ConeFields, grid: LowResGrid, scene: Bindings) -> None:
-        """Finds the change; `scene` brings the bindings that cones march with."""
+    def trace(
+        self, scene: Bindings, grid: LowResGrid, direct: DirectLight, cones: ConeFields, marching: Bindings
+    ) -> moderngl.Texture:
+        """Aims cones at the volumes from surfaces beyond them, and returns the relative change of light there."""
         self._find.run(
             self._points,
             grid.bindings,
             scene,
+            marching,
             direct_mu=direct.light.mu,
             cone_mu=cones.mu,
             cone_rho=cones.rho,
@@ -43,11 +48,13 @@ class DistantChange:
             grid.size,
             grid.bindings,
             scene,
+            marching,
             lattice_change=self._lattice,
             lattice_pixels=self._pixels,
-            distant_change_out=self.change,
+            distant_change_out=self._change,
         )
+        return self._change
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.change, self._lattice, self._pixels, self._find, self._upsample)
+        release_all(self._change, self._lattice, self._pixels, self._find, self._upsample)

@@ -107,7 +107,7 @@ class LightVolume:
         release_all(self.state, self.next_state, self.total)
 
 
-class Light(Protocol):
+class PropagatedLight(Protocol):
     """What surfaces read of light volumes."""
 
     @property
@@ -135,7 +135,7 @@ class LpvJoin:
         self._kernel = Kernel(gpu, "lpv_join")
         self._total: moderngl.Texture3D | None = None
 
-    def run(self, lights: Sequence[LightVolume | None]) -> Light | None:
+    def run(self, lights: Sequence[LightVolume | None]) -> PropagatedLight | None:
         """Returns all light; None where there are no volumes."""
         given = [light for light in lights if light is not None]
         if len(given) < 2:

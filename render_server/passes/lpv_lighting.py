@@ -12,12 +12,12 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.lpv import Light, LightVolume, cells_of
+from deltalight.render_server.passes.lpv import LightVolume, PropagatedLight, cells_of
 from deltalight.render_server.passes.volumes import PlacedVolume
 from deltalight.render_server.passes.voxels import VoxelStore
 
 
-def light_volume_bindings(mu: Light, rho: Light) -> dict[str, Binding]:
+def light_volume_bindings(mu: PropagatedLight, rho: PropagatedLight) -> dict[str, Binding]:
     """Returns the light without and with objects, as shaders/common/lpv_light.glsl reads it."""
     return {"light_mu": mu.total, "light_rho": rho.total}
 
@@ -152,7 +152,9 @@ class LpvQuery:
         self._change = Kernel(gpu, "lpv_query", REAL=1, CHANGE=1)
         self._virtual = Kernel(gpu, "lpv_query")
 
-    def read_real(self, fields: ConeFields, grid: LowResGrid, mu: Light, rho: Light, scene: Bindings) -> None:
+    def read_real(
+        self, fields: ConeFields, grid: LowResGrid, mu: PropagatedLight, rho: PropagatedLight, scene: Bindings
+    ) -> None:
         """Writes E_mu and E_rho of real surfaces."""
         self._run_real(self._real, fields, grid, light_volume_bindings(mu, rho), scene)
 
@@ -160,8 +162,8 @@ class LpvQuery:
         self,
         fields: ConeFields,
         grid: LowResGrid,
-        delta: Light,
-        direct: Light | None,
+        delta: PropagatedLight,
+        direct: PropagatedLight | None,
         scene: Bindings,
     ) -> None:
         """Writes E_mu of real surfaces without the volumes, and E_rho with `delta` and `direct` added."""
@@ -183,7 +185,9 @@ class LpvQuery:
             specular_rho=fields.specular_rho,
         )
 
-    def read_virtual(self, fields: ConeFields, grid: LowResGrid, rho: Light, scene: Bindings) -> None:
+    def read_virtual(
+        self, fields: ConeFields, grid: LowResGrid, rho: PropagatedLight, scene: Bindings
+    ) -> None:
         """Writes the irradiance of virtual surfaces, and the radiance that a mirror there would show."""
         self._virtual.run(
             grid.size,
@@ -212,11 +216,13 @@ class LpvFields:
         self._fields, self._bindings = fields, query_bindings(settings)
         self._query = LpvQuery(gpu)
 
-    def marching(self, rho: Light, volume: PlacedVolume) -> dict[str, Binding]:
+    def marching(self, rho: PropagatedLight, volume: PlacedVolume) -> dict[str, Binding]:
         """Returns the bindings for lighting reflected points from V_rho, whose cells fill the `volume`."""
         return {**light_volume_bindings(rho, rho), **volume.bindings, **self._bindings}
 
-    def read_difference(self, scene: Bindings, grid: LowResGrid, mu: Light, rho: Light) -> ConeFields:
+    def read_difference(
+        self, scene: Bindings, grid: LowResGrid, mu: PropagatedLight, rho: PropagatedLight
+    ) -> ConeFields:
         """Reads the irradiance at real surfaces and at the objects."""
         own = {**scene, **self._bindings}
         self._query.read_real(self._fields, grid, mu, rho, own)
@@ -227,9 +233,9 @@ class LpvFields:
         self,
         scene: Bindings,
         grid: LowResGrid,
-        delta: Light,
-        direct: Light | None,
-        rho: Light,
+        delta: PropagatedLight,
+        direct: PropagatedLight | None,
+        rho: PropagatedLight,
         rho_volume: PlacedVolume,
     ) -> ConeFields:
         """Reads the change of irradiance at real surfaces, and the irradiance at the objects."""

@@ -8,8 +8,8 @@ import pytest
 
 from deltalight.benchmarks.gltf_features import FEATURES, LAMPS, Feature, written
 from deltalight.benchmarks.gltf_plate import Plate
+from tests.render_server.gltf_plates import seen_from_above
 from tests.render_server.scenes import FOCAL, HEIGHT, ObjectsRenderer, Stage, directional, unlit
-from tests.render_server.test_gltf_materials import seen_from_above
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 EDGE = 0.9 * HEIGHT / FOCAL  # m

@@ -13,6 +13,7 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_objects import PlaneRegion, Region, Surface
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.shader_source import SHADERS
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.declared_surfaces import UNBOUNDED_M, build_surface_table, plane_fits
 from deltalight.render_server.scene.depth_surface import depth_surface
@@ -207,6 +208,7 @@ def test_how_depth_saw_a_plane() -> None:
     place = look_at().world_from_camera
     surface = depth_surface(view.depth, camera())
     fits = plane_fits(table, view.depth, lambda: surface, place, 0.001)
+    assert f"plane_fits[{len(fits)}]" in (SHADERS / "common/measured_surfaces.glsl").read_text()
     assert fits[0] == pytest.approx([0.008, 0.002], rel=0.1)
     assert fits[1].tolist() == [0.0, UNBOUNDED_M]
     assert (plane_fits(table, None, lambda: surface, place, 0.001)[:, 1] == UNBOUNDED_M).all()
