@@ -1,9 +1,9 @@
 """A camera's blur on the virtual part of a picture ([D] 6.2): its lens's, measured at the board's edges, and motion.
 
 The response to an edge is taken as Gaussian, a pixel's own area included, so the MTF is exp(-2 (pi sigma f)^2). One
-figure holds lens, focus at the board's distance, demosaicking and sharpening; camera_defocus.py and camera_mosaic.py
-tell some of it apart where they find it. By lateral chromatic aberration the picture in red and in blue is a little
-larger or smaller than in green. During an exposure the picture moves in a straight line.
+figure holds lens, focus at the board's distance, demosaicking and sharpening; camera_defocus.py, camera_mosaic.py and
+camera_sharpening.py tell some of it apart where they find it. By lateral chromatic aberration the picture in red and
+in blue is a little larger or smaller than in green. During an exposure the picture moves in a straight line.
 """
 
 from collections.abc import Sequence

@@ -6,7 +6,7 @@ MTF is that of lens and pixel times 1 + a (1 - K), where K is the transform of G
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,9 +24,11 @@ from deltalight.render_server.post_effects.camera_blur import (
 from deltalight.render_server.post_effects.camera_edges import BIN_PX, EdgeProfile, EdgeStep
 
 RADII_PX = np.array([0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4])
-"""If the widest fits best, it is something else, such as the ringing of JPEG."""
+MASKS, ENOUGH = 5, 0.97
+"""The first radii are those of masks. They must explain that much of what wider ones do, which fit JPEG's ringing."""
 VARIANCES = np.geomspace(0.01, 1.0, 25)
 """Of a lens, px^2, besides a pixel's area. Behind a softer one, an unsharp mask of these radii hardly overshoots."""
+AMOUNTS = np.linspace(0.0, 2.0, 41)
 OUTLIER_POWER = 9.0
 """Times the median: an edge that is so much unlike a step shows something else."""
 LEAST_OVERSHOOT = 0.02
@@ -42,7 +44,7 @@ Table = Float64[np.ndarray, "variances radii"]
 class Sharpening:
     """Amount a and radius s (px) of an unsharp mask, and the variance of the blur before it, px^2.
 
-    A pixel's own area is included in that.
+    That is the median over the edges, a pixel's own area included.
     """
 
     amount: float
@@ -78,21 +80,32 @@ class _Fit:
 
 
 def _best(fits: Sequence[_Fit]) -> Sharpening | None:
-    """Return the sharpening that explains most, or None if its amount is within its error, or hardly overshoots."""
+    """Return the sharpening that explains most, each edge having a blur of its own: some may be out of focus.
+
+    None if there are few edges, or if the amount is within its error or hardly overshoots.
+    """
     powers, shares, halos = (
         np.stack([getattr(fit, name) for fit in fits]) for name in ("power", "shared", "halo")
     )
-    least = powers.min(axis=(1, 2))
+    least = powers[..., 0].min(axis=1)
     kept = least <= OUTLIER_POWER * np.median(least)
-    power, shared, halo = (each[kept].sum(axis=0) for each in (powers, shares, halos))
-    amounts = np.maximum(shared / halo, 0)
-    row, column = np.unravel_index((power - amounts**2 * halo).argmin(), amounts.shape)
-    amount = float(amounts[row, column])
-    misfits = shares[kept, row, column] - amount * halos[kept, row, column]
-    error = np.sqrt((misfits**2).sum()) / halo[row, column]
-    found = Sharpening(amount, float(RADII_PX[column]), float(VARIANCES[row]) + PIXEL_VARIANCE)
-    sure = amount > SIGNIFICANT * error and column < len(RADII_PX) - 1
-    return found if sure and _overshoot(found) >= LEAST_OVERSHOOT else None
+    kept &= powers[..., 0].argmin(axis=1) < len(VARIANCES) - 1
+    if kept.sum() < LEAST_EDGES:
+        return None
+    powers, shares, halos = powers[kept], shares[kept], halos[kept]
+    misfits = [powers - amount * (2 * shares - amount * halos) for amount in AMOUNTS]
+    sums = np.array([each.min(axis=1).sum(axis=0) for each in misfits])
+    explained = sums[0] - sums.min(axis=0)
+    column = int(explained[:MASKS].argmax())
+    step = int(sums[:, column].argmin())
+    blurs = misfits[step][..., column].argmin(axis=1)
+    shared, halo = (each[np.arange(len(blurs)), blurs, column] for each in (shares, halos))
+    amount = float(shared.sum() / halo.sum())
+    error = np.sqrt(((shared - amount * halo) ** 2).sum()) / halo.sum()
+    sharp, middle = np.quantile(VARIANCES[blurs], [0.25, 0.5]) + PIXEL_VARIANCE
+    found = Sharpening(amount, float(RADII_PX[column]), float(middle))
+    sure = amount > SIGNIFICANT * error and explained[column] >= ENOUGH * explained.max()
+    return found if sure and _overshoot(replace(found, variance=sharp)) >= LEAST_OVERSHOOT else None
 
 
 def _overshoot(sharpening: Sharpening) -> float:
