@@ -28,7 +28,9 @@ class Matting:
         self._band = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
         self._nearest_kernel = Kernel(gpu, "nearest_depth")
         self._band_kernel = Kernel(gpu, "matting_band", BLOCK=BLOCK)
+        self._estimate, self._contrast = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._kernel = Kernel(gpu, "matting", BLOCK=BLOCK, SURFACE_REACH=SURFACE_REACH)
+        self._fusion = Kernel(gpu, "matte_fusion", SURFACE_REACH=SURFACE_REACH)
 
     def run(
         self,
@@ -56,6 +58,7 @@ class Matting:
             own,
             rectangle=rectangle,
             nearest_depth=self._within_reach,
+            estimate_out=self._estimate,
             Texels=self._band,
         )
         self._kernel.run(
@@ -63,10 +66,21 @@ class Matting:
             scene,
             own,
             nearest_depth=self._within_reach,
+            estimate_out=self._estimate,
+            contrast_out=self._contrast,
+            Texels=self._band,
+            sight=float(sight),
+        )
+        self._fusion.run(
+            (self._threads,),
+            scene,
+            own,
+            rectangle=rectangle,
+            estimate=self._estimate,
+            contrast=self._contrast,
             object_coverage=coverage.texture,
             edge_correction=unmixing.texture,
             Texels=self._band,
-            sight=float(sight),
         )
 
     def _find_nearest(self, scene: Bindings, rectangle: Rectangle, sight: int, reach: int) -> None:
@@ -95,6 +109,9 @@ class Matting:
             self._within_reach,
             self._band,
             self._nearest_kernel,
+            self._estimate,
+            self._contrast,
             self._band_kernel,
             self._kernel,
+            self._fusion,
         )

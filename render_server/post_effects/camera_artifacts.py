@@ -1,7 +1,7 @@
 """What a camera does to a picture, learned from its frames and put on the virtual part.
 
-In this order: vignetting, blur, compression, noise. Noise is last because it is measured behind the compression.
-Where the camera's mosaic is known, noise comes before it, as at the sensor, and the compression last.
+In this order: vignetting, blur, sharpening, compression, noise. Noise is last because it is measured behind the
+others. Where the camera's mosaic is known, noise comes before it, as at the sensor, and the compression last.
 """
 
 from dataclasses import dataclass, replace
@@ -37,6 +37,7 @@ from deltalight.render_server.post_effects.camera_mosaic import (
     mosaicked,
 )
 from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
+from deltalight.render_server.post_effects.camera_sharpening import CameraSharpening, Sharpening, sharpened
 from deltalight.render_server.post_effects.camera_vignetting import PaperVignetting, Vignetting, vignetted
 from deltalight.render_server.post_effects.tone import in_tone
 
@@ -57,6 +58,7 @@ class FrameArtifacts:
     compression: Compression | None = None
     distance_blur: DistanceBlur | None = None
     mosaic: Mosaic | None = None
+    sharpening: Sharpening | None = None
 
     def under(self, tone: Tone) -> Self:
         """Return what a picture gets that was made with a tone curve."""
@@ -76,6 +78,8 @@ class FrameArtifacts:
             color, coverage = self.distance_blur.applied(color, coverage, depth_m, frame.response)
         elif self.kernels is not None:
             color, coverage = blurred(color, coverage, self.kernels, frame.response)
+        if self.sharpening is not None:
+            color = sharpened(color, coverage, self.sharpening)
         if self.mosaic is None:
             return self._with_noise(self._compressed(color, coverage), coverage, self.noise)
         at_sensor = None if self.noise is None else self.noise.before_filter(NOISE_KEPT)
@@ -92,7 +96,7 @@ class FrameArtifacts:
 
 
 class CameraArtifacts:
-    """Learns a camera's noise, the blur of its lens, its vignetting, mosaic and compression; follows its motion."""
+    """Learns a camera's noise, blur, sharpening, vignetting, mosaic and compression; follows its motion."""
 
     def __init__(self) -> None:
         self._noise = CameraNoise()
@@ -100,6 +104,7 @@ class CameraArtifacts:
         self._mosaic = CameraMosaic()
         self._compression = CameraCompression()
         self._defocus = BoardDefocus()
+        self._sharpening = CameraSharpening()
         self._lens: list[LensBlur] = []
         self._last: ViewFrame | None = None
         self._pose: Float64[np.ndarray, "4 4"] = np.eye(4)
@@ -128,10 +133,10 @@ class CameraArtifacts:
             self._last, self._pose = frame, world_from_camera
         from_centre = np.nan_to_num(_pixel(frame, self._pose, place_m) - frame.camera.matrix[:2, 2])
         lens, by_distance = self._lens_blur(), self._defocus.model
-        if self._mosaic.model is not None:
-            # What was measured holds the blur of interpolation, which objects get by being interpolated.
-            lens = None if lens is None else lens.without(GREEN_VARIANCE)
-            by_distance = None if by_distance is None else by_distance.without(GREEN_VARIANCE)
+        by_others = self._variance_by_others(lens)
+        if by_others:
+            lens = None if lens is None else lens.without(by_others)
+            by_distance = None if by_distance is None else by_distance.without(by_others)
         return FrameArtifacts(
             frame,
             self._noise.model,
@@ -140,7 +145,18 @@ class CameraArtifacts:
             self._compression.model,
             self._distance_blur(lens, by_distance, from_centre),
             self._mosaic.model,
+            self._sharpening.model,
         )
+
+    def _variance_by_others(self, lens: LensBlur | None) -> float:
+        """Return how much of a measured blur's variance (px^2) is not the lens's, but what objects get separately.
+
+        Interpolation of a mosaic adds some; sharpening makes it less.
+        """
+        sharpening = self._sharpening.model
+        by_mosaic = 0.0 if self._mosaic.model is None else GREEN_VARIANCE
+        by_sharpening = 0.0 if sharpening is None or lens is None else lens.sigma_px**2 - sharpening.variance
+        return by_mosaic + by_sharpening
 
     def _distance_blur(
         self, lens: LensBlur | None, defocus: Defocus | None, from_centre_px: Float64[np.ndarray, " 2"]
@@ -175,7 +191,9 @@ class CameraArtifacts:
         edges = edge_steps(frame)
         if wants_lens:
             found = measure_blur(edges)
-            self._lens += [] if found is None else [found]
+            if found is not None:
+                self._lens.append(found)
+                self._sharpening.observe(edges, frame.response)
         if wants_defocus:
             self._defocus.observe(frame, edges)
 

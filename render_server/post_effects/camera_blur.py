@@ -1,13 +1,14 @@
 """A camera's blur on the virtual part of a picture ([D] 6.2): its lens's, measured at the board's edges, and motion.
 
 The response to an edge is taken as Gaussian, a pixel's own area included, so the MTF is exp(-2 (pi sigma f)^2). One
-figure holds lens, focus at the board's distance, demosaicking and sharpening; camera_defocus.py and camera_mosaic.py
-tell some of it apart where they find it. By lateral chromatic aberration the picture in red and in blue is a little
-larger or smaller than in green. During an exposure the picture moves in a straight line.
+figure holds lens, focus at the board's distance, demosaicking and sharpening; camera_defocus.py, camera_mosaic.py and
+camera_sharpening.py tell some of it apart where they find it. By lateral chromatic aberration the picture in red and
+in blue is a little larger or smaller than in green. During an exposure the picture moves in a straight line.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ PIXEL_VARIANCE = 1 / 12
 """Of a pixel's area; objects are rendered with it, so that much of the camera's blur is there already."""
 LEAST_EDGES = 8
 NO_MOTION = np.zeros(2)
+NARROW_PX = np.linspace(0.01, 1.0, 100)
 SOLID, LEAST_SHARE = 0.99, 1 / 512
 TINY_SHARE = 1e-6
 LEAST_MOTION_PX, LEAST_SHIFT_PX = 0.25, 0.05
@@ -84,8 +86,7 @@ def blur_kernels(
     length, apart = float(np.linalg.norm(motion_px)), float(np.abs(shifts).max())
     if lacks <= PIXEL_VARIANCE / 4 and length < LEAST_MOTION_PX and apart < LEAST_SHIFT_PX:
         return None
-    # The kernel's own texels, over which the Gaussian is integrated, have the variance of a pixel.
-    sigma = np.sqrt(max(lacks - PIXEL_VARIANCE, 1e-4))
+    sigma = _kernel_sigma(lacks)
     radius = int(np.ceil(3 * sigma + length / 2 + apart + 1))
     steps = 8 * int(np.ceil(length)) + 1
     share = (np.arange(steps) + 0.5) / steps - 0.5
@@ -96,6 +97,26 @@ def blur_kernels(
         )  # a row for each moment of the exposure
         kernels.append(np.einsum("tr,tc->rc", rows, columns))
     return np.asarray([kernel / kernel.sum() for kernel in kernels])
+
+
+def _kernel_sigma(variance: float) -> float:
+    """Return the Gaussian (px) to integrate over texels for what rendered objects lack of a blur's variance, px^2.
+
+    A wide one gets a texel's variance by that. Of a narrow one, texels keep too much contrast, so it is chosen by the
+    frequency at which the whole blur halves contrast, or the highest that pixels show.
+    """
+    if variance >= NARROW_PX[-1] ** 2 + PIXEL_VARIANCE:
+        return float(np.sqrt(variance - PIXEL_VARIANCE))
+    whole = max(variance, 0.0) + PIXEL_VARIANCE
+    frequency = min(mtf50(np.sqrt(whole)), 0.5)
+    wanted = np.exp(-2 * whole * (np.pi * frequency) ** 2) / np.sinc(frequency)
+    kept = _narrow_kernels() @ np.cos(2 * np.pi * frequency * np.arange(-6, 7))
+    return float(np.interp(-wanted, -kept, NARROW_PX))
+
+
+@cache
+def _narrow_kernels() -> Float64[np.ndarray, "n k"]:
+    return np.concatenate([_integrals(np.zeros(1), sigma, 6) for sigma in NARROW_PX])
 
 
 def _integrals(centres: Float64[np.ndarray, " t"], sigma: float, radius: int) -> Float64[np.ndarray, "t k"]:
@@ -158,7 +179,7 @@ def _blurred_part(
     weight: Float32[np.ndarray, "h w"],
 ) -> tuple[Layer, Layer, Layer]:
     """Return how much a part of the objects covers, blurred, its light times that, and the light behind it."""
-    objects, behind = (_continued(linear, known, kernels.shape[1]) for known in (cover >= SOLID, cover <= 0))
+    objects, behind = (continued(linear, known, kernels.shape[1]) for known in (cover >= SOLID, cover <= 0))
     part = (cover * weight)[..., None]
     return _by_channel(part, kernels), _by_channel(part * objects, kernels), behind
 
@@ -192,7 +213,7 @@ def _filtered(
     return np.asarray(cv2.filter2D(picture, -1, turned, borderType=cv2.BORDER_REPLICATE))
 
 
-def _continued(
+def continued(
     picture: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], width: int
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return a picture where `known`, and elsewhere the mean of what is known nearby; far from that, as it is."""

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.frames import ViewFrame, decode_lut
@@ -23,6 +23,26 @@ MOST_RESIDUAL = 0.1
 """Of an edge's contrast, rms: what lies across it is something else."""
 CODES = (4, 251)
 """An edge with pixels outside is clipped."""
+PROFILE_REACH_PX = (2.0, 4.0)
+"""How far beside an edge its profile must be seen, and how far it is kept."""
+STEEP = (0.2, 0.8)
+"""Between dark and bright: codes that tell where an edge is."""
+LEAST_STEEP = 8
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeProfile:
+    """Green codes across an edge, from its dark side to its bright side, averaged in bins.
+
+    `distance_px` is measured from where the code is halfway, `code` is 0 and 1 at the medians of both sides, which
+    are `levels` (0..255), and `pixels` is how many a bin holds. `across` is the direction in the picture.
+    """
+
+    distance_px: Float64[np.ndarray, " n"]
+    code: Float64[np.ndarray, " n"]
+    pixels: Float64[np.ndarray, " n"]
+    levels: tuple[float, float]
+    across: Float64[np.ndarray, " 2"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +51,8 @@ class EdgeStep:
 
     `sigma_px` is the blur's standard deviation in green. `across_px` is how far the edge is from the principal point,
     measured across it, `red_px` and `blue_px` how far beside it red and blue are. Its middle is at the depth
-    1 / `inverse_m`, along the optical axis, and `radius_px` from the principal point.
+    1 / `inverse_m`, along the optical axis, and `radius_px` from the principal point. `profile` is None if too little
+    is seen beside it.
     """
 
     sigma_px: float
@@ -40,6 +61,7 @@ class EdgeStep:
     blue_px: float
     inverse_m: float
     radius_px: float
+    profile: EdgeProfile | None
 
 
 def edge_steps(frame: ViewFrame) -> list[EdgeStep]:
@@ -116,7 +138,39 @@ def _edge_step(frame: ViewFrame, edge: _Edge) -> EdgeStep | None:
     (_, red), (sigma, green), (_, blue) = steps
     from_centre = ends.mean(axis=0) - frame.camera.matrix[:2, 2]
     radius = float(np.linalg.norm(from_centre))
-    return EdgeStep(sigma, float(across @ from_centre), red - green, blue - green, edge.inverse_m, radius)
+    profile = _profile(distance[used], along[used] / edge.length - 0.5, codes[used][:, 1], across)
+    return EdgeStep(
+        sigma, float(across @ from_centre), red - green, blue - green, edge.inverse_m, radius, profile
+    )
+
+
+def _profile(
+    distance: Float64[np.ndarray, " n"],
+    along: Float64[np.ndarray, " n"],
+    codes: UInt8[np.ndarray, " n"],
+    across: Float64[np.ndarray, " 2"],
+) -> EdgeProfile | None:
+    """Return the profile of an edge, put straight: the board's pose may be off by part of a pixel.
+
+    `along` is -0.5 at one end of the edge and 0.5 at the other.
+    """
+    reach = float(np.abs(distance).max())
+    below, above = (float(np.median(codes[side * distance > reach / 2])) for side in (-1, 1))
+    if reach < PROFILE_REACH_PX[0] or below == above:
+        return None
+    value = (codes - min(below, above)) / abs(above - below)
+    rising = 1 if above > below else -1
+    steep = (value > STEEP[0]) & (value < STEEP[1]) & (np.abs(distance) < PROFILE_REACH_PX[0])
+    if steep.sum() < LEAST_STEEP:
+        return None
+    columns = np.stack([value - 0.5, np.ones_like(value), along], axis=1)
+    _, shift, tilt = np.linalg.lstsq(columns[steep], distance[steep], rcond=None)[0]
+    distance = rising * (distance - shift - tilt * along)
+    kept = np.abs(distance) <= PROFILE_REACH_PX[1]
+    _, bins = np.unique(np.round(distance[kept] / BIN_PX).astype(int), return_inverse=True)
+    count = np.bincount(bins).astype(np.float64)
+    middle, mean = (np.bincount(bins, each[kept]) / count for each in (distance, value))
+    return EdgeProfile(middle, mean, count, (min(below, above), max(below, above)), rising * across)
 
 
 def _fitted_steps(

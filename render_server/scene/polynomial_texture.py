@@ -1,5 +1,6 @@
 """Polynomial texture maps (Malzbender et al. 2001): texels by the light's direction (docs/method.md 6.8)."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,11 @@ POLYNOMIAL_TYPE = "ptm"
 MOST_TEXELS_EDGE = 512  # that are kept
 _DIRECTIONS = 64  # over which a texel's albedo is averaged
 _ROWS = 32  # of texels that are decoded at a time
-_ADVICE = "export it again as a PTM of RGB coefficients (18 planes in JPEG)"
+_SEPARATE = (POLYNOMIAL_TYPE, "rgb", 3 * TERMS)  # type, colour space, and planes: six for each colour
+_LUMINANCE = (POLYNOMIAL_TYPE, "lrgb", 3 + TERMS)  # a colour, and six of the luminance that scales it
+_ADVICE = "export it again as a PTM of RGB or LRGB coefficients (18 or 9 planes, in JPEG)"
+
+Plane = Float32[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,22 +78,57 @@ def polynomial_terms(directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarr
 
 
 def read_polynomial_texture(folder: Path) -> PolynomialTexture:
-    """Reads a PTM in the web format of Relight: `info.json` and `plane_0.jpg` to `plane_5.jpg`.
+    """Reads a PTM in the web format of Relight: `info.json`, and `plane_0.jpg` to `plane_5.jpg` of RGB coefficients.
+
+    Of LRGB coefficients, `plane_0.jpg` holds the colours, and `plane_1.jpg` and `plane_2.jpg` three terms each.
 
     Raises:
         DeltalightError: a file is missing or damaged, or it is another kind of map.
     """
     info = read_info(folder, "a PTM")
-    if (info.get("type"), info.get("colorspace"), info.get("nplanes")) != (POLYNOMIAL_TYPE, "rgb", 3 * TERMS):
-        raise DeltalightError(f"{folder}/{INFO_NAME} describes no PTM of RGB coefficients; {_ADVICE}.")
+    kind = (info.get("type"), info.get("colorspace"), info.get("nplanes"))
+    if kind not in (_SEPARATE, _LUMINANCE):
+        raise DeltalightError(
+            f"{folder}/{INFO_NAME} describes no PTM of RGB or LRGB coefficients; {_ADVICE}."
+        )
+    count = (_SEPARATE if kind == _SEPARATE else _LUMINANCE)[2]
     try:
         scale, bias = (
-            finite_array(info["materials"][0][key]).reshape(TERMS, 1, 1, 3) for key in ("scale", "bias")
+            finite_array(info["materials"][0][key]).astype(np.float32).reshape(count)
+            for key in ("scale", "bias")
         )
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DeltalightError(f"{folder}/{INFO_NAME} lacks whole scales and biases; {_ADVICE}.") from error
-    codes = (read_codes(folder / f"plane_{term}.jpg").astype(np.float32) for term in range(TERMS))
-    each = [averaged(plane, MOST_TEXELS_EDGE) for plane in codes]
-    if len({plane.shape for plane in each}) > 1:
-        raise DeltalightError(f"the planes of {folder} have several sizes; {_ADVICE}.")
-    return PolynomialTexture(np.asarray((np.stack(each) / 255 - bias) * scale, np.float16))
+    terms = _separate_terms if kind == _SEPARATE else _luminance_terms
+    planes = terms(_pictures(folder, count // 3), scale, bias)
+    return PolynomialTexture(
+        np.stack([averaged(plane, MOST_TEXELS_EDGE).astype(np.float16) for plane in planes])
+    )
+
+
+def _pictures(folder: Path, count: int) -> Iterator[Plane]:
+    """Yields the codes / 255 of all planes, which have one size."""
+    shapes = set()
+    for number in range(count):
+        codes = read_codes(folder / f"plane_{number}.jpg")
+        shapes.add(codes.shape)
+        if len(shapes) > 1:
+            raise DeltalightError(f"the planes of {folder} have several sizes; {_ADVICE}.")
+        yield codes / np.float32(255)
+
+
+def _separate_terms(
+    pictures: Iterator[Plane], scale: Float32[np.ndarray, "18"], bias: Float32[np.ndarray, "18"]
+) -> Iterator[Plane]:
+    for picture, by, off in zip(pictures, scale.reshape(TERMS, 3), bias.reshape(TERMS, 3), strict=True):
+        yield (picture - off) * by
+
+
+def _luminance_terms(
+    pictures: Iterator[Plane], scale: Float32[np.ndarray, "9"], bias: Float32[np.ndarray, "9"]
+) -> Iterator[Plane]:
+    """Yields coefficients of R, G and B: those of luminance times the colours, which have no scale of their own."""
+    colors = next(pictures)
+    for picture, by, off in zip(pictures, scale.reshape(3, 3)[1:], bias.reshape(3, 3)[1:], strict=True):
+        terms = (picture - off) * by
+        yield from (terms[..., channel, None] * colors for channel in range(3))

@@ -1,6 +1,6 @@
 """Things with known mattes before a background, hair and a hand, as a colour camera and a depth camera see them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,6 +33,11 @@ class Thing:
 
     def view(self, **changes: object) -> ViewFrame:
         return frame(self.color, depth=self.depth, **changes)
+
+    def again(self, seed: int) -> "Thing":
+        """The next picture: the colour camera has other noise; depth is as it was."""
+        linear = self.alpha[..., None] * self.front + (1 - self.alpha[..., None]) * self.back
+        return replace(self, color=_exposed(linear, np.random.default_rng(seed)))
 
     @property
     def by_depth(self) -> np.ndarray:
@@ -70,11 +75,15 @@ def _before(
     front = np.array(color_linear) * (1 + _smooth(random, 2.0, 0.25))[..., None]
     back = _background(pattern, random)
     linear = alpha[..., None] * front + (1 - alpha[..., None]) * back
-    linear = np.clip(linear + SENSOR_NOISE * random.standard_normal(linear.shape), 0, 1)
-    lut = decode_lut(None)[:, 0]
-    color = np.searchsorted((lut[1:] + lut[:-1]) / 2, linear).astype(np.uint8)
+    color = _exposed(linear, random)
     depth = clean_depth(depth_image(_depth(alpha, random)), color, DepthSettings())
     return Thing(alpha, front, back, color, depth)
+
+
+def _exposed(linear: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    linear = np.clip(linear + SENSOR_NOISE * random.standard_normal(linear.shape), 0, 1)
+    lut = decode_lut(None)[:, 0]
+    return np.searchsorted((lut[1:] + lut[:-1]) / 2, linear).astype(np.uint8)
 
 
 def _head(random: np.random.Generator) -> np.ndarray:

@@ -135,17 +135,17 @@ def edge_picture(slope: float = 0.2) -> tuple[np.ndarray, Float32[np.ndarray, "h
 
 
 def spread_px(picture: np.ndarray, slope: float = 0.2) -> float:
-    """Standard deviation of the line-spread function across the edge."""
+    """Standard deviation of the line-spread function across the edge, less the pixel over which steps are taken."""
     rows = np.arange(64)[8:-8]
     profile = linear(picture)[8:-8, :, 0]
     steps = np.diff(profile, axis=1)
     where = np.arange(95) + 0.5 - 48 + 0.5 - slope * (rows[:, None] + 0.5 - 32)
     mean = (steps * where).sum() / steps.sum()
     across = float((steps * (where - mean) ** 2).sum() / steps.sum())
-    return float(np.sqrt(across / (1 + slope**2)))
+    return float(np.sqrt((across - PIXEL_VARIANCE) / (1 + slope**2)))
 
 
-@pytest.mark.parametrize("sigma_px", [0.6, 1.0, 1.7])
+@pytest.mark.parametrize("sigma_px", [0.45, 0.6, 1.0, 1.7])
 def test_an_objects_edge_is_as_soft_as_the_lens(sigma_px: float) -> None:
     picture, coverage = edge_picture()
     kernels = blur_kernels(LensBlur(sigma_px), NO_MOTION, NO_MOTION)
@@ -157,6 +157,17 @@ def test_an_objects_edge_is_as_soft_as_the_lens(sigma_px: float) -> None:
     assert np.array_equal(soft[untouched], picture[untouched])
     assert soft[:, 80:].min() == soft[:, 80:].max() == picture[0, 95, 0]
     assert covered.sum() == pytest.approx(coverage.sum(), rel=0.01)
+
+
+@pytest.mark.parametrize("sigma_px", [0.35, 0.45, 0.6, 0.8, 1.0, 1.7])
+def test_kernels_halve_contrast_where_the_lens_does(sigma_px: float) -> None:
+    """Together with the pixels of a rendered object, whose transform is a sinc; at Nyquist if that is before."""
+    kernels = blur_kernels(LensBlur(sigma_px), NO_MOTION, NO_MOTION)
+    assert kernels is not None
+    frequency = min(mtf50(sigma_px), 0.5)
+    at = np.arange(kernels.shape[1]) - kernels.shape[1] // 2
+    kept = np.sinc(frequency) * float(kernels[1].sum(axis=0) @ np.cos(2 * np.pi * frequency * at))
+    assert kept == pytest.approx(np.exp(-2 * (np.pi * sigma_px * frequency) ** 2), rel=0.02)
 
 
 def test_what_is_behind_an_edge_is_not_blurred() -> None:

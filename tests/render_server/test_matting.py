@@ -110,6 +110,23 @@ def test_fingers_that_depth_misses_are_found(objects: ObjectsRenderer, stage: St
     assert after[1] > before[1] + 8
 
 
+@pytest.mark.parametrize(("pattern", "most"), [("plain", 1.12), ("wood", 5.5), ("checks", 1.12)])
+def test_noise_changes_pictures_little(
+    objects: ObjectsRenderer, stage: Stage, pattern: str, most: float
+) -> None:
+    """From frame to frame, in the band, as a multiple of the camera's own change; in wood, colours tell less."""
+    first, document = hand(pattern), matted(unlit(glowing(stage)))
+    things = [first.again(seed) for seed in range(4)]
+    band = first.band(REACH_PX)
+    pictures = [255 * coded(objects.linear(document, each.view(pose=ABOVE))) for each in things]
+    found, cameras = (
+        np.sqrt(np.mean(np.diff([each[band] for each in taken], axis=0) ** 2) / 2)
+        for taken in (pictures, [each.color.astype(float) for each in things])
+    )
+    print(f"\n{pattern}: r.m.s. deviation {found:.2f} codes, of the camera's pictures {cameras:.2f}")
+    assert found < most * cameras
+
+
 @pytest.mark.parametrize("distortion", [0.0, -0.3])
 def test_through_a_lens_with_antialiasing(objects: ObjectsRenderer, stage: Stage, distortion: float) -> None:
     lens, thing = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0)), hairy_head("plain")

@@ -142,6 +142,53 @@ def test_a_folder_of_relight_is_read(tmp_path: Path) -> None:
     assert found.coefficients[:, 5, 7] == pytest.approx(CODED, abs=0.012)  # half a code, and JPEG's rounding
 
 
+COLORS = np.array([[[200, 100, 60]] * 16 + [[80, 160, 240]] * 16] * 24, np.uint8)
+
+
+def luminance_folder(folder: Path, coded: np.ndarray) -> Path:
+    """A map of two colours whose luminance has these coefficients (6,) everywhere."""
+    folder.mkdir(exist_ok=True)
+    scale, bias = np.array([1, 1, 1, 2.0, 2.0, 3.0, 2.0, 1.5, 2.0]), np.array([0, 0, 0, *[0.5] * 6])
+    terms = np.tile(np.rint(255 * (coded / scale[3:] + bias[3:])), (24, 32, 1)).astype(np.uint8)
+    for number, codes in enumerate((COLORS, terms[..., :3], terms[..., 3:])):
+        Image.fromarray(codes).save(folder / f"plane_{number}.jpg", quality=100, subsampling=0)
+    info = {"type": "ptm", "colorspace": "lrgb", "nplanes": 9}
+    info["materials"] = [{"scale": scale.tolist(), "bias": bias.tolist()}]
+    (folder / "info.json").write_text(json.dumps(info))
+    return folder
+
+
+def test_a_folder_of_luminance_is_read(tmp_path: Path) -> None:
+    """A polynomial of luminance times the colour: 1, lu, lv from one picture, lu^2, lu lv, lv^2 from the next."""
+    found = read_polynomial_texture(luminance_folder(tmp_path / "map", CODED[:, 0]))
+    assert found.coefficients.shape == (6, 24, 32, 3)
+    for row, column in ((5, 7), (20, 30)):
+        wanted = np.outer(CODED[:, 0], COLORS[row, column] / 255)
+        assert found.coefficients[:, row, column] == pytest.approx(wanted, abs=0.018)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (
+            lambda folder: _rewritten(folder, lambda info: info.update(nplanes=18)),
+            "describes no PTM of RGB or",
+        ),
+        (
+            lambda folder: _rewritten(folder, lambda info: info["materials"][0]["bias"].pop()),
+            "lacks whole sc",
+        ),
+        (lambda folder: (folder / "plane_2.jpg").unlink(), "plane_2.jpg cannot be read as a picture"),
+        (lambda folder: Image.new("RGB", (8, 8)).save(folder / "plane_1.jpg"), "have several sizes"),
+    ],
+)
+def test_bad_maps_of_luminance(tmp_path: Path, change: Callable[[Path], None], sentence: str) -> None:
+    folder = luminance_folder(tmp_path / "map", CODED[:, 0])
+    change(folder)
+    with pytest.raises(DeltalightError, match=sentence):
+        read_polynomial_texture(folder)
+
+
 def test_a_file_holds_the_map(tmp_path: Path) -> None:
     write_material(tmp_path / "map.dlmat", two_halves())
     again = read_material(tmp_path / "map.dlmat")
@@ -167,7 +214,7 @@ def _rewritten(folder: Path, change: Callable[[dict[str, Any]], object]) -> None
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (_without("type"), "describes no PTM of RGB coefficients"),
+        (_without("type"), "describes no PTM of RGB or LRGB coefficients"),
         (_without("materials"), "lacks whole scales and biases"),
         (
             lambda folder: _rewritten(

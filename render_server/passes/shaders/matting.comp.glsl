@@ -11,6 +11,10 @@
 
 layout(local_size_x = 64) in;
 uniform float sight;        // pixels, length of the rays
+// rg: mean and variance of the thing's fraction; b: 1, where colours tell it. rgb: the thing's colour minus the
+// background's. a of both: where the nearest sample of the thing is, in pixels.
+layout(rgba16f) writeonly uniform image2D estimate_out;
+layout(rgba16f) writeonly uniform image2D contrast_out;
 
 const int RAYS = 12;
 const float STEP = 3.0;    // pixels from sample to sample along a ray; farther on, GROWTH of the way so far
@@ -71,7 +75,7 @@ float log_likelihood(float a, vec3 colour, Side front, Side back) {
     return -0.5 * dot(d, x.xyz) - x.w;
 }
 
-// The thing's fraction by its posterior, and the variance of that. The moments are kept relative to the greatest
+// Mean and variance of the thing's fraction by its posterior. The moments are kept relative to the greatest
 // likelihood so far.
 vec2 posterior(vec3 colour, Side front, Side back) {
     float greatest = log_likelihood(0.0, colour, front, back);
@@ -83,7 +87,7 @@ vec2 posterior(vec3 colour, Side front, Side back) {
         greatest = max(greatest, found);
     }
     float mean = sum.y / sum.x;
-    return settled(mean, max(sum.z / sum.x - mean * mean, 0.0));
+    return vec2(mean, max(sum.z / sum.x - mean * mean, 0.0));
 }
 
 // The pixel's own F - B, given its colour and fraction.
@@ -93,21 +97,21 @@ vec3 contrast(vec3 colour, float a, Side front, Side back) {
     return max(own_front, vec3(0.0)) - max(own_back, vec3(0.0));
 }
 
-void find_matte(ivec2 pixel) {
-    float z = depth_shown(pixel), covered = antialiased ? covered_fraction(pixel, z) : 1.0;
-    if (covered <= 0.0) return;
+// Stores what the colours tell; matte_fusion.comp.glsl makes a matte of it.
+void find_estimate(ivec2 pixel) {
+    float z = depth_shown(pixel);
+    if (antialiased && covered_fraction(pixel, z) <= 0.0) return;
     Side front, back;
     look_around(pixel, z, front, back);
     if (!has_step(front, back, z)) return;
     vec3 colour = texelFetch(linear_picture, pixel, 0).rgb;
     vec2 found = posterior(colour, front, back);
-    if (found.y > UNKNOWN) return;   // no better than a guess
-    float known, a = combined_fraction(pixel, covered, found, known);
-    store_edge(pixel, covered, a, known, contrast(colour, a, front, back), front.nearest);
+    imageStore(estimate_out, pixel, vec4(found, 1.0, float(front.nearest.x)));
+    imageStore(contrast_out, pixel, vec4(contrast(colour, found.x, front, back), float(front.nearest.y)));
 }
 
 void main() {
     int width = textureSize(real_surface_position, 0).x;
     for (uint i = first_item(); i < listed_count(); i += items_apart())
-        find_matte(texel_of_index(texels[i], width));
+        find_estimate(texel_of_index(texels[i], width));
 }
