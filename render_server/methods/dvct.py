@@ -29,10 +29,10 @@ from deltalight.render_server.methods.method import (
     march_defines,
     resolve_voxel_cones,
 )
+from deltalight.render_server.methods.per_volume import PerVolume, Several
+from deltalight.render_server.methods.volume_lights import VolumeLights, volume_light_stages
 from deltalight.render_server.methods.volume_placement import (
-    SizeOf,
-    only_one,
-    volume_placement,
+    Placements,
     volume_placements,
 )
 from deltalight.render_server.methods.voxel_volumes import (
@@ -42,6 +42,7 @@ from deltalight.render_server.methods.voxel_volumes import (
     affordable_size,
     delta_voxel_stages,
     joint_voxels,
+    make_room,
     placed_volume,
     sets_memory_mb,
 )
@@ -62,7 +63,7 @@ from deltalight.render_server.passes.split_injection import (
     ResolveInjection,
     SplitInjection,
 )
-from deltalight.render_server.passes.volumes import MOST_VOLUMES, VolumePlacement
+from deltalight.render_server.passes.volumes import MOST_VOLUMES
 from deltalight.render_server.passes.voxel_light import NO_SUPPORT, AlbedoTexture
 from deltalight.render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
@@ -70,7 +71,8 @@ from deltalight.render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memo
 class InjectedVoxels:
     """V_delta and V_rho with the joint opacity of V_eta, filled by split injection ([P1] 3.2).
 
-    Two isotropic mipmaps: (V_delta, V_eta) with signed radiance, and (V_rho, V_eta).
+    Two isotropic mipmaps: (V_delta, V_eta) with signed radiance, and (V_rho, V_eta). Those of several volumes lie
+    side by side.
     """
 
     directions = 1
@@ -78,20 +80,26 @@ class InjectedVoxels:
     def __init__(self, gpu: GpuContext, size: int) -> None:
         self.delta, self.rho = (VoxelMipmap(gpu, size, self.directions) for _ in range(2))
         self.real, self.objects = (VoxelSet(gpu, size, [self.delta, self.rho]) for _ in range(2))
-        self._albedo = RealAlbedo(gpu)
+        self._albedo = Several(lambda: RealAlbedo(gpu))
         self._inject = SplitInjection(gpu)
         self._resolve = ResolveInjection(gpu)
         self._filter = FilterIsotropic(gpu)
 
-    def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
+    def voxelize_real(self, real: GeometryState, placements: Placements) -> VoxelSet:
         """Voxelises the real scene."""
-        self.real.fill(real.parts, placement)
-        return self.real
+        return self._fill(self.real, real, placements)
 
-    def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
+    def voxelize_objects(self, objects: GeometryState, placements: Placements) -> VoxelSet:
         """Voxelises the objects."""
-        self.objects.fill(objects.parts, placement)
-        return self.objects
+        return self._fill(self.objects, objects, placements)
+
+    def _make_room(self, placements: Placements) -> None:
+        make_room(self.real, (self.delta, self.rho, self.objects), placements)
+
+    def _fill(self, voxels: VoxelSet, geometry: GeometryState, placements: Placements) -> VoxelSet:
+        self._make_room(placements)
+        voxels.fill_all([geometry.parts] * len(placements), placements)
+        return voxels
 
     def find_albedo(
         self,
@@ -99,31 +107,32 @@ class InjectedVoxels:
         seen: Observation,
         albedo: AlbedoTexture,
         _lights: LightSet,
-        lights: LightBuffers,
+        lights: PerVolume[LightBuffers],
         _environment: moderngl.TextureArray,
-    ) -> RealAlbedo:
+    ) -> PerVolume[RealAlbedo]:
         """Computes the real scene's albedo as seen from the lights."""
         seen.image.build_levels()
-        self._albedo.run(lights, {**surfel_scene(seen, lights, albedo), **placed.volume.bindings})
-        return self._albedo
+        found = self._albedo.of(len(lights))
+        for volume, (each, own) in enumerate(zip(found, lights, strict=True)):
+            each.run(own, {**surfel_scene(seen, own, albedo), **placed.volume.bindings}, volume)
+        return PerVolume(found)
 
     def inject(
         self,
         real: VoxelSet,
         objects: VoxelSet,
-        found: RealAlbedo,
+        found: PerVolume[RealAlbedo],
         geometry: GeometryState,
         seen: Observation,
         albedo: AlbedoTexture,
-        lights: LightBuffers,
+        lights: PerVolume[LightBuffers],
     ) -> tuple[VoxelSet, VoxelSet]:
         """Injects the light of all maps."""
-        scene = {
-            **surfel_scene(seen, lights, albedo),
-            **geometry.materials.bindings,
-            **real.volume.bindings,
-        }
-        self._inject.run(real.store, objects.store, lights, found.atlas, scene)
+        shared = {**geometry.materials.bindings, **real.volume.bindings}
+        self._inject.begin(real.store, objects.store)
+        for volume, (seen_albedo, own) in enumerate(zip(found, lights, strict=True)):
+            scene = {**surfel_scene(seen, own, albedo), **shared}
+            self._inject.add(real.store, objects.store, own, seen_albedo.atlas, scene, volume=volume)
         return real, objects
 
     def filter(self, injected: tuple[VoxelSet, VoxelSet]) -> "InjectedVoxels":
@@ -148,9 +157,15 @@ class InjectedVoxels:
 
 
 def injection_stages(
-    g: Graph, s: FrameResources, lit: LitScene, voxels: InjectedVoxels, placement: Resource[VolumePlacement]
+    g: Graph,
+    s: FrameResources,
+    lit: LitScene,
+    voxels: InjectedVoxels,
+    placement: Resource[Placements],
+    lights: VolumeLights,
 ) -> Resource[InjectedVoxels]:
     """Declares voxelisation of both geometries, real albedo, injection and filtering."""
+    real_maps, object_maps = volume_light_stages(g, s, lit, placement, lights)
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     albedo = g.stage(
         "real albedo",
@@ -159,7 +174,7 @@ def injection_stages(
         s.measured,
         s.albedo,
         s.lights,
-        lit.real_maps,
+        real_maps,
         lit.environment,
     )
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
@@ -172,7 +187,7 @@ def injection_stages(
         s.objects,
         s.measured,
         s.albedo,
-        lit.object_maps,
+        object_maps,
     )
     return g.stage("filter", voxels.filter, injected)
 
@@ -244,15 +259,16 @@ class UnchangedCones:
         release_all(*(self._made or ()))
 
 
-def _may_divide(settings: DvctMethod) -> bool:
-    """Whether objects far apart get volumes of their own: shadow cones and a given edge mean a single one."""
-    return settings.resolved_shadow == "map" and settings.volume_edge_m is None
+def _placements(
+    g: Graph, s: FrameResources, setup: Setup[DvctMethod], directions: int
+) -> Resource[Placements]:
+    """Declares the cubes of voxels, as large as the budget and the GPU let several be."""
+    settings, size = setup.settings, setup.resolved.volume_size
 
+    def size_of(count: int) -> int:
+        return affordable_size(size, count, settings.memory_budget_mb, g.gpu, directions)
 
-def _volume_sizes(gpu: GpuContext, settings: DvctMethod, resolved: ResolvedSettings) -> SizeOf:
-    if not _may_divide(settings):
-        return only_one(resolved.volume_size)
-    return lambda count: affordable_size(resolved.volume_size, count, settings.memory_budget_mb, gpu)
+    return volume_placements(g, s, size_of, settings.volume_edge_m, settings.tier)
 
 
 def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
@@ -264,9 +280,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     g.section("voxels")
     voxels = g.shared("voxels", lambda: DeltaVoxels(g.gpu, settings, resolved.volume_size))
     with bounced_later(g, s, lit, settings.tier):
-        placement = volume_placements(
-            g, s, _volume_sizes(g.gpu, settings, resolved), settings.volume_edge_m, settings.tier
-        )
+        placement = _placements(g, s, setup, DIRECTIONS)
         mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
     shading = Shading(
         g.gpu,
@@ -347,8 +361,11 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     g.section("voxels")
     voxels = g.shared("voxels", lambda: InjectedVoxels(g.gpu, resolved.volume_size))
     with bounced_later(g, s, lit, settings.tier):
-        placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
-        injected = injection_stages(g, s, lit, voxels, placement)
+        placement = _placements(g, s, setup, voxels.directions)
+        lights = g.shared(
+            "volume lights", lambda: VolumeLights(g.gpu, resolved, settings.shadow_samples, settings.tier)
+        )
+        injected = injection_stages(g, s, lit, voxels, placement, lights)
     shadow_cones = voxels.directions if settings.resolved_shadow == "cone" else None
     tier = settings.tier
     direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones, reuses=tier.refresh_tiles > 0)
@@ -378,13 +395,12 @@ def state_memory(settings: DvctMethod, resolved: ResolvedSettings) -> str:
         DeltalightError: it is beyond the budget.
     """
     size, budget_mb = resolved.volume_size, settings.memory_budget_mb
-    if settings.operator == "paper":
-        return memory_statement(size, 1, budget_mb)
-    stated = memory_statement(size, DIRECTIONS, budget_mb, FAR_SIZE)
-    divided = affordable_size(size, MOST_VOLUMES, budget_mb) if _may_divide(settings) else 0
-    if not divided:
+    directions = DIRECTIONS if settings.operator == "exact" else InjectedVoxels.directions
+    stated = memory_statement(size, directions, budget_mb, FAR_SIZE if directions == DIRECTIONS else 0)
+    divided = affordable_size(size, MOST_VOLUMES, budget_mb, directions=directions)
+    if settings.volume_edge_m is not None or not divided:
         return stated
-    divided_mb = sets_memory_mb(divided, MOST_VOLUMES)
+    divided_mb = sets_memory_mb(divided, MOST_VOLUMES, directions)
     return f"{stated}; objects far apart: up to {MOST_VOLUMES} of {divided}^3, {divided_mb} MB"
 
 

@@ -27,8 +27,11 @@ SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around th
 LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
 
 Points = Float64[np.ndarray, "n 3"]
-Fitted = tuple[tuple[Light, ...], tuple[Light, ...], GeometryState, ObjectExtent, SurfaceTable, bool]
-"""Lights, those that come with objects, room, objects, mirrors, and whether only the shadows of the objects count."""
+Fitted = tuple[
+    tuple[Light, ...], tuple[Light, ...], GeometryState, ObjectExtent, SurfaceTable, bool, ObjectExtent
+]
+"""Lights, those that come with objects, room, objects, mirrors, whether only the objects' shadows count, and all
+objects that block light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +89,16 @@ class LightStages:
         extent: ObjectExtent,
         surfaces: SurfaceTable,
         area: Rectangle,
+        blocking: ObjectExtent | None = None,
     ) -> tuple[bytes, bytes]:
         """Fits the views: of real shadows around the objects, and closely around the objects.
 
         If an `area` of the picture is to be lit too, or lamps of objects shine everywhere, real shadows are those of
-        the whole scene. Returns the records of both, which tell whether their maps are still those of the views.
+        the whole scene. `blocking`: all objects, if the `extent` is that of some. Returns the records of both, which
+        tell whether their maps are still those of the views.
         """
-        fitted = lights.lights, lamps, real, extent, surfaces, area == NOWHERE and not lamps
+        is_around_objects = area == NOWHERE and not lamps
+        fitted = lights.lights, lamps, real, extent, surfaces, is_around_objects, blocking or extent
         if self._fitted is None or any(
             one is not other for one, other in zip(fitted, self._fitted, strict=True)
         ):
@@ -108,6 +114,7 @@ class LightStages:
         extent: ObjectExtent,
         surfaces: SurfaceTable,
         is_around_objects: bool,
+        blocking: ObjectExtent,
     ) -> None:
         receivers = self._receivers_of(real, extent) if is_around_objects else real.points
         mirrors = (
@@ -116,7 +123,13 @@ class LightStages:
             else []
         )
         self.buffers.place(
-            list(lights), real.points, receivers, extent.points, mirrors=mirrors, virtual_lights=lamps
+            list(lights),
+            real.points,
+            receivers,
+            extent.points,
+            mirrors=mirrors,
+            virtual_lights=lamps,
+            blocking=blocking.points,
         )
 
     def _receivers_of(self, real: GeometryState, extent: ObjectExtent) -> Points:
@@ -230,6 +243,8 @@ def object_extent(g: Graph, s: FrameResources) -> Resource[ObjectExtent]:
 
 def object_lamps(g: Graph, s: FrameResources) -> Resource[tuple[Light, ...]]:
     """Declares the lights that come with the objects."""
+    if "object lamps" in g:
+        return g.resource("object lamps")
     return g.value("object lamps", _lamps_of, s.objects, same=_same_lights)
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import moderngl
-import numpy as np
 
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
@@ -19,6 +18,7 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import LitScene, Points, object_bvh, object_extent
 from deltalight.render_server.methods.method import ResolvedSettings
+from deltalight.render_server.methods.volume_placement import object_boxes
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeams, Caustics
 from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -33,9 +33,7 @@ from deltalight.render_server.passes.reflections import (
     TransmittedLight,
 )
 from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
-from deltalight.render_server.passes.volumes import (
-    PlacedVolume,
-)
+from deltalight.render_server.passes.volumes import PlacedVolume
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.view import CameraView, Rectangle
@@ -233,18 +231,15 @@ class Shading:
 
         Geometry, lights, volume, and values derived from them.
         """
-        low, high = objects.bounds
         has_caustics = self._caustics is not None and casts_caustics(objects)
-        bounds = volume.placement.voxel_bounds(np.stack([low, high])).astype(float)
         return {
             **geometry,
             **self._lights.bindings,
             **volume.bindings,
+            **object_boxes(objects, volume.placements),
             "normal_offset": self._normal_offset(objects),
             "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
-            "object_low": tuple(bounds[:3]),
-            "object_high": tuple(1.0 - bounds[3:]),
             "lit_area": (0, 0, *self.size) if self.is_everywhere else area,
             "has_caustics": has_caustics,
             "beam_alpha": GREATEST_ALPHA if has_caustics else 0.0,

@@ -9,7 +9,8 @@ from jaxtyping import Float64
 
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources
-from deltalight.render_server.gpu_scene import ObjectExtent
+from deltalight.render_server.gpu.kernel import Binding
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import object_extent
 from deltalight.render_server.passes.volumes import (
@@ -64,6 +65,37 @@ def _may_stay(placed: Placements, groups: Sequence[ObjectExtent], wanted: Placem
     return len(placed) == len(wanted) and all(
         keep_placement(old, *group.bounds, new) for old, group, new in pairs
     )
+
+
+def object_boxes(objects: GeometryState, placements: Placements) -> dict[str, Binding]:
+    """Returns the voxels that hold each volume's own objects (shaders/common/object_box.glsl).
+
+    Each object belongs to one volume, so that none counts twice where volumes overlap.
+    """
+    boxes = [np.stack(objects.bounds)]
+    if len(placements) > 1:
+        own = own_extents(objects.extents, placements)
+        boxes = [_box(each, placement) for each, placement in zip(own, placements, strict=True)]
+    corners = np.zeros((2, MOST_VOLUMES, 4))
+    for volume, (placement, box) in enumerate(zip(placements, boxes, strict=True)):
+        bounds = placement.voxel_bounds(box)
+        corners[:, volume, :3] = bounds[:3], 1 - bounds[3:]
+    lows, highs = (tuple(each.ravel().tolist()) for each in corners)
+    return {"object_lows": lows, "object_highs": highs}
+
+
+def own_extents(extents: Sequence[ObjectExtent], placements: Placements) -> list[list[ObjectExtent]]:
+    """Returns each volume's own objects: those whose middles lie deeper in it than in others."""
+    own: list[list[ObjectExtent]] = [[] for _ in placements]
+    for extent in extents:
+        middle = np.mean(extent.bounds, axis=0)
+        own[int(np.argmin([each.distance_from_middle(middle) for each in placements]))].append(extent)
+    return own
+
+
+def _box(own: Sequence[ObjectExtent], placement: VolumePlacement) -> Float64[np.ndarray, "_ 3"]:
+    """Returns corners of a box around objects; the volume's middle if there are none."""
+    return np.stack(ObjectExtent.around(own).bounds) if own else placement.corners.mean(axis=0)[None]
 
 
 def place_volumes(

@@ -59,24 +59,28 @@ FAR_EDGE_M = 20.0  # its greatest edge: what lies farther lights little through 
 FAR_MARGIN = 1.05
 
 
-def sets_memory_mb(size: int, count: int) -> int:
-    """Returns the memory of `count` volume sets of six directions and of the coarse one beyond, MB."""
-    taken = 2 * count * volume_memory_bytes(size, DIRECTIONS) + volume_memory_bytes(FAR_SIZE, DIRECTIONS)
-    return math.ceil((taken + bounce_tail_bytes()) / MEGABYTE)
+def sets_memory_mb(size: int, count: int, directions: int = DIRECTIONS) -> int:
+    """Returns the memory of `count` volume sets, MB; with six directions, of the coarse volume beyond, too."""
+    taken = 2 * count * volume_memory_bytes(size, directions)
+    if directions == DIRECTIONS:
+        taken += volume_memory_bytes(FAR_SIZE, DIRECTIONS) + bounce_tail_bytes()
+    return math.ceil(taken / MEGABYTE)
 
 
-def affordable_size(size: int, count: int, budget_mb: int, gpu: GpuContext | None = None) -> int:
+def affordable_size(
+    size: int, count: int, budget_mb: int, gpu: GpuContext | None = None, directions: int = DIRECTIONS
+) -> int:
     """Returns how many voxels an edge each of `count` volumes may have, `size` at most; 0 where no size fits.
 
     The budget limits several, and what the GPU can hold, if it is given; one that does not fit is refused elsewhere.
     """
-    while count > 1 and size > 0 and not _fits(size, count, budget_mb, gpu):
+    while count > 1 and size > 0 and not _fits(size, count, budget_mb, gpu, directions):
         size -= VOLUME_STEP
     return size
 
 
-def _fits(size: int, count: int, budget_mb: int, gpu: GpuContext | None) -> bool:
-    if sets_memory_mb(size, count) > budget_mb:
+def _fits(size: int, count: int, budget_mb: int, gpu: GpuContext | None, directions: int) -> bool:
+    if sets_memory_mb(size, count, directions) > budget_mb:
         return False
     if gpu is None:
         return True
@@ -127,6 +131,14 @@ class VoxelSet:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.store, self.volume, self.groups, self._voxelize, self._clear)
+
+
+def make_room(real: VoxelSet, others: Sequence[VoxelSet | VoxelMipmap], placements: Placements) -> None:
+    """Makes room for so many volumes in the sets and mipmaps, or gives back what more of them took."""
+    wanted = placements[0].size, len(placements)
+    if wanted != (real.store.volume_size, real.store.volume_count):
+        for each in (real, *others):
+            each.resize(*wanted)
 
 
 class FarScene:
@@ -198,11 +210,7 @@ class DirectionalVoxels:
         self._occupy = OccupyVoxels(gpu)
 
     def _make_room(self, placements: Placements) -> None:
-        """Makes room for so many volumes, and gives back what more of them took."""
-        wanted = placements[0].size, len(placements)
-        if wanted != (self.real.store.volume_size, self.real.store.volume_count):
-            for each in (self.mu, self.rho, self.real, self.objects):
-                each.resize(*wanted)
+        make_room(self.real, (self.mu, self.rho, self.objects), placements)
 
     def voxelize_real(self, real: GeometryState, placements: Placements) -> VoxelSet:
         """Voxelises the real scene, with back faces if one camera saw it."""

@@ -127,11 +127,12 @@ class LightBuffers:
         *,
         mirrors: Sequence[MirrorLight] = (),
         virtual_lights: Sequence[Light] = (),
+        blocking: Float64[np.ndarray, "b 3"] | None = None,
     ) -> None:
         """Fits the views of each light, those of the scene and those that come with objects.
 
-        To the real points that may receive the objects' shadow, and to the virtual objects. Views of mirror images
-        are limited to the front of their planes.
+        To the real points that may receive the objects' shadow, and to the virtual objects; `blocking`: points of all
+        objects, if those are some. Views of mirror images are limited to the front of their planes.
         """
         self.mirrors, self._virtual_count = list(mirrors), len(virtual_lights)
         lights = [*lights, *virtual_lights]
@@ -139,7 +140,8 @@ class LightBuffers:
         shown = np.concatenate([receivers, virtual_points])
         axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
         real = self._views_around_objects.of(lights, receivers, real_points)
-        virtual = self._views_of_objects.of(lights, virtual_points, virtual_points)
+        blocking = virtual_points if blocking is None else blocking
+        virtual = self._views_of_objects.of(lights, virtual_points, blocking)
         for mirror in mirrors:
             real.append(mirror_views(mirror, receivers, real_points, mirror.tolerance_m))
             virtual.append(mirror_views(mirror, virtual_points, virtual_points))

@@ -26,14 +26,15 @@ class RealAlbedo:
         self.atlas = texture_2d(gpu, (1, 1), 4, "f2")
         self._kernel = Kernel(gpu, "real_albedo")
 
-    def run(self, lights: LightBuffers, scene: Bindings) -> None:
-        """Fills the atlas."""
+    def run(self, lights: LightBuffers, scene: Bindings, volume: int = 0) -> None:
+        """Fills the atlas, of texels in one of the scene's volumes."""
         if self.atlas.size != lights.real_atlas.size:
             self.atlas.release()
             self.atlas = texture_2d(self._gpu, lights.real_atlas.size, 4, "f2")
         threads = (list_threads(self._gpu, lights.tile_size**2),)
         for view in range(len(lights.real_views)):
-            self._kernel.run(threads, scene, albedo_out=self.atlas, view_index=view)
+            own: Bindings = {"view_index": view, "filled_volume": volume}
+            self._kernel.run(threads, own, scene, albedo_out=self.atlas)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -50,19 +51,25 @@ class SplitInjection:
         self._virtual = Kernel(gpu, "split_inject", VIRTUAL=1)
         self._divide, self._threads = Kernel(gpu, "split_radiance"), list_threads(gpu)
 
-    def run(
+    def begin(self, *stores: VoxelStore) -> None:
+        """Clears the sums."""
+        for store in stores:
+            clear_buffer(self._gpu, store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4)
+
+    def add(
         self,
         real: VoxelStore,
         virtual: VoxelStore,
         lights: LightBuffers,
         real_albedo: moderngl.Texture,
         scene: Bindings,
+        *,
+        volume: int = 0,
     ) -> None:
-        """Injects all lights; `scene` brings the objects' materials."""
-        for store in (real, virtual):
-            clear_buffer(self._gpu, store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4)
-        real_sums: Bindings = {**real.bindings, "Sums": real.delta_sums, "real_albedo": real_albedo}
-        virtual_sums: Bindings = {**virtual.bindings, "Sums": virtual.delta_sums}
+        """Injects all lights into one of the volumes; `scene` brings the objects' materials."""
+        chosen: Bindings = {"filled_volume": volume}
+        real_sums: Bindings = {**real.bindings, **chosen, "Sums": real.delta_sums, "real_albedo": real_albedo}
+        virtual_sums: Bindings = {**virtual.bindings, **chosen, "Sums": virtual.delta_sums}
         threads = (map_threads(self._gpu, lights.tile_size),)
         for real_views, virtual_views in lights.views_of_lights:
             for view in real_views:
@@ -125,7 +132,8 @@ class FilterIsotropic:
         """Rebuilds all levels from level 0."""
         for level in range(1, volume.placement.levels):
             cells = volume.placement.size >> level
-            self._kernel.run((cells,) * 3, volume.bindings, delta=delta.texture, rho=rho.texture, level=level)
+            threads = (cells, cells, cells * len(volume.placements))
+            self._kernel.run(threads, volume.bindings, delta=delta.texture, rho=rho.texture, level=level)
 
     def release(self) -> None:
         """Frees the program."""
@@ -162,6 +170,8 @@ class DeltaError:
 
         RGBA16F: irradiance, camera units; a: 1 where known. The size is the reduced grid's.
         """
+        if self._mu.texture.size != rho.texture.size:
+            self._mu.resize(real.volume_size, real.volume_count)
         clear_volume(self._gpu, self._mu.texture)
         own: Bindings = {**real.bindings, **volume.bindings}
         self._resolve.run((self._threads,), own, mu=self._mu.texture, Light=real.delta_sums)

@@ -88,6 +88,17 @@ class VolumePlacement:
         origin, edge = np.array(self.origin), self.size * self.voxel_edge
         return bool((low < origin + edge).all() and (high > origin).all())
 
+    @property
+    def corners(self) -> Float64[np.ndarray, "8 3"]:
+        """World, m; the least coordinates first, the greatest last."""
+        unit = np.indices((2, 2, 2), float).reshape(3, 8).T
+        return np.asarray(np.array(self.origin) + self.size * self.voxel_edge * unit)
+
+    def distance_from_middle(self, point: Float64[np.ndarray, "3"]) -> float:
+        """Returns how far a point (world, m) is from the middle, by the edge: 0.5 at the border (enter_volume)."""
+        relative = (point - np.array(self.origin)) / (self.size * self.voxel_edge)
+        return float(np.abs(relative - 0.5).max())
+
     def voxel_bounds(self, points: Float64[np.ndarray, "n 3"]) -> np.ndarray[Any, np.dtype[np.int32]]:
         """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
         voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)

@@ -80,6 +80,7 @@ EXTENDED: dict[Case, dict[str, Any]] = {
 }
 APART = [
     Case("exact", "model", "mirror"),
+    Case("paper", "model", "mirror"),
     Case("dlpv", "model", "mirror"),
     Case("dlpv-paper", "depth", "plain"),
 ]
@@ -171,14 +172,14 @@ def render_several(case: Case, gpu: GpuContext, folder: Path) -> None:
 
 
 def render_apart(case: Case, gpu: GpuContext, folder: Path, **method: Any) -> None:  # noqa: ANN401
-    """Renders the case's objects, and one that has a volume of its own, in the composite and as voxels."""
+    """Renders the case's objects, and one that has a volume of its own, in the composite, as voxels and its error."""
     document = scene_of(case, Stage(folder)).model_dump(mode="json", exclude_unset=True)
     far = {**document["objects"][0], "id": "far", "pose": {"translation_m": [2.0, 0, 0]}}
     document["objects"].append(far)
     scene = changed(parse_scene(document), "method", method)
     renderer = SceneRenderer(gpu, scene)
     try:
-        for view in ("composite", "volume"):
+        for view in ("composite", "volume", "error"):
             renderer.set_scene(changed(scene, "output", {"view": view}))
             renderer.render(frames_of(case)[0])
     finally:
@@ -262,7 +263,7 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{f"{case} coated": partial(render_coated, case, changes) for case, changes in EXTENDED.items()},
     **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
     **{f"{case}, objects far apart": partial(render_apart, case) for case in APART},
-    "objects far apart, live": partial(render_apart, APART[0], quality="live"),
+    **{f"{case}, objects far apart, live": partial(render_apart, case, quality="live") for case in APART[:2]},
     "by device": by_device,
     "image-based shading": image_based,
     "precomputed transfer": precomputed_transfer,

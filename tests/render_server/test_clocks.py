@@ -20,12 +20,13 @@ pytestmark = pytest.mark.usefixtures("clean_gl")
 
 LIGHT = {"environment", "object bvh", "light views"}
 MAPS = {"shadow maps real", "shadow maps objects"}
+OWN_MAPS = {"volume views", "volume maps real", "volume maps objects"}
 VOXELS = {"voxelize real", "voxelize objects"}
 CELLS = {"geometry volume real", "geometry volume"}
 STANDING = {
     "none": LIGHT | MAPS | VOXELS | {"voxelize far"},
     "exact": LIGHT | MAPS | VOXELS | {"voxelize far"},
-    "paper": LIGHT | MAPS | VOXELS,
+    "paper": LIGHT | MAPS | VOXELS | OWN_MAPS,
     "differential": LIGHT | VOXELS | {"shadow maps mu", "shadow maps rho", "voxelize far", "group surfels"},
     "dlpv": LIGHT | MAPS | VOXELS | CELLS,
     "dlpv-paper": LIGHT | MAPS | VOXELS | CELLS,
@@ -38,7 +39,7 @@ FOR_ESTIMATES = {"direct light mu", "cones mu"}
 
 REAL_ALONE = {
     *("declared surfaces", "camera", "real surface", "environment", "shadow maps real", "shadow maps mu"),
-    *("voxelize real", "voxelize far", "real voxel scene", "voxel scene mu"),
+    *("volume maps real", "voxelize real", "voxelize far", "real voxel scene", "voxel scene mu"),
     *("light real voxels", "light far voxels", "filter mu", "bounces real", "real albedo"),
     *("inject scene", "inject real", "geometry volume real", "propagate mu"),
 }

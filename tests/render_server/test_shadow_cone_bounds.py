@@ -74,7 +74,8 @@ def found_in(
         buffers = [gpu.ctx.buffer(content.tobytes()) for content in contents]
         for buffer in buffers:
             stack.callback(buffer.release)
-        bounds = {"object_low": tuple(box[0]), "object_high": tuple(box[1])}
+        padding = (0.0,) * 13  # the columns of other volumes
+        bounds = {"object_lows": (*box[0], *padding), "object_highs": (*box[1], *padding)}
         named = dict(zip(("Spheres", "Points", "Found"), buffers, strict=True))
         kernel.run((SPHERES,), lights.bindings, volume.bindings, bounds, named, count=SPHERES)
         result = np.frombuffer(buffers[2].read(), np.int32).reshape(SPHERES, 2)

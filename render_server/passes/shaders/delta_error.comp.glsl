@@ -14,6 +14,7 @@ void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
     SurfacePoint s = surface_point(texel);
+    enter_volume(s.position);
     vec3 q = volume_coordinate(s.position);
     bool known = s.present && volume_fade(q) > 0.0;
     vec3 e = vec3(0.0);

@@ -1,4 +1,5 @@
-// Filters one level of the isotropic mipmaps of V_delta and V_rho: means of eight cells ([P1] 3.2).
+// Filters one level of the isotropic mipmaps of V_delta and V_rho: means of eight cells ([P1] 3.2). Cells of further volumes
+// follow in z.
 #include "common/volume.glsl"
 
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
@@ -8,7 +9,10 @@ uniform int level;   // the level to write; >= 1
 
 void main() {
     ivec3 cell = ivec3(gl_GlobalInvocationID);
-    if (any(greaterThanEqual(cell, ivec3(volume_size >> level)))) return;
+    int cells = volume_size >> level;
+    if (any(greaterThanEqual(cell, ivec3(cells, cells, volume_count * cells)))) return;
+    work_in_volume(cell.z / cells);
+    cell.z -= volume * cells;
     ivec3 finer = level_base(level - 1, 0) + 2 * cell;
     vec4 sum_delta = vec4(0.0), sum_rho = vec4(0.0);
     for (int j = 0; j < 8; ++j) {

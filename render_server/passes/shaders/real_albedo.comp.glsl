@@ -11,6 +11,7 @@ layout(rgba16f) writeonly uniform image2D albedo_out;
 uniform sampler2D real_light_normal;
 #pragma texels rgba16f real_light_normal
 uniform int view_index;
+uniform int filled_volume;
 uniform float bias_real;   // m
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
@@ -61,6 +62,7 @@ vec3 albedo_at(LightView view, ivec2 texel) {
 }
 
 void main() {
+    work_in_volume(filled_volume);
     LightView view = listed_view(view_index);
     uint i = next_wanted(view, first_item());
     if (i < texels_of(view)) do {

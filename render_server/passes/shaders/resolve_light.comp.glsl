@@ -28,8 +28,8 @@ void main() {
             float own = float(light[i * uint(LIGHT_SUMS) + uint(ALL_DELTA + k)]);
             found[k] = (share > 0.0 ? mix(own, float(other_light[j + uint(ALL_DELTA + k)]), share) : own) / FIXED_POINT;
         }
-        ivec3 v = voxel_of_index(voxel, volume_size);
-        imageStore(delta, v, vec4(found[0], found[1], found[2], 1.0));
-        imageStore(rho, v, vec4(found[3], found[4], found[5], 1.0));
+        ivec3 v = enter_volume_of(voxel, volume_size);
+        imageStore(delta, level_base(0, 0) + v, vec4(found[0], found[1], found[2], 1.0));
+        imageStore(rho, level_base(0, 0) + v, vec4(found[3], found[4], found[5], 1.0));
     }
 }

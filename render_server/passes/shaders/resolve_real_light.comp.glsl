@@ -14,6 +14,7 @@ void main() {
         int at = int(i) * LIGHT_SUMS;
         vec3 found;
         for (int k = 0; k < 3; ++k) found[k] = float(light[at + ALL_RHO + k] - light[at + ALL_DELTA + k]);
-        imageStore(mu, voxel_of_index(touched[i], volume_size), vec4(found / FIXED_POINT, 1.0));
+        ivec3 v = enter_volume_of(touched[i], volume_size);
+        imageStore(mu, level_base(0, 0) + v, vec4(found / FIXED_POINT, 1.0));
     }
 }

@@ -2,6 +2,7 @@
 // surface that its rays light; split_radiance divides one by the other (docs/method.md 4.3). VIRTUAL walks the objects'
 // map: +Phi_rho where the light meets the object (V_delta and V_rho). REAL walks the real map: -Phi_mu of what the
 // objects keep the light off (V_delta), +Phi of what they leave lit (V_rho).
+#include "common/volume.glsl"
 #define GRID_ACCESS readonly
 #include "common/voxel_store.glsl"
 #include "common/light_rays.glsl"
@@ -13,7 +14,6 @@
 #endif
 #endif
 #include "common/packing.glsl"
-#include "common/volume.glsl"
 #include "common/split_sums.glsl"
 #include "common/map_texels.glsl"
 
@@ -26,6 +26,7 @@ uniform sampler2D virtual_light_normal;
 #pragma texels rgba16f real_albedo real_light_normal virtual_light_normal
 #pragma texels rgba32f virtual_light_uv
 uniform int view_index;
+uniform int filled_volume;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 
 const float SNAP = 0.25;   // voxels: a surface on the border of two voxels belongs to the one that it touched
@@ -33,7 +34,9 @@ const float SNAP = 0.25;   // voxels: a surface on the border of two voxels belo
 // rasterisers snap corners of triangles to 1/256 of a texel.
 const float ABOVE_ROUNDING = 0.01;
 
-uint entry_at(vec3 q) { return inside_volume(q) ? grid[voxel_index(ivec3(q), volume_size)] : 0u; }
+uint entry_at(vec3 q) {
+    return inside_volume(q) ? grid[voxel_index(ivec3(q) + ivec3(0, 0, volume * volume_size), volume_size)] : 0u;
+}
 
 // Slot of the touched voxel at q, a hair above, or next to it, -1 if there is none.
 int slot_near(vec3 q) {
@@ -159,6 +162,7 @@ void split(Light light, LightView view, ivec2 texel) {
 #endif
 
 void main() {
+    work_in_volume(filled_volume);
     LightView view = listed_view(view_index);
     Light light = listed_light(light_of_view(view_index));
     uint i = next_wanted(view, first_item());

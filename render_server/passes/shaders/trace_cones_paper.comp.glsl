@@ -14,8 +14,7 @@ layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mirrored radi
 layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb C_delta of the specular cone
 uniform sampler2D linear_picture;
 #pragma texels rgba16f linear_picture
-uniform vec3 object_low;    // voxels that hold the objects
-uniform vec3 object_high;
+#include "common/object_box.glsl"
 #else
 layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where traced
 layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb mean radiance of the specular cone
@@ -41,15 +40,28 @@ vec3 mirrored(ivec2 texel, SurfacePoint s, vec3 v, vec3 d, float half_angle) {
     return texelFetch(linear_picture, pixel, 0).rgb / max(reflectance, vec3(1e-3));
 }
 
+// The part of a cone from q that the objects of all volumes cover.
+float hidden_by_objects(vec3 q, vec3 d, float ratio) {
+    int home = volume;
+    float hidden = 0.0;
+    for (int chosen = 0; chosen < volume_count; ++chosen) {
+        work_in_volume(chosen);
+        vec3 start = coordinate_from(q, home);
+        vec2 within = box_interval(start, d, object_low() - 0.5, object_high() + 0.5);
+        hidden += (1.0 - hidden) * march(mipmap, start, d, ratio, within).a;
+    }
+    work_in_volume(home);
+    return hidden;
+}
+
 // C_delta adds the radiance of the object's voxels; their opacity removes what was mirrored from there ([P1] 3.2).
 void specular(ivec2 texel, SurfacePoint s, vec3 q) {
     vec3 v = normalize(camera_position - s.position);
     vec3 d = reflect(-v, s.normal);
     float half_angle = specular_half_angle(s.roughness);
     float ratio = 2.0 * tan(half_angle);
-    vec3 added = march(mipmap, q, d, ratio, in_volume(q, d)).rgb;
-    float hidden = march(mipmap, q, d, ratio, box_interval(q, d, object_low - 0.5, object_high + 0.5)).a;
-    store_specular(texel, hidden * mirrored(texel, s, v, d, half_angle), added);
+    vec3 added = march_on(mipmap, q, d, ratio).rgb;
+    store_specular(texel, hidden_by_objects(q, d, ratio) * mirrored(texel, s, v, d, half_angle), added);
 }
 
 void shade(ivec2 texel, SurfacePoint s) {
@@ -70,7 +82,7 @@ void shade(ivec2 texel, SurfacePoint s) {
         e = diffuse(mipmap, q, s.normal, true);
         vec3 d = reflect(normalize(s.position - camera_position), s.normal);
         float half_angle = specular_half_angle(s.roughness);
-        vec4 met = march(mipmap, q, d, 2.0 * tan(half_angle), in_volume(q, d));
+        vec4 met = march_on(mipmap, q, d, 2.0 * tan(half_angle));
         c = met.rgb + (1.0 - met.a) * environment(d, half_angle);
     }
     imageStore(irradiance_rho, texel, vec4(e, s.present ? 1.0 : 0.0));
@@ -81,5 +93,7 @@ void shade(ivec2 texel, SurfacePoint s) {
 void main() {
     ivec2 texel = ivec2(spread_place() * gl_WorkGroupSize.xy + gl_LocalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
-    shade(texel, surface_point(texel));
+    SurfacePoint s = surface_point(texel);
+    enter_volume(s.position);
+    shade(texel, s);
 }

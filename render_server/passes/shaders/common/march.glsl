@@ -229,24 +229,7 @@ void march_far(vec3 q, vec3 d, float before, float end, float ratio, inout Cross
     } while (sum.coverage < WALL && find_far(w, at, before, end, ratio));
 }
 
-const float ENDLESS = 1e30;
-
 #ifdef SEVERAL_VOLUMES
-// Of the volumes that a ray (world, m) has not `crossed`, goes to the one that it meets first after a distance t; returns where,
-// or ENDLESS.
-float enter_next(vec3 from, vec3 d, float t, uint crossed) {
-    float nearest = ENDLESS;
-    int found = 0;
-    for (volume = 0; volume < volume_count; ++volume) {
-        if ((crossed >> volume & 1u) != 0u) continue;
-        vec2 within = box_interval(from - volume_origin, d, vec3(0.0), vec3(float(volume_size) * voxel_edge));
-        float at = max(within.x, t);
-        if (at < within.y && at < nearest) { nearest = at; found = volume; }
-    }
-    volume = found;
-    return nearest;
-}
-
 // One march from q (voxels) along d, continued through other volumes and, between and behind them, the coarse scene.
 Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
     Crossed sum = Crossed(vec3(0.0), 0.0);

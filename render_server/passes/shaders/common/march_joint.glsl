@@ -9,10 +9,11 @@ const float OPAQUE = 0.99;   // opacity that ends a march
 // inside an object is blocked by its far wall.
 vec4 cone_sample(sampler3D mipmap, vec3 q, int level, vec3 d) {
 #if DIRECTIONS == 1
-    return volume_sample(mipmap, 0, volume_size, q, level, 0);
+    return volume_sample(mipmap, volume * volume_size, volume_size, q, level, 0);
 #else
     vec4 sum = vec4(0.0);
-    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(mipmap, 0, volume_size, q, level, k);
+    int first = volume * volume_size;
+    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(mipmap, first, volume_size, q, level, k);
     return sum;
 #endif
 }

@@ -22,6 +22,28 @@ vec3 cone_direction(int k) {
 
 vec2 in_volume(vec3 q, vec3 d) { return box_interval(q, d, vec3(0.0), vec3(float(volume_size))); }
 
+// (c, a) of the cone from q (voxels) through the volume at hand, and through others that are ahead; nothing is known of what
+// stands between them.
+vec4 march_on(sampler3D mipmap, vec3 q, vec3 d, float ratio) {
+    vec2 within = in_volume(q, d);
+    vec4 sum = march(mipmap, q, d, ratio, within);
+#ifdef SEVERAL_VOLUMES
+    int home = volume;
+    vec3 from = volume_origin + q * voxel_edge;
+    uint crossed = 1u << home;
+    float t = enter_next(from, d, within.y * voxel_edge, crossed);   // m
+    while (sum.a < OPAQUE && t < ENDLESS) {
+        crossed |= 1u << volume;
+        vec3 start = volume_coordinate(from);
+        float end = in_volume(start, d).y;
+        sum = accumulated(sum, march(mipmap, start, d, ratio, vec2(t / voxel_edge, end)));
+        t = enter_next(from, d, end * voxel_edge, crossed);
+    }
+    work_in_volume(home);
+#endif
+    return sum;
+}
+
 // E of the nine cones; unoccluded uniform light would give pi L.
 vec3 diffuse(sampler3D mipmap, vec3 q, vec3 n, bool with_environment) {
     mat3 basis = basis_around(n);
@@ -29,7 +51,7 @@ vec3 diffuse(sampler3D mipmap, vec3 q, vec3 n, bool with_environment) {
     for (int k = 0; k < CONES; ++k) {
         vec3 local = cone_direction(k);
         vec3 d = basis * local;
-        vec4 c = march(mipmap, q, d, RATIO, in_volume(q, d));
+        vec4 c = march_on(mipmap, q, d, RATIO);
         if (with_environment) c.rgb += (1.0 - c.a) * environment(d, HALF_ANGLE);
         e += local.z * c.rgb;
     }

@@ -60,6 +60,8 @@ vec2 box_interval(vec3 q, vec3 d, vec3 low, vec3 high) {
     return vec2(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
 }
 
+const float ENDLESS = 1e30;   // of a ray that meets nothing
+
 // The delta fades over the last voxels, so that nothing is cut off at the border.
 const float FADE_VOXELS = 4.0;
 
@@ -92,10 +94,32 @@ bool near_volume(vec3 p, float margin) {
     volume = before;
     return near;
 }
+
+// Of the volumes that a ray (world, m) has not `crossed`, goes to the one that it meets first after a distance t; returns where,
+// or ENDLESS.
+float enter_next(vec3 from, vec3 d, float t, uint crossed) {
+    float nearest = ENDLESS;
+    int found = 0;
+    for (volume = 0; volume < volume_count; ++volume) {
+        if ((crossed >> volume & 1u) != 0u) continue;
+        vec2 within = box_interval(from - volume_origin, d, vec3(0.0), vec3(float(volume_size) * voxel_edge));
+        float at = max(within.x, t);
+        if (at < within.y && at < nearest) { nearest = at; found = volume; }
+    }
+    volume = found;
+    return nearest;
+}
+
+// The coordinate of what is at q in the volume `home`.
+vec3 coordinate_from(vec3 q, int home) {
+    return volume_coordinate(volume_places[home].xyz + q * volume_places[home].w);
+}
 #else
 void work_in_volume(int chosen) {}
 
 void enter_volume(vec3 p) {}
+
+vec3 coordinate_from(vec3 q, int home) { return q; }
 
 bool near_volume(vec3 p, float margin) {
     return inside_cube(p - volume_origin + margin, float(volume_size) * voxel_edge + 2.0 * margin);
