@@ -47,9 +47,18 @@ class Declarations:
 
 
 def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = None) -> str:
-    """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines."""
+    """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines.
+
+    A process reads each shader once (`assembled`).
+    """
+    return assembled(path, tuple((name, str(value)) for name, value in (defines or {}).items()))
+
+
+@lru_cache(maxsize=1024)  # every shader in all its variants, for watchers too: renderers are made again and again
+def assembled(path: Path, defines: tuple[tuple[str, str], ...]) -> str:
+    """Returns what `shader_source` does."""
     files: list[Path] = []
-    body, given = _expand(path, files), defines or {}
+    body, given = _expand(path, files), dict(defines)
     constants = _VALUE.findall(body)
     body = _VALUE.sub(
         lambda found: f"const bool {found[1]} = {'true' if found[1] in given else 'false'};", body
