@@ -60,7 +60,9 @@ def expanded(path: Path) -> tuple[str, str]:
     """Returns the text of a shader with its includes, and a table of their files."""
     files: dict[Path, int] = {}
     body = _expand(path, files)
-    return body, "\n".join(f"// file {index}: {file.parent.name}/{file.name}" for file, index in files.items())
+    return body, "\n".join(
+        f"// file {index}: {file.parent.name}/{file.name}" for file, index in files.items()
+    )
 
 
 @lru_cache(maxsize=1024)  # in all variants, and for watchers too

@@ -30,7 +30,7 @@ from tests.services.record_samples import feeding
 from tests.services.room_samples import StandInPlacer, plans, running
 from tests.services.storage_samples import TETRAHEDRON
 
-pytestmark = pytest.mark.slow(seconds=40)
+pytestmark = pytest.mark.slow(seconds=10)
 PROCESSES = 3
 PATIENCE_S = 60.0
 
