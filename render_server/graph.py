@@ -427,14 +427,19 @@ class Graph:
 
     def _require_declared(self, stage: Stage, results: Sequence[Any], dispatches: Sequence[Dispatch]) -> None:
         """Refuses that a kernel wrote what another stage made and this one does not hand on."""
-        written = [(run.kernel, name, item) for run in dispatches for name, item in run.written.items()]
-        if not written:
+        own = {id(item) for value in results for item in gpu_objects(value)} if dispatches else set()
+        written = [
+            (run.kernel, name, item)
+            for run in dispatches
+            for name, item in run.written.items()
+            if id(item) not in own
+        ]
+        if not written:  # to look through all that the others made takes longer than a frame
             return
-        own = {id(item) for value in results for item in gpu_objects(value)}
         for other in self._resources.values():
             if other.stage is stage or other.version == 0:
                 continue
-            held = {id(item) for item in gpu_objects(other.value)} - own
+            held = {id(item) for item in gpu_objects(other.value)}
             for kernel, name, item in written:
                 if id(item) in held:
                     raise GraphError(

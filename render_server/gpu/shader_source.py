@@ -47,22 +47,37 @@ class Declarations:
 
 
 def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = None) -> str:
-    """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines."""
-    files: list[Path] = []
-    body, given = _expand(path, files), defines or {}
-    constants = _VALUE.findall(body)
+    """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines.
+
+    A process reads each shader once (`expanded`).
+    """
+    given = tuple((name, str(value)) for name, value in (defines or {}).items())
+    return _assembled(*expanded(path), given)
+
+
+@lru_cache(maxsize=512)  # every shader of the project: renderers are made again and again
+def expanded(path: Path) -> tuple[str, str]:
+    """Returns the text of a shader with its includes, and a table of their files."""
+    files: dict[Path, int] = {}
+    body = _expand(path, files)
+    return body, "\n".join(
+        f"// file {index}: {file.parent.name}/{file.name}" for file, index in files.items()
+    )
+
+
+@lru_cache(maxsize=1024)  # in all variants, and for watchers too
+def _assembled(body: str, table: str, defines: tuple[tuple[str, str], ...]) -> str:
+    given, constants = dict(defines), _VALUE.findall(body)
     body = _VALUE.sub(
         lambda found: f"const bool {found[1]} = {'true' if found[1] in given else 'false'};", body
     )
     head = [VERSION, *(f"#define {name} {value}" for name, value in given.items() if name not in constants)]
-    table = [f"// file {index}: {file.parent.name}/{file.name}" for index, file in enumerate(files)]
-    return "\n".join([*head, *table, body, ""])  # NVIDIA refuses a `#line` that no line break follows
+    return "\n".join([*head, table, body, ""])  # NVIDIA refuses a `#line` that no line break follows
 
 
-def _expand(path: Path, seen: list[Path]) -> str:
+def _expand(path: Path, seen: dict[Path, int]) -> str:
     """Returns the source of `path`, with every include that was not yet `seen` replaced by its text."""
-    seen.append(path)
-    number = len(seen) - 1
+    number = seen[path] = len(seen)
     lines = [f"#line 1 {number}"]
     for before, target, next_line in _split(path.read_text()):
         lines += before

@@ -10,6 +10,7 @@ import pytest
 from deltalight.render_server.gpu import kernel as kernel_module
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.shader_source import expanded
 from deltalight.render_server.gpu.textures import texture_2d
 from deltalight.render_server.methods import registry
 from deltalight.render_server.methods.method import SOFTWARE_DEFAULTS
@@ -53,6 +54,7 @@ def make(gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     ) -> Kernel:
         text = f"layout({local_size}) in;\n{OUT}{declared}\nvoid main() {{ {statements} }}"
         (tmp_path / "tiny.comp.glsl").write_text(text)
+        expanded.cache_clear()  # a file that changes: only here
         made.append(Kernel(gpu, "tiny", **defines))
         return made[-1]
 

@@ -75,6 +75,13 @@ def test_includes_are_recursive_and_come_once(shaders: Path) -> None:
     assert lines.index("float inner;") < lines.index("float outer;") < lines.index("void main() {}")
 
 
+def test_defines_differ_as_their_texts_do(shaders: Path) -> None:
+    (shaders / "main.glsl").write_text("void main() {}")
+    for value in (1, 1.0, "1u"):
+        text = shader_text.shader_source(shaders / "main.glsl", {"SIZE": value})
+        assert text.splitlines()[1] == f"#define SIZE {value}"
+
+
 def test_include_of_itself_ends(shaders: Path) -> None:
     (shaders / "main.glsl").write_text('#include "main.glsl"\nvoid main() {}')
     assert shader_text.shader_source(shaders / "main.glsl").count("void main()") == 1

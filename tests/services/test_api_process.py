@@ -127,7 +127,8 @@ def open_to_others(folder: Path, port: int, stdout: int) -> Iterator[subprocess.
     command = [sys.executable, "-m", "deltalight.services.cli", *words]
     running = subprocess.Popen(command, cwd=ROOT, stdout=stdout, stderr=subprocess.PIPE, text=True)
     try:
-        wait_for(lambda: httpx.get(f"http://{ports.LOOPBACK}:{port}/api/v1/health").status_code == 200)
+        with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1") as client:
+            wait_for(lambda: client.get("/health").status_code == 200)
         yield running
     finally:
         running.terminate()

@@ -23,7 +23,7 @@ from tests.services.render_server_samples import Recorder
 from tests.services.storage_samples import TETRAHEDRON
 from tests.services.test_api_process import process
 
-pytestmark = pytest.mark.slow(seconds=90)
+pytestmark = pytest.mark.slow(seconds=10)
 
 SENDERS, ROUNDS = 40, 3
 SHOWN, IDLE = "left", "right"  # cameras: one sends pictures, the other none

@@ -22,7 +22,7 @@ from deltalight.services.rooms.placer import Placement, RoomOrder
 from deltalight.services.rooms.status import RoomNode
 from tests.services.older_version import OLDER, running
 
-pytestmark = pytest.mark.slow(seconds=40)
+pytestmark = pytest.mark.slow(seconds=20)
 SIZE, FRAMES_PER_S = (96, 72), 5.0
 ROOMS = """
 slots: 2
