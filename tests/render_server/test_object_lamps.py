@@ -303,6 +303,24 @@ def test_lamps_that_make_no_light_are_refused_in_a_sentence(
         load_asset(Path(model["asset"]))
 
 
+@pytest.mark.parametrize("kind", ["directional", "spot", "point"])
+def test_a_node_of_scale_0_leaves_lights_without_direction_dark(
+    gpu: GpuContext, tmp_path: Path, kind: str
+) -> None:
+    """A sentence says so; nothing else of the picture is lost. A point needs no direction."""
+    flat = {"translation": LAMP.tolist(), "scale": [0, 0, 0]}
+    model = lamp_model(tmp_path / "lamp.glb", {**POINT, "type": kind}, flat, HOLDER)
+    lit, dark = (Lit(gpu, Stage(tmp_path), [{**model, "lamps": factor}]) for factor in (1, 0))
+    assert np.isfinite(lit.linear).all()
+    if kind == "point":
+        assert not lit.notices
+        assert (lit.linear - dark.linear)[lit.around()].mean() > 0.01
+    else:
+        (sentence,) = lit.notices
+        assert "dark while the scale of their nodes is 0 along z (node 0)" in sentence
+        assert np.array_equal(lit.codes, dark.codes)
+
+
 def test_more_lamps_than_a_scene_may_list_are_refused(gpu: GpuContext, tmp_path: Path) -> None:
     """In one file, and of all objects together, but for those whose lamps are off."""
     model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, HOLDER)
