@@ -1,5 +1,6 @@
 """One scene across frames: geometry, lights and estimates that outlive a frame, and the frame graph."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import View
+from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
 from deltalight.render_server.estimation.flat_things import SurfaceTables
@@ -31,6 +33,8 @@ from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.methods.registry import MethodChoice, choose_method
 from deltalight.render_server.passes.composite import Composite, Crossfade, Enlarge, Picture
+from deltalight.render_server.passes.shadow_maps import most_maps_bytes
+from deltalight.render_server.passes.voxels import MEGABYTE
 from deltalight.render_server.precomputed import Precomputed
 from deltalight.render_server.real_geometry import RealGeometry
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
@@ -164,8 +168,16 @@ class LiveScene:
         self._objects.load(scene.objects)
         for sentence in self._objects.left_out(scene.objects):
             self._notify(sentence)
+        self._state_lamps(scene.objects, method)
         known = before if method.keeps_world else None
         return _Plan(scene, method, LightEstimator(scene.lights, self._notify, known, waits=self._waits))
+
+    def _state_lamps(self, objects: Sequence[SceneObject], method: MethodChoice) -> None:
+        """Says how much memory the shadow maps of the objects' lamps may take."""
+        lamps = self._objects.lamps_of(objects)
+        if lamps:
+            maps_mb = math.ceil(most_maps_bytes(lamps, method.resolved.rsm_size) / MEGABYTE)
+            self._notify(f"shadow maps of the objects' lamps ({len(lamps)}): up to {maps_mb} MB")
 
     def _notify(self, sentence: str) -> None:
         if sentence not in self._notices:

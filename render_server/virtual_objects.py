@@ -116,9 +116,13 @@ class VirtualObjects:
                 self._check_material(item)
         self._check_lamps(objects)
 
-    def _check_lamps(self, objects: Sequence[SceneObject]) -> None:
+    def lamps_of(self, objects: Sequence[SceneObject]) -> list[Light]:
+        """Returns the lights that come with loaded objects, in the assets' own coordinates."""
         lit = (item for item in objects if item.visible and item.lamps)
-        count = sum(len(self._assets[item.asset].lamps(np.eye(4))) for item in lit)
+        return [lamp for item in lit for lamp in self._assets[item.asset].lamps(np.eye(4))]
+
+    def _check_lamps(self, objects: Sequence[SceneObject]) -> None:
+        count = len(self.lamps_of(objects))
         if count > MOST_LAMPS:
             raise DeltalightError(
                 f"the objects bring {count} lamps, more than {MOST_LAMPS}; switch some off with `lamps: 0`."

@@ -13,12 +13,11 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.light_maps import LitScene, light_stages
+from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages
 from deltalight.render_server.methods.lighting import (
     Layers,
     Shading,
     ShadingOptions,
-    bounced_later,
     shading_stages,
     surfel_scene,
 )

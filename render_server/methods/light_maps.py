@@ -1,5 +1,6 @@
 """Stages that fit the lights' views around objects and room, and draw their depth maps (docs/method.md 4.1)."""
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from operator import eq
 from typing import Any
@@ -24,6 +25,7 @@ from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.view import NOWHERE, Rectangle
 
 SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
+SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
 
 Points = Float64[np.ndarray, "n 3"]
@@ -220,6 +222,17 @@ def light_stages(
         given = real_maps, object_maps, s.lights, extent, s.measured
         mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
+
+
+def bounced_later(
+    g: Graph, s: FrameResources, lit: LitScene, tier: QualityTier, *also: Resource[Any]
+) -> AbstractContextManager[None]:
+    """What is declared in here may show objects that move as they were a frame before (`QualityTier.bounce_turns`).
+
+    `also`: other resources that follow the objects.
+    """
+    followers = s.objects, object_extent(g, s), lit.object_maps
+    return g.lagging(tier.bounce_turns, *followers, *lit.mirrored, *also)
 
 
 def _both_none(old: object, new: object) -> bool:

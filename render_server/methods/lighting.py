@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import moderngl
 
@@ -15,11 +14,11 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.light_maps import LitScene, Points, object_bvh, object_extent
+from deltalight.render_server.methods.cast_beams import SentBeams, beam_stages, casts_caustics
+from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, Points, object_bvh
 from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.methods.volume_placement import object_boxes
-from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeams, Caustics
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
@@ -38,20 +37,8 @@ from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.view import CameraView, Rectangle
 
-SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
-
-
-def bounced_later(
-    g: Graph, s: FrameResources, lit: LitScene, tier: QualityTier, *also: Resource[Any]
-) -> AbstractContextManager[None]:
-    """What is declared in here may show objects that move as they were a frame before (`QualityTier.bounce_turns`).
-
-    `also`: other resources that follow the objects.
-    """
-    followers = s.objects, object_extent(g, s), lit.object_maps
-    return g.lagging(tier.bounce_turns, *followers, *lit.mirrored, *also)
 
 
 def no_voxels(_: object) -> None:
@@ -88,11 +75,6 @@ def reflects_screen(objects: GeometryState) -> bool:
 def mirrors_objects(objects: GeometryState) -> bool:
     """Whether any object is smooth enough to show objects, by rays."""
     return bool(min(objects.materials.smoothest, objects.materials.smoothest_coat) < RAY_ROUGHNESS)
-
-
-def casts_caustics(objects: GeometryState) -> bool:
-    """Whether any object is smooth enough to cast caustics."""
-    return bool(objects.materials.smoothest**2 < GREATEST_ALPHA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,50 +114,6 @@ class Layers:
     direct_mu: Resource[DirectLight] | None = None
     cones_mu: Resource[ConeFields] | None = None
     transmit: Callable[[Resource[moderngl.Texture]], Resource[moderngl.Texture]] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class SentBeams:
-    """Beams that objects cast, and how far they reach (m)."""
-
-    beams: CausticBeams
-    reach_m: float
-
-
-class CastBeams:
-    """Beams that smooth objects cast, for all views."""
-
-    def __init__(self, gpu: GpuContext, lights: LightBuffers, tier: QualityTier) -> None:
-        self._lights = lights
-        self._beams = CausticBeams(gpu, blocks=tier.caustic_blocks)
-
-    def trace(
-        self,
-        objects: GeometryState,
-        bvh: ObjectBvh,
-        seen: Observation,
-        volume: PlacedVolume,
-        _lights: LightSet,
-        *_maps: object,
-    ) -> SentBeams | None:
-        """Traces the beams that smooth objects cast; None if none is smooth enough."""
-        if not casts_caustics(objects):
-            return None
-        low, high = objects.bounds
-        offset = SELF_SHADOW_TEXELS * self._lights.virtual_texel_m((low + high) / 2)
-        materials = objects.materials
-        scene = {**seen.bindings, **materials.bindings, **self._lights.bindings, "normal_offset": offset}
-        self._beams.trace(self._lights, bvh, materials, scene, bias_m=seen.scan.bias_m)
-        reach = max(each.size * each.voxel_edge for each in volume.placements)
-        return SentBeams(self._beams, reach)
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        self._beams.release()
-
-
-def no_beams(*_: object) -> None:
-    """Of a method without caustics."""
 
 
 class Shading:
@@ -415,6 +353,18 @@ class Shading:
                 item.release()
 
 
+class Behind(NamedTuple):
+    """What rays that leave the objects may meet, in the order in which stages take it."""
+
+    objects: Resource[GeometryState]
+    scene: Resource[Bindings]
+    direct: Resource[DirectLight]
+    cones: Resource[ConeFields]
+    bvh: Resource[ObjectBvh]
+    observation: Resource[Observation]
+    marching: Resource[dict[str, Binding]]
+
+
 def shading_stages(
     g: Graph,
     s: FrameResources,
@@ -439,11 +389,7 @@ def shading_stages(
         "shading scene", shading.scene, s.geometry, s.objects, s.view, volume, s.lit_area, *lit.all, s.lights
     )
     bvh = object_bvh(g, s)
-    trace_beams: Callable[..., SentBeams | None] = no_beams
-    if shading.has_caustics:
-        trace_beams = g.shared("caustic beams", lambda: CastBeams(g.gpu, lit.buffers, shading.tier)).trace
-    with bounced_later(g, s, lit, shading.tier, bvh):
-        sent = g.stage("caustic beams", trace_beams, s.objects, bvh, s.measured, volume, s.lights, *lit.all)
+    sent = beam_stages(g, s, lit, shading.tier, volume, bvh, casts=shading.has_caustics)
     beams = g.stage("caustic ends", shading.end_beams, sent, s.own_measured)
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     kept: list[Resource[Any]] = []
@@ -462,16 +408,28 @@ def shading_stages(
     if find_distant is not None:
         distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
-    behind = (s.objects, scene, direct, cones, bvh, s.observation, marching)
-    mirrored = g.stage("mirrored objects", shading.mirror_objects, s.objects, scene, grid, bvh, marching)
-    screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
-    radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
+    behind = Behind(s.objects, scene, direct, cones, bvh, s.observation, marching)
+    radiance = _surface_stages(g, shading, grid, caustics, behind)
 
     def transmit(own: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
         return g.stage("transmitted light", shading.add_transmitted, own, *behind)
 
     layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
     return replace(layers, direct_mu=own_light, transmit=transmit)
+
+
+def _surface_stages(
+    g: Graph,
+    shading: Shading,
+    grid: Resource[LowResGrid],
+    caustics: Resource[Caustics | None],
+    behind: Behind,
+) -> Resource[moderngl.Texture]:
+    """Declares what smooth objects reflect, and the light that objects send."""
+    objects, scene, _, cones, bvh, _, marching = behind
+    mirrored = g.stage("mirrored objects", shading.mirror_objects, objects, scene, grid, bvh, marching)
+    screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
+    return g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
 
 
 def _light_states(

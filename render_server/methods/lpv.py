@@ -13,12 +13,11 @@ from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.methods.light_maps import LitScene, light_stages
+from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages
 from deltalight.render_server.methods.lighting import (
     Layers,
     Shading,
     ShadingOptions,
-    bounced_later,
     shading_stages,
 )
 from deltalight.render_server.methods.lpv_cells import cell_stages, release_held

@@ -14,8 +14,9 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.methods.cast_beams import casts_caustics
 from deltalight.render_server.methods.light_maps import LitScene
-from deltalight.render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, casts_caustics, surfel_scene
+from deltalight.render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, surfel_scene
 from deltalight.render_server.methods.per_volume import OfEach, PerVolume, several
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import (

@@ -24,6 +24,8 @@ WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces 
 NEAREST_M = 1e-3
 CASTER_CELL = 8
 """Texels an edge of the cells in which distances to casters are known; shaders/common/lights.glsl knows it too."""
+MOST_VIEWS = 6  # of a light: the faces of a cube
+TEXEL_BYTES = 4 + 8 + 16  # of an atlas: depth, `normal` and `uv`
 EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
 
 
@@ -89,6 +91,20 @@ class ShadowMapAtlas:
         release_target(self.target)
         for item in (self.depth, self.normal, self.uv, self.caster_distance):
             item.release()
+
+
+def atlas_bytes(tiles: int, tile_size: int) -> int:
+    """Returns the bytes of an atlas of so many tiles of `tile_size` texels an edge."""
+    columns = tile_columns(tiles)
+    places = columns * max(1, -(-tiles // columns))
+    cells = -(-tile_size // CASTER_CELL)
+    return places * (tile_size * tile_size * TEXEL_BYTES + cells * cells * 4)
+
+
+def most_maps_bytes(lights: Sequence[Light], tile_size: int) -> int:
+    """Returns the most bytes that maps of the real scene and of the objects take; `tile_size` in texels."""
+    views = sum(1 if isinstance(light, DirectionalLight) else MOST_VIEWS for light in lights)
+    return 2 * atlas_bytes(views, tile_size)
 
 
 class ShadowMaps:

@@ -33,7 +33,7 @@ _FAR_AWAY = 1 << 20  # voxels
 NO_SUPPORT: Final = np.full(6 * MOST_VOLUMES, _FAR_AWAY, np.int32).tobytes()  # mu and rho differ nowhere
 
 SURFEL_LIGHT_BYTES = 2 * 48  # front and back
-GROUP_SUMS_BYTES = 40
+GROUP_SUMS_BYTES = 44
 GROUP_LIGHT_BYTES = 32
 HEADER_BYTES = 4
 NO_GROUPS: Final[Bindings] = {"SurfelLights": None}

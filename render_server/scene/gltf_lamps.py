@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from deltalight.render_server.scene.gltf_document import GltfDocument, GltfFault
 MOST_LAMPS = 64  # as a scene may list
 LEAST_RANGE_M = 1e-6
 _ORIGIN, _AWAY = np.zeros(3, np.float32), np.array([0, 0, -1], np.float32)
+_NO_LIGHT = np.zeros(3, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +30,17 @@ class GltfLamp:
     node: int
     light: PunctualLight | DirectionalLight
 
+    def is_aimless(self, world_from_node: Float64[np.ndarray, "4 4"]) -> bool:
+        """Whether it needs a direction, and the node's scale, 0 along z, leaves it none."""
+        is_aimed = isinstance(self.light, DirectionalLight) or self.light.cone is not None
+        return is_aimed and not world_from_node[:3, 2].any()
+
     def placed(self, world_from_node: Float64[np.ndarray, "4 4"]) -> Light:
-        """Returns the light in the world."""
+        """Returns the light in the world, dark where it has no direction."""
+        if self.is_aimless(world_from_node):
+            upright = np.eye(4)
+            upright[:3, 3] = world_from_node[:3, 3]
+            return replace(self, light=self.light.scaled(_NO_LIGHT)).placed(upright)
         if isinstance(self.light, PunctualLight):
             return self.light.placed(world_from_node)
         axis = -world_from_node[:3, 2]
@@ -58,6 +69,18 @@ def read_lamps(gltf: GltfDocument, nodes: NodeTree) -> tuple[GltfLamp, ...]:
     if len(lamps) > MOST_LAMPS:
         raise GltfFaultError(f"it has {len(lamps)} lights; at most {MOST_LAMPS} can be drawn")
     return tuple(lamps)
+
+
+def dark_lamps(path: Path, lamps: Sequence[GltfLamp], nodes: NodeTree) -> str | None:
+    """Returns a sentence about lights that nodes at rest leave without direction; None if there are none."""
+    placed = nodes.asset_from_node(nodes.rest)
+    dark = [str(lamp.node) for lamp in lamps if lamp.is_aimless(placed[lamp.node])]
+    if not dark:
+        return None
+    return (
+        f"{path} has lights that are dark while the scale of their nodes is 0 along z (node {', '.join(dark)}): "
+        "they have no direction; give these nodes another scale."
+    )
 
 
 def _light(description: dict[str, Any], index: int) -> PunctualLight | DirectionalLight:

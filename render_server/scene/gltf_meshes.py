@@ -19,7 +19,7 @@ from deltalight.render_server.scene.gltf_document import (
     faults_named,
     read_nodes,
 )
-from deltalight.render_server.scene.gltf_lamps import GltfLamp, read_lamps
+from deltalight.render_server.scene.gltf_lamps import GltfLamp, dark_lamps, read_lamps
 from deltalight.render_server.scene.gltf_posing import (
     GltfPart,
     Morph,
@@ -355,13 +355,15 @@ def load_gltf(path: Path) -> GltfAsset:
             together[material].append(part)
         if not together:
             raise DeltalightError(f"{path} has no triangle with an area; export a triangle mesh.")
+        lamps = read_lamps(gltf, nodes)
+        sentences = left_out(gltf), dark_lamps(path, lamps, nodes)
         return GltfAsset(
             path,
             nodes,
             list(together.values()),
             read_clips(gltf, nodes),
-            left_out=left_out(gltf),
-            lamps=read_lamps(gltf, nodes),
+            left_out=" ".join(each for each in sentences if each is not None) or None,
+            lamps=lamps,
         )
 
 

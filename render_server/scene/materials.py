@@ -20,6 +20,7 @@ from deltalight.render_server.scene.textures_by_light import TextureByLight
 
 MATERIAL_FLOATS, COATING_FLOATS = 20, 8
 DARKEST_ATTENUATION = 1e-4  # black has no logarithm
+COAT_F0 = 0.04  # reflectance of a clear coat at normal incidence, of index 1.5
 MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
 
 
@@ -172,13 +173,17 @@ class Material:
         return np.asarray(-np.log(darkest) / np.float32(self.attenuation_distance_m), np.float32)
 
     def mean_transmittance(self, path_m: float) -> Float32[np.ndarray, "3"]:
-        """Returns what passes of light at normal incidence: two surfaces and a path between, or a thin one; R G B."""
-        through = self.transmission * (1 - self.metallic)
-        if self.transmission_map is not None:
-            through *= float(self.transmission_map.texels[..., 0].mean()) / 255
+        """Returns what passes of light at normal incidence: two surfaces and a path between, or a thin one; R G B.
+
+        A coat reflects a part before light enters; rays do not meet it as they leave, either.
+        """
+        through = self.transmission * (1 - self.metallic) * _mean_red(self.transmission_map)
         entered = (1 - self.dielectric_f0) * self.base_color * np.float32(through)
+        below = 1 - COAT_F0 * self.coat * _mean_red(self.coat_map)
         return np.asarray(
-            entered ** (1 if self.is_thin else 2) * np.exp(-self.absorption_per_m * np.float32(path_m)),
+            below
+            * entered ** (1 if self.is_thin else 2)
+            * np.exp(-self.absorption_per_m * np.float32(path_m)),
             np.float32,
         )
 
@@ -398,6 +403,11 @@ def _floats(value: Any, default: tuple[float, ...]) -> tuple[float, ...]:  # noq
         return default
     numbers = tuple(float(item) for item in np.atleast_1d(value))
     return numbers * 3 if len(numbers) == 1 else numbers[:3]
+
+
+def _mean_red(each: TextureMap | None) -> float:
+    """Returns the mean of a data map's first channel, 1 without a map."""
+    return 1.0 if each is None else float(each.texels[..., 0].mean()) / 255
 
 
 def _first(value: Any, default: float) -> float:  # noqa: ANN401 - as in the file

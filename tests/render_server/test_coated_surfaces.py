@@ -204,6 +204,41 @@ def test_maps_of_coats_and_sheens_are_as_the_factors(draw: Draw, name: str) -> N
     assert by_maps.mean() > 0.01, "what lies over the black plate is seen"
 
 
+def test_a_smooth_coat_with_maps_has_the_highlight_of_one_without(draw: Draw) -> None:
+    """A roughness between two steps of eight bits: the peak of the lobe goes by its fourth power."""
+    coat = {"clearcoatFactor": 1.0, "clearcoatRoughnessFactor": 20.5 / 255}
+    lamp = [directional((0.0, 0.0, -1.0), 0.01)]
+    by_factors = draw(coated(dict(coat), color=0.0), lamp)[INSIDE]
+    made = coated(dict(coat), color=0.0)
+    made.material["normalTexture"] = made.texture(even(128, 128, 255), scale=0.0)
+    by_maps = draw(made, lamp)[INSIDE]
+    print(f"peak {by_maps.max() / by_factors.max() - 1:+.4f} from that without maps")
+    assert by_maps.max() == pytest.approx(by_factors.max(), rel=0.01)
+
+
+@pytest.mark.parametrize(("texture", "wanted"), [(None, 0.96), ((51, 0, 0), 0.992)])
+def test_a_coat_darkens_the_shadow_of_glass(
+    gpu: GpuContext, tmp_path: Path, texture: tuple[int, ...] | None, wanted: float
+) -> None:
+    """By what it reflects of light that comes straight, where no beams bring it."""
+    kept = []
+    for coat in (0.0, 1.0):
+        made = coated({"clearcoatFactor": coat}, color=1.0)
+        if texture is not None:
+            made.material["extensions"]["KHR_materials_clearcoat"]["clearcoatTexture"] = made.texture(
+                even(*texture)
+            )
+        made.material["extensions"]["KHR_materials_transmission"] = {"transmissionFactor": 1.0}
+        asset = {"asset": str(made.write(tmp_path / f"{coat}.glb")), "up_axis": "z"}
+        asset["pose"] = {"translation_m": [0, 0, 0.3]}
+        document = Stage(tmp_path).document([asset], [directional((0, 0, -1))], floor(), caustics=False)
+        found = solve(gpu, document)
+        at_middle = (np.abs(found.position[..., :2]) < 0.1).all(axis=-1) & (found.matte == 0)
+        kept.append(found.direct_rho[at_middle].mean() / found.direct_mu[at_middle].mean())
+    print(f"{kept[0]:.4f} of the light without a coat, {kept[1]:.4f} with it")
+    assert kept[1] / kept[0] == pytest.approx(wanted, abs=0.002)
+
+
 def test_a_coat_has_a_normal_map_of_its_own(draw: Draw) -> None:
     """The base's tilt does not move the coat's highlight; the coat's own does."""
     lamp, tilt = [directional((0.35, 0.0, -1.0), 2.0, 1.0)], (204, 128, 231)

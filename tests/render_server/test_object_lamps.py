@@ -12,6 +12,8 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import sizes_bytes
+from deltalight.render_server.passes.shadow_maps import ShadowMapAtlas, atlas_bytes
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.mesh_loading import load_asset
 from tests.render_server.gltf_samples import HALF
@@ -301,6 +303,24 @@ def test_lamps_that_make_no_light_are_refused_in_a_sentence(
         load_asset(Path(model["asset"]))
 
 
+@pytest.mark.parametrize("kind", ["directional", "spot", "point"])
+def test_a_node_of_scale_0_leaves_lights_without_direction_dark(
+    gpu: GpuContext, tmp_path: Path, kind: str
+) -> None:
+    """A sentence says so; nothing else of the picture is lost. A point needs no direction."""
+    flat = {"translation": LAMP.tolist(), "scale": [0, 0, 0]}
+    model = lamp_model(tmp_path / "lamp.glb", {**POINT, "type": kind}, flat, HOLDER)
+    lit, dark = (Lit(gpu, Stage(tmp_path), [{**model, "lamps": factor}]) for factor in (1, 0))
+    assert np.isfinite(lit.linear).all()
+    if kind == "point":
+        assert not lit.notices
+        assert (lit.linear - dark.linear)[lit.around()].mean() > 0.01
+    else:
+        (sentence,) = lit.notices
+        assert "dark while the scale of their nodes is 0 along z (node 0)" in sentence
+        assert np.array_equal(lit.codes, dark.codes)
+
+
 def test_more_lamps_than_a_scene_may_list_are_refused(gpu: GpuContext, tmp_path: Path) -> None:
     """In one file, and of all objects together, but for those whose lamps are off."""
     model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": LAMP.tolist()}, HOLDER)
@@ -352,3 +372,36 @@ def test_lamps_of_a_resting_object_stay_the_same_lights_while_another_moves(
     renderer.release()
     assert seen[1][0] is seen[0][0]
     assert seen[2][0].intensity == pytest.approx(0.5 * seen[0][0].intensity)
+
+
+@pytest.mark.parametrize("tiles", [1, 6, 7])
+def test_an_atlas_takes_what_is_stated(gpu: GpuContext, tiles: int) -> None:
+    atlas = ShadowMapAtlas(gpu, tiles, 36)
+    assert atlas_bytes(tiles, 36) == sum(sizes_bytes([atlas]))
+    atlas.release()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "views"),
+    [("dvct", "point", 6), ("dvct", "directional", 1), ("differential", "point", 6)],
+)
+def test_maps_of_lamps_take_no_more_than_is_stated(
+    gpu: GpuContext, tmp_path: Path, name: str, kind: str, views: int
+) -> None:
+    """A point has up to six maps of the room and of the objects each, a distant light one."""
+    model = lamp_model(tmp_path / "lamp.glb", {**POINT, "type": kind}, {"translation": [0, 0, 0.05]}, HOLDER)
+    renderer = SceneRenderer(gpu, Stage(tmp_path).document([model], [], floor(), name=name))
+    renderer.render(frame(depth=None))
+    held = sum(each.size_bytes for each in graph_of(renderer).report() if "shadow maps" in each.name)
+    (sentence,) = [each for each in renderer.notices if "shadow maps" in each]
+    renderer.release()
+    stated = -(-2 * atlas_bytes(views, 256) // 10**6)
+    assert sentence == f"shadow maps of the objects' lamps (1): up to {stated} MB"
+    assert 0 < held <= 1e6 * stated
+
+
+def test_without_lamps_nothing_is_stated(gpu: GpuContext, tmp_path: Path) -> None:
+    model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": [0, 0, 0.05]}, HOLDER)
+    renderer = SceneRenderer(gpu, Stage(tmp_path).document([{**model, "lamps": 0}], [ambient(SKY)], floor()))
+    assert not any("shadow maps" in each for each in renderer.notices)
+    renderer.release()

@@ -4,6 +4,7 @@
 #if !defined(CHANGE) && !defined(TAIL)
 #define KEEPS_COVERAGE
 #endif
+#define TWO_SIDED_STARTS
 #include "common/march.glsl"
 #include "common/walk.glsl"
 #include "common/environment.glsl"
@@ -83,6 +84,7 @@ void gather(int slot) {
     vec3 n = normalize(sum);
     vec3 corner = block_corner(group_entries[slot]);
     vec3 q = corner + sums_at(at + GROUP_PLACE) / area;
+    start_on(n, group_sums[at + GROUP_TWO_SIDED] > 0);
     float turn = 2.0 * PI * fract(dot(0.5 * corner, TURN_OF_BLOCK));
     ConeSet cones = ConeSet(1, 0, WIDTH, turn);
 #ifdef TAIL

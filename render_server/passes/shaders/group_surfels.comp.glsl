@@ -29,6 +29,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
         atomicAdd(group_sums[at + GROUP_NORMAL + j], fixed_point(weight * n[j]));
         atomicAdd(group_sums[at + GROUP_PLACE + j], fixed_point(weight * place[j]));
     }
+    if (s.uv_voxel.w > 0.5) atomicAdd(group_sums[at + GROUP_TWO_SIDED], 1);
     if (!has_seen || surfel_light(2u * surfel + uint(side), RADIANCE_MU).w > 0.5) return;
     atomicAdd(group_sums[at + GROUP_UNSEEN], 1);
 }

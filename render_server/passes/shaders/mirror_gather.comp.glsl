@@ -1,5 +1,6 @@
 // Ambient and bounced light at the reflected points that mirror_hits listed, and how much real things occlude them
 // from the reflecting surface.
+#define TWO_SIDED_STARTS
 #include "common/march.glsl"
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
@@ -42,6 +43,7 @@ void gather(ivec2 texel) {
     Mirror m = mirror_at(mirror_pixel(texelFetch(sample_pixels, texel, 0)));
     enter_volume(position);
     vec3 q = volume_coordinate(position);
+    start_on(normal.xyz, is_two_sided(int(normal.w)));
     vec3 e_mu, e_rho;
     diffuse(q, normal.xyz, WHOLE, true, e_mu, e_rho);
     vec3 d = reflect(normalize(position - m.point), normal.xyz);

@@ -4,6 +4,7 @@
 // not again.)
 #include "common/brdf.glsl"
 #include "common/octahedral.glsl"
+#define TWO_SIDED_STARTS
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
 #include "common/shown_maps.glsl"
@@ -85,6 +86,13 @@ vec4 lobe_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, b
     return seen;
 }
 
+// Cones through voxels start on that surface from now on.
+void start_on_object(vec4 normal) {
+#ifdef VOXELS
+    start_on(normal.xyz, is_two_sided(int(normal.w)));
+#endif
+}
+
 #ifdef EXTENDED
 // The same of a rougher lobe too, by one cone through voxels.
 vec4 any_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bool of_coat, bool wanted) {
@@ -101,6 +109,7 @@ vec4 any_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bo
 vec4 reflection(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
     vec4 position = texelFetch(virtual_raster_position, raster, 0), normal = shown_normal(raster, false);
+    start_on_object(normal);
     Material m = coated_material(raster);
     vec3 share = coat_share(reflected_towards(m, normal.xyz, normalize(camera_position - position.xyz)));
     vec4 base = any_reflection(pixel, position, normal, m.roughness, false, has_interface(m.f0));
@@ -117,6 +126,7 @@ vec4 reflection(ivec2 pixel) {
     bool shines = m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0;
     float roughness = roughness_at(raster, int(normal.w));
     if (!shines || roughness >= ROUGHEST) return vec4(0.0);
+    start_on_object(normal);
     return lobe_reflection(pixel, position, normal, roughness, false, CONE_COUNT);
 }
 #endif

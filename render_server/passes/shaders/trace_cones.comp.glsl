@@ -1,5 +1,8 @@
 // Diffuse and specular cones of the exact operator at 1/scale of the picture (docs/method.md 3, 4.5).
 // REAL: E_mu and E_rho of ambient + bounced light on real surfaces. VIRTUAL: E_rho and the specular cone of the object.
+#ifndef REAL
+#define TWO_SIDED_STARTS
+#endif
 #include "common/march.glsl"
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
@@ -97,6 +100,7 @@ void trace(ivec2 texel) {
     diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
     e_rho = with_further_bounces(e_mu, e_rho, q, s.normal);
 #else
+    start_on(s.normal, s.two_sided);
     if (is_fresh(texel)) diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
 #endif
 #ifdef MEASURED

@@ -63,8 +63,7 @@ bool is_left_out(Fragment f, vec2 place, float blend_sample) {
 // An interpolated normal may vanish in a fold, or face away at a silhouette: then use the triangle's own.
 vec3 facing_normal(Fragment f, vec3 view) {
     vec3 n = f.normal == vec3(0.0) ? f.face : normalize(f.normal);
-    bool double_sided = materials[f.material].flags.x > 0.5;
-    return dot(n, view) >= 0.0 ? n : (double_sided ? -n : f.face);
+    return dot(n, view) >= 0.0 ? n : (is_two_sided(f.material) ? -n : f.face);
 }
 
 // `shows`: whether a pixel will show it; otherwise texture coordinate and colour are not needed.

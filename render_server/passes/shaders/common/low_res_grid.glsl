@@ -5,7 +5,7 @@ uniform isampler2D sample_pixels;   // real x, y; virtual x, y; -1: none; below:
 #pragma texels rgba16i sample_pixels
 uniform ivec2 low_resolution_size;
 
-struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness; };
+struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness; bool two_sided; };
 
 #ifdef REAL
 #include "common/surfaces.glsl"
@@ -18,20 +18,21 @@ ivec2 real_pixel(ivec2 texel) {
 
 SurfacePoint surface_point(ivec2 texel) {
     ivec2 pixel = real_pixel(texel);
-    if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0);
+    if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0, false);
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);
     float roughness = normal.w < 0.0 ? -1.0 : surfaces[int(normal.w)].surface.x;
-    return SurfacePoint(true, texelFetch(real_surface_position, pixel, 0).xyz, normal.xyz, roughness);
+    return SurfacePoint(true, texelFetch(real_surface_position, pixel, 0).xyz, normal.xyz, roughness, false);
 }
 #else
 #include "common/shown_maps.glsl"
 
 SurfacePoint surface_point(ivec2 texel) {
     ivec2 pixel = texelFetch(sample_pixels, texel, 0).zw;
-    if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0);
+    if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0, false);
     pixel = raster_texel(pixel);
     vec4 normal = texelFetch(virtual_raster_normal, pixel, 0);
     vec3 position = texelFetch(virtual_raster_position, pixel, 0).xyz;
-    return SurfacePoint(true, position, normal.xyz, roughness_at(pixel, int(normal.w)));
+    int material = int(normal.w);
+    return SurfacePoint(true, position, normal.xyz, roughness_at(pixel, material), is_two_sided(material));
 }
 #endif

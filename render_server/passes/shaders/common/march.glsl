@@ -65,7 +65,22 @@ struct Walk {
     int level;
     bool grows;      // whether cells are larger from the next face on
     bool halved;     // whether the sample is of the slice ahead alone, in its middle
+    int clear;       // main coordinate of the first face where samples are clear of a surface that the ray starts on
 };
+
+#ifdef TWO_SIDED_STARTS
+const float OWN_REACH = 2.0;   // voxels in front of a surface where samples still meet it
+vec3 two_sided_normal = vec3(0.0);   // of the surface where marches start, if it has two sides: both are in its voxels
+
+void start_on(vec3 n, bool two_sided) { two_sided_normal = two_sided ? n : vec3(0.0); }
+
+void clear_own_surface(inout Walk w) {
+    float rise = dot(two_sided_normal, w.slope);
+    if (two_sided_normal != vec3(0.0)) w.clear = int(ceil(w.first + OWN_REACH / max(rise, 1e-3)));
+}
+#else
+void clear_own_surface(inout Walk w) {}
+#endif
 
 // In a grid of n cells an edge. Nothing behind the start counts.
 Walk walk_from(vec3 q, vec3 d, int n) {
@@ -76,7 +91,7 @@ Walk walk_from(vec3 q, vec3 d, int n) {
     axis[main] = side;
     ivec3 facing = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
     int plane = int(ceil(side * q[main] - 0.5));
-    return Walk(q, side * q[main], d / a[main], 1.0 / a[main], axis, facing, side > 0.0 ? n : 0, plane, 0, false, true);
+    return Walk(q, side * q[main], d / a[main], 1.0 / a[main], axis, facing, side > 0.0 ? n : 0, plane, 0, false, true, plane);
 }
 
 float travelled_to(Walk w, int plane) { return max(float(plane) - w.first, 0.0) * w.stretch; }
@@ -133,7 +148,7 @@ vec4 directional_sample(sampler3D mipmap, int first, int n, vec3 q, Walk w) {
 // Coverage and radiance of one slice along the ray. Of all surfaces in a cell, f and b are known: their area towards
 // and away from the ray along each axis. The net area n.d is exact; a closed lump adds, on the side that the ray
 // sees, at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a plane: no surface
-// occludes itself).
+// occludes itself). Nor does one that has two sides, which is a pair to itself.
 vec4 directional_sample(sampler3D mipmap, int first, int n, vec3 q, Walk w) {
     vec4 x = volume_sample(mipmap, first, n, q, w.level, w.facing.x);
     vec4 y = volume_sample(mipmap, first, n, q, w.level, w.facing.y);
@@ -148,7 +163,7 @@ vec4 directional_sample(sampler3D mipmap, int first, int n, vec3 q, Walk w) {
         volume_sample(mipmap, first, n, q, w.level, w.facing.z ^ 1).a);
     float net = dot(weights, f - b);
     float round = 0.5 * (net + max(abs(net), length(weights * (f + b))));
-    float paired = max(net, 0.0) + length(weights * min(f, b));
+    float paired = max(net, 0.0) + (w.plane >= w.clear ? length(weights * min(f, b)) : 0.0);
     return most * min(min(round, paired) / most.a, 1.0);
 }
 #endif
@@ -187,6 +202,7 @@ float march_near(
 ) {
     Walk w = walk_from(q, d, volume_size);
     if (before > 0.0) enlarge_cells(w, ratio, before, volume_levels);
+    else clear_own_surface(w);
     int held = 6 * volume;
     vec3 low = vec3(support[held], support[held + 1], support[held + 2]);
     vec3 high = vec3(-support[held + 3], -support[held + 4], -support[held + 5]) + 1.0;

@@ -36,6 +36,8 @@ struct MaterialEntry {
 };
 layout(std430) readonly buffer Materials { MaterialEntry materials[]; };
 
+bool is_two_sided(int index) { return materials[index].flags.x > 0.5; }
+
 // An unlit surface glows with its base colour, which the vertex colour multiplies.
 vec3 glow_tint(MaterialEntry e, vec3 tint) { return e.flags.w < 0.0 ? tint : vec3(1.0); }
 

@@ -114,8 +114,7 @@ MeshSurface surface_of(MeshHit hit, Ray ray) {
     vec3 face = cross(vertex_vector(rows, 0, vec3(0.0, 1.0, 0.0)) - corner, vertex_vector(rows, 0, vec3(0.0, 0.0, 1.0)) - corner);
     if (dot(face, ray.direction) > 0.0) face = -face;
     vec3 mean = vertex_vector(rows, 3, weights), normal = normalize(mean == vec3(0.0) ? face : mean);
-    bool double_sided = materials[material].flags.x > 0.5;
-    if (dot(normal, ray.direction) > 0.0) normal = double_sided ? -normal : normalize(face);
+    if (dot(normal, ray.direction) > 0.0) normal = is_two_sided(material) ? -normal : normalize(face);
     vec2 uv = vertex_vector(rows, 6, weights).xy;
     return MeshSurface(ray.from + hit.distance * ray.direction, normal, uv, vertex_vector(rows, 8, weights), material);
 }

@@ -30,18 +30,21 @@ layout(rgba32ui) readonly uniform uimage2D virtual_raster_extended;
 // Coat and sheen with their maps, and what maps give of f0 and transmission.
 struct Extended { Coating over; vec3 f0; float transmission; };
 
+// The coat's roughness has two bytes: the peak of its lobe goes by the inverse fourth power, and eight bits would show.
 uvec4 pack_extended(Extended s) {
     uint normal = packUnorm2x16(octahedral_uv(s.over.normal));   // for mirror images
-    return uvec4(packUnorm4x8(vec4(s.over.coat, s.over.roughness, s.over.sheen_roughness, s.transmission)),
-        packUnorm4x8(vec4(sqrt(s.over.sheen), 0.0)), normal, packUnorm4x8(vec4(sqrt(s.f0), 0.0)));
+    vec2 rough = unpackUnorm4x8(packUnorm2x16(vec2(s.over.roughness, 0.0))).xy;
+    return uvec4(packUnorm4x8(vec4(s.over.coat, rough.y, s.over.sheen_roughness, s.transmission)),
+        packUnorm4x8(vec4(sqrt(s.over.sheen), rough.x)), normal, packUnorm4x8(vec4(sqrt(s.f0), 0.0)));
 }
 
 Extended extended_at(ivec2 raster) {
     uvec4 codes = imageLoad(virtual_raster_extended, raster);
-    vec4 amounts = unpackUnorm4x8(codes.x);
-    vec3 sheen = unpackUnorm4x8(codes.y).rgb, f0 = unpackUnorm4x8(codes.w).rgb;
+    vec4 amounts = unpackUnorm4x8(codes.x), sheen = unpackUnorm4x8(codes.y);
+    float roughness = unpackUnorm2x16(packUnorm4x8(vec4(sheen.w, amounts.y, 0.0, 0.0))).x;
+    vec3 f0 = unpackUnorm4x8(codes.w).rgb;
     vec3 normal = octahedral_direction(unpackUnorm2x16(codes.z));
-    return Extended(Coating(amounts.x, amounts.y, normal, sheen * sheen, amounts.z), f0 * f0, amounts.w);
+    return Extended(Coating(amounts.x, roughness, normal, sheen.rgb * sheen.rgb, amounts.z), f0 * f0, amounts.w);
 }
 
 Coating coating_at(ivec2 raster, int material) { return extended_at(raster).over; }

@@ -10,7 +10,8 @@ layout(std430) GROUP_LIGHT_ACCESS buffer GroupLight { vec4 group_light[]; };   /
 
 const int GROUP_AREA = 0, GROUP_UNSEEN = 1, GROUP_NORMAL = 2, GROUP_PLACE = 5;   // all weighted by area / h^2
 const int GROUP_IRRADIANCE = 8, GROUP_RADIANCE = 9;   // luminance of mu, of all light
-const int GROUP_SUMS = 10;
+const int GROUP_TWO_SIDED = 10;   // surfels
+const int GROUP_SUMS = 11;
 const float LIGHT_FIXED_POINT = 1024.0;   // of these two: sums up to 2e6
 const vec3 LUMINANCE = vec3(0.2126, 0.7152, 0.0722);
 
