@@ -9,10 +9,10 @@
 #include "common/shown_pixels.glsl"
 #include "common/walk.glsl"
 #include "common/caustics.glsl"
+#include "common/surface_change.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D radiance_out;
-uniform sampler2D object_coverage;
 uniform sampler2D cone_irradiance;
 uniform sampler2D cone_specular;
 uniform sampler2D virtual_raster_tint;
@@ -42,6 +42,14 @@ Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
     return sum;
 }
 
+// Half-angle (rad) of a disc over which directions mirrored by a curved surface spread within a pixel: its mean square is that of the
+// pixel's square, a twelfth of the change along each axis, and mirroring doubles the normal's turn.
+float mirrored_spread(ivec2 pixel, vec4 position, vec4 normal) {
+    vec3 x = change_along(pixel, ivec2(1, 0), position, normal, false).normal;
+    vec3 y = change_along(pixel, ivec2(0, 1), position, normal, false).normal;
+    return sqrt((2.0 / 3.0) * (dot(x, x) + dot(y, y)));
+}
+
 void shade(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
     vec4 position = texelFetch(virtual_raster_position, raster, 0);
@@ -61,7 +69,7 @@ void shade(ivec2 pixel) {
         indirect.specular = seen.rgb + (1.0 - seen.a) * indirect.specular;
     }
     indirect.irradiance += caustic_irradiance(pixel, textureSize(object_coverage, 0), OBJECT_LAYER, position.xyz, normal.xyz, position.w);
-    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect);
+    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect, mirrored_spread(pixel, position, normal));
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
 }
 

@@ -28,7 +28,8 @@ vec3 response_times_cosine(vec3 n, vec3 v, vec3 l, float cosine, Material m, flo
 #endif
 }
 
-vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
+// `turn`: half-angle (rad) of the disc over which a pixel's own area spreads the mirrored direction.
+vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, float turn) {
     vec3 sum = vec3(0.0);
     int i = 0;
     if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
@@ -39,11 +40,11 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
         vec3 lifted = p + normal_offset * n;
         vec2 fraction = visibility(listed_light(i), lifted, n, 3.0 * noise_sigma * depth * depth, 0.0);
         vec3 seen = arriving(listed_light(i), lifted, fraction, beam_alpha);
-        sum += across * seen * response_times_cosine(n, v, l, cosine, m, radius);
+        sum += across * seen * response_times_cosine(n, v, l, cosine, m, length(vec2(radius, turn)));
     } while (++i < light_count);
     return sum;
 }
 
-vec3 object_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, Indirect indirect) {
-    return with_gathered(emitted(m, n, v) + direct_radiance(p, depth, n, v, m), m, n, v, indirect);
+vec3 object_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, Indirect indirect, float turn) {
+    return with_gathered(emitted(m, n, v) + direct_radiance(p, depth, n, v, m, turn), m, n, v, indirect);
 }
