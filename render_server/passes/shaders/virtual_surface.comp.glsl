@@ -9,16 +9,17 @@
 #include "common/shown_pixels.glsl"
 #include "common/walk.glsl"
 #include "common/caustics.glsl"
-#include "common/surface_change.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D radiance_out;
+uniform sampler2D object_coverage;
 uniform sampler2D cone_irradiance;
 uniform sampler2D cone_specular;
 uniform sampler2D virtual_raster_tint;
 uniform sampler2D screen_reflection;   // rgb radiance times fraction; a: fraction of the specular lobe
 #pragma texels rgba16f cone_irradiance cone_specular screen_reflection
 #pragma texels rgba8 virtual_raster_tint
+#pragma texels r16f object_coverage
 uniform bool has_screen_reflection;
 #include "common/camera.glsl"
 
@@ -42,12 +43,27 @@ Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
     return sum;
 }
 
-// Half-angle (rad) of a disc over which directions mirrored by a curved surface spread within a pixel: its mean square is that of the
-// pixel's square, a twelfth of the change along each axis, and mirroring doubles the normal's turn.
+const float STRAIGHT = 0.25;   // sine of the greatest angle between a chord of a smooth surface and its mean tangent plane
+
+// Squared change of the normal from a pixel to the next along an axis: the mean of both sides, of which edges do not count. (The chord
+// of an arc is at right angles to the mean of the normals at its ends.)
+float turn_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
+    float sum = 0.0;
+    for (int side = -1; side <= 1; side += 2) {
+        ivec2 raster = raster_texel(clamp(pixel + side * axis, ivec2(0), textureSize(object_coverage, 0) - 1));
+        vec4 p = texelFetch(virtual_raster_position, raster, 0), n = texelFetch(virtual_raster_normal, raster, 0);
+        vec3 chord = (p - position).xyz, turn = (n - normal).xyz, both = (n + normal).xyz;
+        bool goes_on = p.w > 0.0 && n.w == normal.w && abs(dot(chord, both)) <= STRAIGHT * length(chord) * length(both);
+        sum += goes_on ? 0.5 * dot(turn, turn) : 0.0;
+    }
+    return sum;
+}
+
+// Half-angle (rad) of a disc over which directions that a curved surface mirrors spread within a pixel: its mean square is that of the
+// pixel's square, a twelfth of the squared change along each axis, and mirroring doubles the normal's turn.
 float mirrored_spread(ivec2 pixel, vec4 position, vec4 normal) {
-    vec3 x = change_along(pixel, ivec2(1, 0), position, normal, false).normal;
-    vec3 y = change_along(pixel, ivec2(0, 1), position, normal, false).normal;
-    return sqrt((2.0 / 3.0) * (dot(x, x) + dot(y, y)));
+    float x = turn_along(pixel, ivec2(1, 0), position, normal), y = turn_along(pixel, ivec2(0, 1), position, normal);
+    return sqrt((2.0 / 3.0) * (x + y));
 }
 
 void shade(ivec2 pixel) {
