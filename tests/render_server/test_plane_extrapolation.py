@@ -155,11 +155,12 @@ def test_a_long_wall_is_likely_to_be_high() -> None:
 def test_a_strip_of_a_wall_beside_a_long_one_goes_on_as_that_does() -> None:
     """Of a wall to the right the view shows 0.2 m: alone it reaches d farther with 0.2 / (0.2 + d), at the end of 2 m with 2 / (2 + d)."""
     strip = wall(0, 0.9, -1.0, evenly((0.8, 0.45), (1, 0.55)))
+    end = wall(1, 1.0, -1.0, evenly((-1, -0.5), (0.9, 1.5)))
     place = CENTRE + 0.9 * DIRECTIONS / np.where(DIRECTIONS[:, :1] > 0, DIRECTIONS[:, :1], np.inf)
     beside = (DIRECTIONS[:, 0] > 0) & (place[:, 1] < 0) & (np.abs(place[:, 2] - 0.5) < 1e-9)
     beyond = 0.8 - place[beside, 1]
     assert beside.sum() >= 4
-    for parts, length in (([(*strip, 0.3)], 0.2), ([(*strip, 0.3), (*AHEAD, 0.3)], 2.0)):
+    for parts, length in (([(*strip, 0.3)], 0.2), ([(*strip, 0.3), (*end, 0.3)], 2.0)):
         found = continued(*shown(*parts)).probability.reshape(-1)[beside]
         assert found == pytest.approx(length / (length + beyond), rel=1e-5)
 
