@@ -10,7 +10,7 @@ uniform int count;
 const int POINTS = 4096;
 
 float of_point(vec3 v, vec3 l, float roughness, float radius) {
-    return specular_times_cosine(vec3(0.0, 0.0, 1.0), v, l, vec3(1.0), roughness, radius).r;
+    return specular_times_cosine(vec3(0.0, 0.0, 1.0), v, l, vec3(1.0), roughness, vec2(radius, 0.0)).r;
 }
 
 void main() {

@@ -59,11 +59,11 @@ float turn_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
     return sum;
 }
 
-// Half-angle (rad) of a disc over which directions that a curved surface mirrors spread within a pixel: its mean square is that of the
-// pixel's square, a twelfth of the squared change along each axis, and mirroring doubles the normal's turn.
-float mirrored_spread(ivec2 pixel, vec4 position, vec4 normal) {
+// Half-angle (rad) of a disc over which a curved surface turns the normal within a pixel: along an axis, its mean square is a quarter of
+// the half-angle's, and that of a square pixel a twelfth of the squared change.
+float turn_within(ivec2 pixel, vec4 position, vec4 normal) {
     float x = turn_along(pixel, ivec2(1, 0), position, normal), y = turn_along(pixel, ivec2(0, 1), position, normal);
-    return sqrt((2.0 / 3.0) * (x + y));
+    return sqrt((x + y) / 6.0);
 }
 
 void shade(ivec2 pixel) {
@@ -85,7 +85,7 @@ void shade(ivec2 pixel) {
         indirect.specular = seen.rgb + (1.0 - seen.a) * indirect.specular;
     }
     indirect.irradiance += caustic_irradiance(pixel, textureSize(object_coverage, 0), OBJECT_LAYER, position.xyz, normal.xyz, position.w);
-    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect, mirrored_spread(pixel, position, normal));
+    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect, turn_within(pixel, position, normal));
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
 }
 
