@@ -2,8 +2,9 @@
 
 How far is unknown. A plane seen over a length L continues for at least d beyond the border with probability
 L / (L + d), because the border cuts it at a place that is independent of it (Gott 1993, Nature 363, for lengths in
-place of times). L is the longest extent that is seen of any plane that bounds the room, because they meet: a wall of which
-the picture shows a strip is unlikely to end just above it or beside it. Its radiance there follows from the lights and from its reflectance where it is seen.
+place of times). L is the longest extent that is seen of any plane that bounds the room, because they meet: a wall of
+which the picture shows a strip is unlikely to end just above it or beside it. Its radiance there follows from the
+lights and from its reflectance where it is seen.
 """
 
 from collections.abc import Sequence

@@ -21,9 +21,9 @@ from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.view import NEAR_M, CameraView, Rectangle, union
 
 # Sample positions in 1/16 pixels from the pixel's centre, nearest first. The first, where surfaces are shaded, is the
-# centre: anywhere else would shift what objects show against the picture. Of all such patterns of eight with one sample in
-# each column and row of eighths (an upright edge is exact to 1/16) this one has the least worst-case error for an
-# edge at any angle and position: 0.18 of a pixel, 0.055 r.m.s.
+# centre: anywhere else would shift what objects show against the picture. Of all such patterns of eight with one
+# sample in each column and row of eighths (an upright edge is exact to 1/16) this one has the least worst-case error
+# for an edge at any angle and position: 0.18 of a pixel, 0.055 r.m.s.
 PATTERN = ((0, 0), (5, -3), (-3, 5), (-7, 1), (-5, -5), (1, -7), (3, 7), (7, 3))
 STEPS = 16
 # Of shaders/common/raster_tiles.glsl: texels an edge of a tile, tiles an edge of one of the next level.

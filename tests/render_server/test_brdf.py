@@ -72,7 +72,7 @@ def test_lamps_wider_than_the_lobe_keep_its_light(gpu: GpuContext) -> None:
 
 
 def highlights(radius: float, roughness: float) -> Float64[np.ndarray, "k 8"]:
-    """Views and lamps around the mirrored direction, up to six times as far as lobe and lamp are wide, on all sides."""
+    """Views and lamps around the mirrored direction, up to six times as far as both are wide, on all sides."""
     rows = []
     for inclined in np.radians([0.0, 20.0, 40.0]):
         view, mirrored = (np.array([side * np.sin(inclined), 0, np.cos(inclined)]) for side in (1, -1))
