@@ -153,7 +153,7 @@ def test_a_long_wall_is_likely_to_be_high() -> None:
 
 
 def test_a_strip_of_a_wall_beside_a_long_one_goes_on_as_that_does() -> None:
-    """Of a wall the view shows 0.2 m: it reaches d farther with 0.2 / (0.2 + d), at the end of 2 m with 2 / (2 + d)."""
+    """The view shows 0.2 m of it, which reaches d farther with 0.2 / (0.2 + d); at the end of 2 m, 2 / (2 + d)."""
     strip = wall(0, 0.9, -1.0, evenly((0.8, 0.45), (1, 0.55)))
     end = wall(1, 1.0, -1.0, evenly((-1, -0.5), (0.9, 1.5)))
     place = CENTRE + 0.9 * DIRECTIONS / np.where(DIRECTIONS[:, :1] > 0, DIRECTIONS[:, :1], np.inf)
