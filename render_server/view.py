@@ -114,12 +114,6 @@ class CameraView:
         """Projection of the raster pinhole; row 0 of the picture comes first in memory."""
         return _clip_from(self.camera)
 
-    def clip_from_camera_at(self, offset: tuple[float, float]) -> Float64[np.ndarray, "4 4"]:
-        """Returns the raster pinhole's projection, shifted by `offset` (x, y) pixels."""
-        matrix = self.clip_from_camera.copy()
-        matrix[:2, 2] -= 2.0 * np.array(offset) / self.raster[1]
-        return matrix
-
     def rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
         """Returns the pixels that can show the convex hull of world points.
 

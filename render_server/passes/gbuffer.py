@@ -79,10 +79,9 @@ class RasterGeometry:
         view: CameraView,
         scene: Bindings,
         *,
-        offset: tuple[float, float] = (0.0, 0.0),
         rectangle: Rectangle | None = None,
     ) -> None:
-        """Draws `mesh` as `view` sees it, sampled `offset` pixels from the texels' centres.
+        """Draws `mesh` as `view` sees it at the texels' centres.
 
         `scene` brings the view's camera and the mesh's own materials. `rectangle` limits drawing to the texels that
         can show the mesh; the others keep their contents.
@@ -95,7 +94,7 @@ class RasterGeometry:
             target.with_extended() if scene["PACKS_EXTENDED"] else target.framebuffer,
             mesh,
             scene,
-            clip_from_camera=view.clip_from_camera_at(offset),
+            clip_from_camera=view.clip_from_camera,
         )
 
     def release(self) -> None:

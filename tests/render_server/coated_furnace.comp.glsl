@@ -29,7 +29,7 @@ vec3 upwards(float z, float turn) { return vec3(sqrt(max(1.0 - z * z, 0.0)) * ve
 float reflected(Material m, vec3 v, vec3 l) {
     if (l.z <= 0.0) return 0.0;
     float density = lobe_density(v, l, m.roughness) + lobe_density(v, l, m.over.roughness) + l.z / PI + 0.25 / (PI * sqrt(l.z));
-    return coated_response(m, UP, v, l, l.z, 0.0).r / density;
+    return coated_response(m, UP, v, l, l.z, vec2(0.0)).r / density;
 }
 
 void main() {

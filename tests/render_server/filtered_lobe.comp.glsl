@@ -23,7 +23,7 @@ vec3 mean_radiance(vec3 n, vec3 v, float roughness) {
         if (l.z <= 0.0) continue;
         float lambda = sqrt(alpha * alpha + (1.0 - alpha * alpha) * local.z * local.z);
         float density = 2.0 * local.z / (local.z + lambda) * ggx_distribution(h.z, alpha) / (4.0 * local.z);
-        vec3 weight = specular_times_cosine(vec3(0.0, 0.0, 1.0), local, l, f0, roughness, 0.0) / density;
+        vec3 weight = specular_times_cosine(vec3(0.0, 0.0, 1.0), local, l, f0, roughness, vec2(0.0)) / density;
         sum += weight * textureLod(environment_map, vec3(octahedral_uv(basis * l), 0.0), 0.0).rgb;
         total += weight;
     }

@@ -18,7 +18,7 @@ float specular_sample(vec2 u, vec3 v, vec3 f0, float roughness) {
     if (l.z <= 0.0) return 0.0;
     float masked = 2.0 * v.z / (v.z + sqrt(alpha * alpha + (1.0 - alpha * alpha) * v.z * v.z));
     float density = masked * ggx_distribution(h.z, alpha) / (4.0 * v.z);
-    return specular_times_cosine(vec3(0.0, 0.0, 1.0), v, l, f0, roughness, 0.0).r / density;
+    return specular_times_cosine(vec3(0.0, 0.0, 1.0), v, l, f0, roughness, vec2(0.0)).r / density;
 }
 
 const float LAMP = 0.15;     // rad, half-angle of the lamp
@@ -31,7 +31,7 @@ float shown_of_lamps(vec3 v, vec3 f0, float roughness) {
     for (int j = 0; j < SIDE * SIDE; ++j) {
         float u = (float(j / SIDE) + 0.5) / float(SIDE), z = 1.0 - most * u * u, phi = 2.0 * PI * (float(j % SIDE) + 0.5) / float(SIDE);
         vec3 l = basis * vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
-        sum += 2.0 * u * specular_times_cosine(n, v, l, f0, roughness, LAMP).r;
+        sum += 2.0 * u * specular_times_cosine(n, v, l, f0, roughness, vec2(LAMP, 0.0)).r;
     }
     return sum * 2.0 * PI * most / float(SIDE * SIDE);
 }

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import moderngl
 import numpy as np
 import pytest
@@ -87,11 +88,14 @@ def area_shares(normal: np.ndarray, shift: float, steps: int = 32) -> np.ndarray
     return shares
 
 
-def test_the_pattern_holds_one_sample_in_each_row_and_column() -> None:
+def test_the_pattern_holds_the_centre_and_one_sample_in_each_row_and_column() -> None:
+    """The centre, on a border of eighths, stands for one of those beside it."""
     pattern = np.array(PATTERN)
+    assert tuple(pattern[0]) == (0, 0)
     places = np.arange(1 - len(PATTERN), len(PATTERN), STEPS // len(PATTERN))
-    assert np.array_equal(np.sort(pattern[:, 0]), places)
-    assert np.array_equal(np.sort(pattern[:, 1]), places)
+    for axis in (0, 1):
+        assert np.abs(np.sort(pattern[:, axis]) - places).max() <= 1
+        assert len(np.unique(pattern[:, axis])) == len(pattern)
     assert np.all(np.diff((pattern**2).sum(axis=1)) >= 0)
 
 
@@ -356,3 +360,49 @@ def test_creases_of_an_object_are_mixed(objects: ObjectsRenderer, stage: Stage) 
     assert bright > 10 * dark
     width = ((row[left:right] - dark) / (bright - dark)).sum()
     assert width == pytest.approx(10 + ridge, abs=1 / 8)
+
+
+def test_objects_are_shaded_at_the_pixels_centres(objects: ObjectsRenderer, stage: Stage) -> None:
+    """Antialiasing changes what edges show, and nothing about pixels that a surface fills."""
+    document = stage.document([stage.virtual(knotted(10))], [directional((1.0, 0.3, -1.0)), ambient(0.3)])
+    view, pictures = seen_from_above(), []
+    for wanted in (True, False):
+        pictures.append(objects.linear(antialiased(unlit(document), wanted), view))
+        matte = objects.newest_coverage()
+        if wanted:
+            inside = cv2.erode((matte == 1).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert inside.sum() > 500
+    smooth, plain = (picture[inside] for picture in pictures)
+    assert np.mean(np.all(smooth == plain, axis=-1)) > 0.9  # the others lie at edges between objects
+
+
+def highlight(objects: ObjectsRenderer, stage: Stage, shift: tuple[float, float], fineness: int) -> float:
+    """Light of a lamp's highlight on a ball of radius 6 px, summed over the pixels (in those of fineness 1)."""
+    shiny = {"base_color": (0, 0, 0), "specular": 1.0, "roughness": 0.2}
+    mesh = ball(6 * PIXEL, (shift[0] * PIXEL, shift[1] * PIXEL, 0.0), 4)
+    lens = camera(fineness * WIDTH, fineness * HEIGHT, fineness * FOCAL)
+    depth = DepthImage(
+        np.full((lens.height, lens.width), 3.0), np.ones((lens.height, lens.width), bool), lens, 0.001
+    )
+    view = frame(np.full((lens.height, lens.width, 3), 100, np.uint8), pose=ABOVE, camera=lens, depth=depth)
+    lit, dark = (
+        objects.linear(
+            antialiased(
+                unlit(stage.document([stage.virtual(mesh, material=shiny)], [directional((1, 0.5, -1.5), e)]))
+            ),
+            view,
+        )
+        for e in (0.2, 1e-6)  # nowhere above white
+    )
+    return float((lit - dark).sum(dtype=np.float64)) / fineness**2
+
+
+def test_highlights_smaller_than_a_pixel_keep_their_light_wherever_they_fall(
+    objects: ObjectsRenderer, stage: Stage
+) -> None:
+    expected = highlight(objects, stage, (0.0, 0.0), 6)
+    shifts = [(x / 3, y / 3) for x in range(3) for y in range(3)]
+    found = np.array([highlight(objects, stage, shift, 1) for shift in shifts]) / expected
+    print(f"mean {found.mean():.3f}, {found.min():.3f} .. {found.max():.3f}")
+    assert found.mean() == pytest.approx(1.0, abs=0.2)
+    assert found == pytest.approx(found.mean(), rel=0.25)

@@ -51,7 +51,7 @@ uniform float roughness;
 RESPONSES = """
 values[0] = diffuse_under_lobe(vec3(0.04), roughness, dot(n, l), dot(n, v)).g;
 values[1] = specular_reflectance(vec3(0.04), roughness, dot(n, v)).g;
-vec3 specular = specular_times_cosine(n, v, l, vec3(0.04), roughness, 0.0);
+vec3 specular = specular_times_cosine(n, v, l, vec3(0.04), roughness, vec2(0.0));
 values[2] = specular.g;
 values[3] = fresnel_schlick(vec3(0.04), dot(n, v)).g;
 """

@@ -152,6 +152,19 @@ def test_a_long_wall_is_likely_to_be_high() -> None:
     assert found[above] == pytest.approx(2 / (2 + beyond), rel=1e-3)
 
 
+def test_a_strip_of_a_wall_beside_a_long_one_goes_on_as_that_does() -> None:
+    """The view shows 0.2 m of it, which reaches d farther with 0.2 / (0.2 + d); at the end of 2 m, 2 / (2 + d)."""
+    strip = wall(0, 0.9, -1.0, evenly((0.8, 0.45), (1, 0.55)))
+    end = wall(1, 1.0, -1.0, evenly((-1, -0.5), (0.9, 1.5)))
+    place = CENTRE + 0.9 * DIRECTIONS / np.where(DIRECTIONS[:, :1] > 0, DIRECTIONS[:, :1], np.inf)
+    beside = (DIRECTIONS[:, 0] > 0) & (place[:, 1] < 0) & (np.abs(place[:, 2] - 0.5) < 1e-9)
+    beyond = 0.8 - place[beside, 1]
+    assert beside.sum() >= 4
+    for parts, length in (([(*strip, 0.3)], 0.2), ([(*strip, 0.3), (*end, 0.3)], 2.0)):
+        found = continued(*shown(*parts)).probability.reshape(-1)[beside]
+        assert found == pytest.approx(length / (length + beyond), rel=1e-5)
+
+
 def test_what_a_wall_shines_with_is_what_the_light_makes_there() -> None:
     position, intensity, albedo = np.array([1.5, 0.2, 1.5]), np.array([2.0, 1.5, 1.0]), 0.4
     lamp = SphereLight(position.astype(np.float32), intensity.astype(np.float32), 0.02)
@@ -185,8 +198,8 @@ def test_a_thing_that_has_the_room_behind_it_ends_where_it_ends() -> None:
 def test_nearer_planes_stand_before_farther_ones() -> None:
     end, side = (
         wall(1, 1.0, -1.0, evenly((-1, -0.5), (0.6, 1.5))),
-        wall(0, 0.6, -1.0, evenly((0.3, 0), (1, 1))),
-    )
+        wall(0, 0.6, -1.0, evenly((0.3, -0.5), (1, 1.5))),
+    )  # as high as each other: neither makes the other one more likely
     planes, samples = shown((*end, 0.3), (*side, 0.9))
     both = continued(planes, samples)
     ahead, aside = (continued([plane], samples) for plane in planes)

@@ -51,7 +51,7 @@ void light(ivec2 pixel, ivec2 size) {
             unshadowed += is_virtual(listed_light(i)) ? 0.0 : dot(across, vec3(1.0 / 3.0)) * cosine;
             if (specular_surfaces && normal.w >= 0.0) {
                 SurfaceEntry e = surfaces[int(normal.w)];
-                vec3 lobe = across * specular_times_cosine(normal.xyz, v, l, e.f0.rgb, e.surface.x, radius);
+                vec3 lobe = across * specular_times_cosine(normal.xyz, v, l, e.f0.rgb, e.surface.x, vec2(radius, 0.0));
                 s_mu += lobe * seen.x;
                 s_rho += lobe * arrives;
             }

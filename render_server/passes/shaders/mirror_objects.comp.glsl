@@ -61,7 +61,7 @@ vec4 trace(ivec2 pixel, Ray ray, out float met_at) {
     float open;
     Indirect indirect = gathered(pixel, s, distance(camera_position, ray.from) + hit.distance, open);
     Material material = material_of(s.material, s.uv, s.tint, 0.0);
-    vec3 radiance = object_radiance(s.position, distance(camera_position, s.position), s.normal, -ray.direction, material, indirect);
+    vec3 radiance = object_radiance(s.position, distance(camera_position, s.position), s.normal, -ray.direction, material, indirect, 0.0);
 #ifdef TRANSMISSION
     // What is behind goes on below the object, unrefracted.
     vec3 passing = material.passing * (1.0 - specular_reflectance(material.f0, material.roughness, -dot(s.normal, ray.direction)));

@@ -1,6 +1,6 @@
-// The first sample of each pixel, from a raster of the objects whose texels' centres are shifted by `offset`: the fraction of the pixel
-// that they cover, and the surface that represents them. Pixels whose other samples may differ are listed for
-// edge_samples.comp.glsl, and the tiles of the raster that they lie in marked.
+// The first sample of each pixel, at its centre, from the raster of the objects: the fraction of the pixel that they cover, and the
+// surface that represents them. Pixels whose other samples may differ are listed for edge_samples.comp.glsl, and the tiles of the
+// raster that they lie in marked.
 #include "common/samples.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
@@ -28,13 +28,12 @@ layout(rgba32ui) writeonly uniform uimage2D extended_out;
 uniform usampler2D virtual_raster_extended;
 #pragma texels rgba32ui virtual_raster_extended
 #endif
-uniform vec2 offset;           // pixels
 uniform float weight;          // of a sample
 uniform ivec4 rectangle;       // first pixel and size of the part of the picture that may show an object, or did before
 uniform ivec4 raster_rectangle;  // the same of the raster: nothing was drawn beyond it
 
-// Exactly one texel centre of the shifted raster is within half a pixel of any position.
-ivec2 sampled_texel(ivec2 pixel) { return ivec2(floor(place_in_raster(pixel) - offset + 0.5)); }
+// Exactly one texel centre is within half a pixel of any position.
+ivec2 sampled_texel(ivec2 pixel) { return ivec2(floor(place_in_raster(pixel) + 0.5)); }
 
 vec4 position_at(ivec2 raster) {
     ivec2 inside = raster - raster_rectangle.xy;

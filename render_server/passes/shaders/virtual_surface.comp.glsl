@@ -19,6 +19,7 @@ uniform sampler2D virtual_raster_tint;
 uniform sampler2D screen_reflection;   // rgb radiance times fraction; a: fraction of the specular lobe
 #pragma texels rgba16f cone_irradiance cone_specular screen_reflection
 #pragma texels rgba8 virtual_raster_tint
+#pragma texels r16f object_coverage
 uniform bool has_screen_reflection;
 #include "common/camera.glsl"
 
@@ -42,6 +43,29 @@ Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
     return sum;
 }
 
+const float STRAIGHT = 0.25;   // sine of the greatest angle between a chord of a smooth surface and its mean tangent plane
+
+// Squared change of the normal from a pixel to the next along an axis: the mean of both sides, of which edges do not count. (The chord
+// of an arc is at right angles to the mean of the normals at its ends.)
+float turn_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
+    float sum = 0.0;
+    for (int side = -1; side <= 1; side += 2) {
+        ivec2 raster = raster_texel(clamp(pixel + side * axis, ivec2(0), textureSize(object_coverage, 0) - 1));
+        vec4 p = texelFetch(virtual_raster_position, raster, 0), n = texelFetch(virtual_raster_normal, raster, 0);
+        vec3 chord = (p - position).xyz, turn = (n - normal).xyz, both = (n + normal).xyz;
+        bool goes_on = p.w > 0.0 && n.w == normal.w && abs(dot(chord, both)) <= STRAIGHT * length(chord) * length(both);
+        sum += goes_on ? 0.5 * dot(turn, turn) : 0.0;
+    }
+    return sum;
+}
+
+// Half-angle (rad) of a disc over which a curved surface turns the normal within a pixel: along an axis, its mean square is a quarter of
+// the half-angle's, and that of a square pixel a twelfth of the squared change.
+float turn_within(ivec2 pixel, vec4 position, vec4 normal) {
+    float x = turn_along(pixel, ivec2(1, 0), position, normal), y = turn_along(pixel, ivec2(0, 1), position, normal);
+    return sqrt((x + y) / 6.0);
+}
+
 void shade(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
     vec4 position = texelFetch(virtual_raster_position, raster, 0);
@@ -61,7 +85,7 @@ void shade(ivec2 pixel) {
         indirect.specular = seen.rgb + (1.0 - seen.a) * indirect.specular;
     }
     indirect.irradiance += caustic_irradiance(pixel, textureSize(object_coverage, 0), OBJECT_LAYER, position.xyz, normal.xyz, position.w);
-    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect);
+    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect, turn_within(pixel, position, normal));
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
 }
 

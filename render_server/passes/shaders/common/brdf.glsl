@@ -109,20 +109,29 @@ float image_of_disc(vec3 d, vec3 l, float alpha, float radius) {
     return lobe_in_disc(d, l, alpha, r) / (PI * sine * sine);
 }
 
-// Specular BRDF times cosine for a light seen under half-angle `radius` (rad). Averaging the lobe's peak over the
-// light's disc, of radius/2 in half-vectors, gives a GGX peak of alpha^2 + (radius/2)^2; D stays a normalised
-// distribution, so the reflected energy is that of the unwidened lobe. A lobe narrower than that shows the disc itself.
-vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, float radius) {
+// Mean of ggx_distribution over the half-vectors towards the points of a disc, seen from within a pixel (`spread`: see below). In s, the
+// tangent of the angle to the normal, the lobe is alpha^2 / (PI (alpha^2 + s^2)^2) but for the cosine's fourth power, and the light a disc
+// of (spread.x / 2)^2 / l.h, squared radius. Over a disc the lobe's integral has a closed form.
+float ggx_over_disc(float n_dot_h, float l_dot_h, float alpha, vec2 spread) {
+    float half_disc = tan(0.5 * spread.x), disc2 = half_disc * half_disc / max(l_dot_h, 1e-2) + spread.y * spread.y;
+    float a2 = alpha * alpha, cosine2 = max(n_dot_h * n_dot_h, 1e-6);
+    float beyond = a2 + (1.0 - cosine2) / cosine2 - disc2, root = sqrt(beyond * beyond + 4.0 * a2 * disc2);
+    return 2.0 * a2 / (PI * root * (root + beyond) * cosine2 * cosine2);
+}
+
+// Specular BRDF times cosine. `spread`: half-angles (rad), x of the light's disc, y of one over which curvature turns the normal within a
+// pixel. A lobe wider than the light's disc is averaged over both; a narrower one shows the disc itself.
+vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, vec2 spread) {
     float alpha = max(roughness * roughness, 2e-3);
-    float wide = min(sqrt(alpha * alpha + 0.25 * radius * radius), 1.0);
     float n_dot_l = max(dot(n, l), 0.0);
     float n_dot_v = max(dot(n, v), 1e-3);
     vec3 h = l + v;
     h *= inversesqrt(max(dot(h, h), 1e-12));   // l = -v has no half-vector
-    float whole = lobe_albedo(roughness, n_dot_v).x;
-    vec3 reflected = fresnel_schlick(f0, max(dot(l, h), 0.0)) * further_reflections(f0, whole);
-    if (alpha < 0.5 * radius) return reflected * (whole * image_of_disc(reflect(-v, n), l, alpha * sqrt(n_dot_v), radius));
-    return reflected * (ggx_distribution(clamp(dot(n, h), 0.0, 1.0), wide)
+    float l_dot_h = max(dot(l, h), 0.0), whole = lobe_albedo(roughness, n_dot_v).x;
+    vec3 reflected = fresnel_schlick(f0, l_dot_h) * further_reflections(f0, whole);
+    float shown = length(vec2(spread.x, 2.0 * spread.y));   // mirroring doubles the normal's turn
+    if (alpha < 0.5 * spread.x) return reflected * (whole * image_of_disc(reflect(-v, n), l, alpha * sqrt(n_dot_v), shown));
+    return reflected * (ggx_over_disc(clamp(dot(n, h), 0.0, 1.0), l_dot_h, alpha, spread)
         * smith_visibility(n_dot_l, n_dot_v, alpha) * n_dot_l);
 }
 

@@ -67,17 +67,17 @@ Reflected reflected_towards(Material m, vec3 n, vec3 v) {
 // The coat's part of what both lobes reflect.
 vec3 coat_share(Reflected r) { return r.coat / max(r.coat + r.lobe, vec3(1e-6)); }
 
-// BRDF times cosine for a light seen under half-angle `radius`. The coat dims the light to a diffuse base on its way in, too, as the
+// BRDF times cosine; `spread` as in specular_times_cosine. The coat dims the light to a diffuse base on its way in, too, as the
 // base's own lobe does (brdf.glsl); other lobes only what leaves, as the extensions have it: so all keep the light.
-vec3 coated_response(Material m, vec3 n, vec3 v, vec3 l, float cosine, float radius) {
+vec3 coated_response(Material m, vec3 n, vec3 v, vec3 l, float cosine, vec2 spread) {
     Coating over = m.over;
     vec3 nc = coat_normal(over, n);
     Reflected seen = reflected_towards(m, n, v);
     float entered = (1.0 - coat_reflectance(over, dot(nc, l))) / (1.0 - mean_coat_reflectance(over));
     vec3 base = m.diffuse / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v)) * (entered * cosine)
-        + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
+        + specular_times_cosine(n, v, l, m.f0, m.roughness, spread);
     return seen.below * base + (1.0 - seen.coat) * over.sheen * sheen_times_cosine(n, v, l, over.sheen_roughness)
-        + over.coat * specular_times_cosine(nc, v, l, COAT_F0, over.roughness, radius);
+        + over.coat * specular_times_cosine(nc, v, l, COAT_F0, over.roughness, spread);
 }
 
 // What coat and sheen let out of the base, in the mean.

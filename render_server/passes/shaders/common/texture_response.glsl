@@ -45,10 +45,10 @@ vec3 base_response(Material m, vec3 l, float cosine) {
 }
 
 // Under a coat, which shines as much as the place is brighter than the stack's mean.
-vec3 stack_response(Material m, vec3 n, vec3 v, vec3 l, float cosine, float radius) {
+vec3 stack_response(Material m, vec3 n, vec3 v, vec3 l, float cosine, vec2 spread) {
     vec3 shown = stack_at(m, cosine, m.stack.w);
     vec3 mean = stack_at(m, cosine, COARSEST);
     float relief = dot(shown, vec3(1.0)) / max(dot(mean, vec3(1.0)), 1e-4);
     return shown / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v))
-        + relief * specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
+        + relief * specular_times_cosine(n, v, l, m.f0, m.roughness, spread);
 }
