@@ -140,6 +140,7 @@ class LiveScene:
         self._graphs: list[FrameGraph] = []  # of each camera
         self._best: list[FrameGraph] = []
         self._spare: list[FrameGraph] = []  # of the picture size before, which a budget may choose again
+        self._chosen: tuple[object, MethodChoice] | None = None  # and what was asked for
         self._refused: tuple[tuple[MethodChoice, list[tuple[int, int]]], str] | None = None
         self._enlarge: Enlarge | None = None
         self._crossfade: Crossfade | None = None
@@ -160,8 +161,7 @@ class LiveScene:
 
     def _planned(self, scene: SceneDocument, before: LightEstimator | None = None) -> _Plan:
         """Checks everything that can fail before anything is replaced. `before`: the lights so far, of this room."""
-        document = scene.method.replaced(quality=self._budget.level.quality)
-        method = choose_method(document, scene.shading, software=self._gpu.is_software)
+        method = self._chosen_method(scene)
         if method.remark is not None:
             self._notify(method.remark)
         method.require(scene.objects)
@@ -178,6 +178,14 @@ class LiveScene:
         if lamps:
             maps_mb = math.ceil(most_maps_bytes(lamps, method.resolved.rsm_size) / MEGABYTE)
             self._notify(f"shadow maps of the objects' lamps ({len(lamps)}): up to {maps_mb} MB")
+
+    def _chosen_method(self, scene: SceneDocument) -> MethodChoice:
+        """Returns the method at the budget's level: the one chosen last if the document asks for the same."""
+        asked = scene.method, scene.shading, self._budget.level.quality
+        if self._chosen is None or self._chosen[0] != asked:
+            document = scene.method.replaced(quality=self._budget.level.quality)
+            self._chosen = asked, choose_method(document, scene.shading, software=self._gpu.is_software)
+        return self._chosen[1]
 
     def _notify(self, sentence: str) -> None:
         if sentence not in self._notices:

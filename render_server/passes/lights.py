@@ -137,7 +137,7 @@ class LightBuffers:
         self.mirrors, self._virtual_count = list(mirrors), len(virtual_lights)
         lights = [*lights, *virtual_lights]
         self._make_mirror_maps()
-        shown = np.concatenate([receivers, virtual_points])
+        shown = np.concatenate([receivers, virtual_points]) if mirrors else receivers
         axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
         real = self._views_around_objects.of(lights, receivers, real_points)
         blocking = virtual_points if blocking is None else blocking

@@ -176,14 +176,15 @@ def rewritten(
     return before
 
 
-def bvh_texture(gpu: GpuContext, data: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:
-    """Returns packed nodes or triangles in rows one after the other, as shaders/common/ray_mesh.glsl reads them.
+def bvh_rows(packed: bytes) -> bytes:
+    """Returns packed nodes or triangles as whole rows of texels, as shaders/common/ray_mesh.glsl reads them."""
+    return packed.ljust(max(-(-len(packed) // BVH_ROW_BYTES), 1) * BVH_ROW_BYTES, b"\0")
 
-    `before`: those before, which are overwritten or freed.
-    """
-    rows = max(-(-len(data) // BVH_ROW_BYTES), 1)
-    size = BVH_ROW_BYTES // TEXEL_BYTES, rows
-    return rewritten(gpu, before, size, "u4", data.ljust(rows * BVH_ROW_BYTES, b"\0"))
+
+def bvh_texture(gpu: GpuContext, rows: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:
+    """Returns a texture of `bvh_rows`. `before`: that of those before, which is overwritten or freed."""
+    size = BVH_ROW_BYTES // TEXEL_BYTES, len(rows) // BVH_ROW_BYTES
+    return rewritten(gpu, before, size, "u4", rows)
 
 
 class ObjectBvh:
@@ -237,14 +238,15 @@ class ObjectBvh:
     def _begin(self) -> None:
         """Begins to bring the hierarchy up to date, after what was begun before."""
         assert self._mesh is not None
-        before, positions, triangles = self._packed, np.ascontiguousarray(self._corners), self._mesh.triangles
+        before, corners, triangles = self._packed, self._corners, self._mesh.triangles
         self._built, self._is_traced = self._corners, False
 
         def packed() -> tuple[bytes, bytes]:
             if before is not None:
                 before.result()
+            positions = np.ascontiguousarray(corners)
             bvh = self._renewed(positions)
-            return bvh.packed(), bvh.packed_triangles(positions, triangles)
+            return bvh_rows(bvh.packed()), bvh_rows(bvh.packed_triangles(positions, triangles))
 
         self._packed = begun(packed)
 
