@@ -48,8 +48,7 @@ class LpvCells:
         self._real_covered, self._virtual_covered = (covered_sums(gpu, size) for _ in range(2))
         self._through_real, self._through_joint = (transmitted_fractions(gpu, size) for _ in range(2))
         self.real, self.objects = (VoxelStore(gpu, 2 * size) for _ in range(2))
-        # One each: what earlier fillings of one tell about the next says nothing of the other's.
-        self._voxelize_real, self._voxelize_objects = Voxelize(gpu), Voxelize(gpu)
+        self._voxelize = Voxelize(gpu)
         self._albedo = RealAlbedo(gpu)
         self._maps = LpvInjectMaps(gpu)
         self._surfaces = LpvInjectSurfaces(gpu)
@@ -74,18 +73,18 @@ class LpvCells:
     def voxelize_real(self, real: GeometryState, volume: PlacedVolume) -> VoxelStore:
         """Voxelises the real scene into surfels, if anything reads them."""
         if self._has_geometry or self._blocks_environment or self._settings.resolved_bounces > 0:
-            self._surfels(self._voxelize_real, self.real, real.solid_parts(volume.placement.voxel_edge))
+            self._surfels(self.real, real.solid_parts(volume.placement.voxel_edge))
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, _volume: PlacedVolume) -> VoxelStore:
         """Voxelises the objects into surfels."""
-        self._surfels(self._voxelize_objects, self.objects, objects.parts)
+        self._surfels(self.objects, objects.parts)
         return self.objects
 
-    def _surfels(self, voxelize: Voxelize, store: VoxelStore, meshes: Meshes) -> None:
+    def _surfels(self, store: VoxelStore, meshes: Meshes) -> None:
         """Voxelises at half a cell; only the store's surfels are used."""
         clear_buffer(self._gpu, store.grid)
-        voxelize.run(store, meshes, self._half_cells)
+        self._voxelize.run(store, meshes, self._half_cells)
 
     def real_scene(
         self,
