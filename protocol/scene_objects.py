@@ -1,5 +1,6 @@
 """The parts of the scene document that hold geometry and materials: `objects` and `real` (docs/formats.md 3)."""
 
+from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal, Self
 
@@ -23,8 +24,15 @@ from deltalight.protocol.scene_fields import (
 
 SheetEdge = Annotated[float, Field(gt=0, le=100)]
 GLTF_SUFFIXES = (".gltf", ".glb")
+ASSETS_KEPT = 256  # whose names were looked at
 # Rotates an asset whose y is up so that its z is up: +90 degrees about x.
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+@lru_cache(maxsize=ASSETS_KEPT)
+def _is_gltf(asset: str) -> bool:
+    """Whether a file is glTF by its name; a dragged object asks in every frame."""
+    return PurePosixPath(asset).suffix.lower() in GLTF_SUFFIXES
 
 
 class Pose(StrictModel):
@@ -170,7 +178,7 @@ class SceneObject(StrictModel):
         """The asset's up axis: as given, or y for glTF and z otherwise."""
         if self.up_axis is not None:
             return self.up_axis
-        return "y" if PurePosixPath(self.asset).suffix.lower() in GLTF_SUFFIXES else "z"
+        return "y" if _is_gltf(self.asset) else "z"
 
     @property
     def playing(self) -> Animation | None:

@@ -50,8 +50,10 @@ class CameraHistory:
         self.voxel_m: float | None = None  # of the surface that depth is fused to; None: nothing is fused
 
     def expect(self, taken: PosedFrame) -> None:
-        """Begins to look at the frame that is taken next: at its colours, while the camera stands still."""
-        self._expected = None if self.moved else FrameSamples.with_begun_color(taken.frame)
+        """Begins to look at the frame that is taken next, while the camera stands still: else poses tell enough."""
+        self._expected = None if self.moved else FrameSamples(taken.frame)
+        if self._expected is not None:
+            self._motion.expect(self._expected)
 
     def update(self, taken: PosedFrame, *, is_unknown: bool) -> bool:
         """Takes a frame; returns whether anything moved in it. `is_unknown`: there is no real scene yet."""

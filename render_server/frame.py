@@ -133,11 +133,10 @@ class ObservationBuffers:
         self.image = CameraImage(gpu, view.size)
         self.real_surface = RealSurface(gpu, view.size)
         self._model_raster: GeometryBuffer | None = None
-        self.raster_camera, self.camera = (UniformBlock[CameraBlock](gpu, view.block()) for _ in range(2))
+        self.camera = UniformBlock[CameraBlock](gpu, view.block())
 
     def set_camera(self, view: CameraView) -> CameraView:
-        """Writes the camera blocks: for rasters through the lens, and for reading the objects' geometry."""
-        self.raster_camera.write(view.without_antialiasing.block())
+        """Writes the camera's block."""
         self.camera.write(view.block())
         return view
 
@@ -146,7 +145,7 @@ class ObservationBuffers:
     ) -> Observation:
         """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
         raster_scene: dict[str, Binding] = {
-            "Camera": self.raster_camera,
+            "Camera": self.camera,
             "lens_distortion": view.without_antialiasing.raster_is_bent,
             **self.image.bindings,
             **declared,
@@ -176,7 +175,7 @@ class ObservationBuffers:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.image, self.real_surface, self._model_raster, self.raster_camera, self.camera)
+        release_all(self.image, self.real_surface, self._model_raster, self.camera)
 
 
 class PictureBuffers:
@@ -217,7 +216,7 @@ class PictureBuffers:
         }
 
     def set_camera(self, view: CameraView) -> CameraView:
-        """Writes the camera blocks: for rasters through the lens, and for reading the objects' geometry."""
+        """Writes the camera's block."""
         return self._observed.set_camera(view)
 
     def observe(
@@ -279,7 +278,6 @@ class PictureBuffers:
             scene={
                 **seen.bindings,
                 **objects.materials.bindings,
-                "Camera": self._observed.raster_camera,
                 "lens_distortion": plain.raster_is_bent,
             },
         )

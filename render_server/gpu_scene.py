@@ -47,7 +47,7 @@ class ObjectExtent:
         parts = zip(self.parts, other.parts, strict=False)
         return same and len(self.parts) == len(other.parts) and all(a.equals(b) for a, b in parts)
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates of the points, m."""
         return short_axis.bounds(self.points)
@@ -172,7 +172,7 @@ class GeometryState:
         chosen = None if self.choose_backs is None else self.choose_backs(coarse, voxel_edge)
         return *self.parts, VoxelizedMesh(coarse.buffers, BACK_OFFSET_VOXELS * voxel_edge, chosen)
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates, m."""
         return short_axis.bounds(self.points)

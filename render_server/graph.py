@@ -8,84 +8,30 @@ drawn.
 import time
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field
 from difflib import get_close_matches
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from deltalight.protocol.plugins import Plugin
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Dispatch, watched
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
 from deltalight.render_server.gpu.timers import PassTimers
-from deltalight.render_server.graph_report import CLOCKS, Clock, SourceReport, StageReport, links, summary
+from deltalight.render_server.graph_report import CLOCKS, Clock, SourceReport, StageReport, summary
 from deltalight.render_server.lag import Lag
+from deltalight.render_server.stages import (
+    GraphError,
+    Resource,
+    Same,
+    Stage,
+    complete_clocks,
+    in_order,
+    needed_for,
+)
+
+__all__ = ["Graph", "GraphError", "Resource", "Stage"]
 
 T = TypeVar("T")
-Same = Callable[[Any, Any], bool]
-
-
-class GraphError(RuntimeError):
-    """Stages and resources do not fit together."""
-
-
-@dataclass(eq=False)
-class Resource(Generic[T]):
-    """A named texture, buffer or plain value, and a number that counts its changes; 0: never written.
-
-    `clocks` are what makes it change: those of its source, or of everything that its stage reads (known from the
-    graph's first run or report on).
-    """
-
-    name: str
-    clocks: frozenset[Clock]
-    stage: "Stage | None" = None
-    version: int = 0
-    _value: T | None = field(default=None, repr=False)
-
-    @property
-    def value(self) -> T:
-        """The last value written.
-
-        Raises:
-            GraphError: nothing was written yet.
-        """
-        if self.version == 0:
-            raise GraphError(f"Resource `{self.name}` is read before it is written.")
-        return self._value  # type: ignore[return-value]
-
-    def write(self, value: T, same: Same | None = None) -> None:
-        """Replaces the value; the version stays if `same` finds the new value equal to the old one."""
-        if self.version == 0 or same is None or not same(self._value, value):
-            self.version += 1
-        self._value = value
-
-
 _Polled = tuple[Resource[Any], Callable[[], Any], Same]
-
-
-@dataclass(eq=False)
-class Stage:
-    """A function of resources.
-
-    `ran`: whether the last run of the graph called it; `plugin`: whose stage it is; `lag`: what it may wait for;
-    `view`: which of the views declared it.
-    """
-
-    name: str
-    function: Callable[..., Any]
-    inputs: tuple[Resource[Any], ...]
-    outputs: tuple[Resource[Any], ...]
-    same: Same | None
-    plugin: Plugin | None = None
-    lag: Lag | None = None
-    view: int = 0
-    seen: tuple[int, ...] | None = None
-    ran: bool = False
-
-    @property
-    def clocks(self) -> frozenset[Clock]:
-        """The clocks that make it run."""
-        return self.outputs[0].clocks
 
 
 class Graph:
@@ -101,8 +47,10 @@ class Graph:
         self._checks = checks
         self._sections: list[tuple[int, str]] = []
         self._values: set[str] = set()
-        self._begun: tuple[dict[Stage, object], dict[Resource[Any], int]] = {}, {}
+        self._runs, self._first_run = 0, 0  # so many so far, and the number of the frame's first
+        self._begun: dict[Resource[Any], int] = {}  # versions of the sources when the frame began
         self._resources: dict[str, Resource[Any]] = {}
+        self._sources: list[Resource[Any]] = []
         self._stages: list[Stage] = []
         self._named: dict[Stage, list[str]] = {}
         self._order: list[Stage] | None = None
@@ -124,7 +72,9 @@ class Graph:
         own = clock == "view" if of_each_view is None else of_each_view
         if self._view and not own and name in self._resources:
             return self._resources[name]
-        return self._declare((_of_view(name, self._view),), None, frozenset([clock]))[0]
+        (made,) = self._declare((_of_view(name, self._view),), None, frozenset([clock]))
+        self._sources.append(made)
+        return made
 
     def polled(self, name: str, clock: Clock, ask: Callable[[], Any], same: Same) -> Resource[Any]:
         """Declares a source that is asked for before every run that needs it."""
@@ -318,8 +268,7 @@ class Graph:
             GraphError: stages read each other in a circle, read what nobody writes, or write what they did not
                 declare.
         """
-        for stage in self._sorted():
-            stage.ran = False
+        self._runs += 1
         if targets not in self._needed:
             self._needed[targets] = self._needed_for(targets or self._resources.values())
         stages, polled = self._needed[targets]
@@ -336,23 +285,9 @@ class Graph:
         if self._order is None:
             for stage, names in self._named.items():
                 stage.inputs = tuple(self._read(stage, name) for name in names)
-            order: list[Stage] = []
-            for stage in self._stages:
-                self._place(stage, order, [])
-            self._order = order
-            self._complete_clocks(order)
+            self._order = in_order(self._stages)
+            complete_clocks(self._order)
         return self._order
-
-    def _place(self, stage: Stage, order: list[Stage], waiting: list[Stage]) -> None:
-        """Appends a stage to the order, after everything that it reads."""
-        if stage in order:
-            return
-        if stage in waiting:
-            raise GraphError(f"Stages read each other in a circle: {links(waiting[waiting.index(stage) :])}.")
-        for item in stage.inputs:
-            if item.stage is not None:
-                self._place(item.stage, order, [*waiting, stage])
-        order.append(stage)
 
     def _read(self, stage: Stage, name: str) -> Resource[Any]:
         name = self._name_in_view(name, stage.view)
@@ -362,27 +297,16 @@ class Graph:
             )
         return self._resources[name]
 
-    def _complete_clocks(self, order: Sequence[Stage]) -> None:
-        for stage in order:
-            clocks = frozenset(clock for item in stage.inputs for clock in item.clocks)
-            for output in stage.outputs:
-                output.clocks = clocks
-
     def _needed_for(self, targets: Iterable[Resource[Any]]) -> tuple[list[Stage], list[_Polled]]:
         """Returns the stages that the targets are made by, in order, and the polled sources."""
-        needed: set[Resource[Any]] = set()
-        open_ = list(targets)
-        while open_:
-            item = open_.pop()
-            if item not in needed:
-                needed.add(item)
-                open_ += () if item.stage is None else item.stage.inputs
-        stages = [stage for stage in self._sorted() if not needed.isdisjoint(stage.outputs)]
+        order = self._sorted()
+        needed = needed_for(targets)
+        stages = [stage for stage in order if not needed.isdisjoint(stage.outputs)]
         return stages, [each for each in self._polled if each[0] in needed]
 
     def _update(self, stage: Stage) -> None:
         """Runs a stage if the version of any input differs from the one that it saw last."""
-        versions = tuple(item.version for item in stage.inputs)
+        versions = tuple([item.version for item in stage.inputs])
         if versions == stage.seen or (
             stage.lag is not None and stage.lag.holds(stage.inputs, stage.seen, versions)
         ):
@@ -392,7 +316,7 @@ class Graph:
                 raise GraphError(f"Stage `{stage.name}` reads `{item.name}` before it is written.")
         for output, value in zip(stage.outputs, self._call(stage), strict=True):
             output.write(value, stage.same)
-        stage.seen, stage.ran = versions, True
+        stage.seen, stage.ran_in = versions, self._runs
 
     def _call(self, stage: Stage) -> Sequence[Any]:
         """Runs a stage's function, timed; returns a value for each output."""
@@ -451,8 +375,8 @@ class Graph:
         """Begins a frame: reports tell what ran and changed since, and stages that waited take their turn."""
         for lag in self._lags:
             lag.begin_frame()
-        seen = {stage: stage.seen for stage in self._stages}
-        self._begun = dict(seen), {item: item.version for item in self._resources.values()}
+        self._first_run = self._runs + 1
+        self._begun = {item: item.version for item in self._sources}
 
     def reused_times_ms(self, ran: Container[str]) -> dict[str, float]:
         """Times of the stages whose values a frame uses again, when they last ran; `ran` names the others.
@@ -475,7 +399,7 @@ class Graph:
     def report(self) -> list[StageReport]:
         """Every stage in the order in which they run, as the frame left it."""
         times: Mapping[str, float] = {} if self.timers is None else self.timers.last_ms
-        sizes, (seen, _) = self._sizes(), self._begun
+        sizes = self._sizes()
         return [
             StageReport(
                 stage.name,
@@ -484,7 +408,7 @@ class Graph:
                 tuple(clock for clock in CLOCKS if clock in stage.clocks),
                 sum(sizes[item] for item in stage.outputs),
                 times.get(stage.name),
-                stage.ran or stage.seen is not seen.get(stage, stage.seen),
+                0 < (self._first_run or self._runs) <= stage.ran_in,
                 self._section_of(stage),
                 stage.name in self._values,
                 summary(stage.function),
@@ -495,13 +419,12 @@ class Graph:
 
     def report_sources(self) -> list[SourceReport]:
         """Every source in the order in which they were declared, as the frame left it."""
-        sizes, (_, versions) = self._sizes(), self._begun
+        sizes = self._sizes()
         return [
             SourceReport(
-                item.name, next(iter(item.clocks)), sizes[item], item.version != versions.get(item, 0)
+                item.name, next(iter(item.clocks)), sizes[item], item.version != self._begun.get(item, 0)
             )
-            for item in self._resources.values()
-            if item.stage is None
+            for item in self._sources
         ]
 
     def _sizes(self) -> dict[Resource[Any], int]:

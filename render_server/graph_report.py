@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 if TYPE_CHECKING:
-    from deltalight.render_server.graph import Stage
+    from deltalight.render_server.stages import Stage
 
 Clock = Literal["scene", "lights", "world", "objects", "view"]
 CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)

@@ -31,7 +31,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
-from deltalight.render_server.methods.registry import MethodChoice, choose_method
+from deltalight.render_server.methods.registry import MethodChoice, MethodChooser
 from deltalight.render_server.passes.composite import Composite, Crossfade, Enlarge, Picture
 from deltalight.render_server.passes.shadow_maps import most_maps_bytes
 from deltalight.render_server.passes.voxels import MEGABYTE
@@ -140,14 +140,14 @@ class LiveScene:
         self._graphs: list[FrameGraph] = []  # of each camera
         self._best: list[FrameGraph] = []
         self._spare: list[FrameGraph] = []  # of the picture size before, which a budget may choose again
+        self._chooser = MethodChooser(software=gpu.is_software)
         self._refused: tuple[tuple[MethodChoice, list[tuple[int, int]]], str] | None = None
         self._enlarge: Enlarge | None = None
         self._crossfade: Crossfade | None = None
         self._refined_ns: int | None = None  # the refined picture has shown since
-        self._changing: tuple[
-            object, ...
-        ] = ()  # what the newest picture was made from, camera and room left out,
-        self._changed_ns = 0  # and when that or anything else last changed
+        # What the newest picture was made from, camera and room left out, and when that or anything else changed.
+        self._changing: tuple[object, ...] = ()
+        self._changed_ns = 0
         self._precomputed = Precomputed(self._notify, waits=waits)
         self._waits = waits
         self._unobserved = False  # the real scene moved while its lights were provisional
@@ -160,8 +160,7 @@ class LiveScene:
 
     def _planned(self, scene: SceneDocument, before: LightEstimator | None = None) -> _Plan:
         """Checks everything that can fail before anything is replaced. `before`: the lights so far, of this room."""
-        document = scene.method.replaced(quality=self._budget.level.quality)
-        method = choose_method(document, scene.shading, software=self._gpu.is_software)
+        method = self._chooser.choose(scene.method, scene.shading, self._budget.level.quality)
         if method.remark is not None:
             self._notify(method.remark)
         method.require(scene.objects)

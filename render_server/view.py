@@ -75,16 +75,28 @@ class CameraView:
     @cached_property
     def with_antialiasing(self) -> "CameraView":
         """Returns the view for stages that read an antialiased geometry buffer of the objects."""
-        return replace(self, antialiased=True)
+        return self._altered(antialiased=True)
 
     @cached_property
     def without_antialiasing(self) -> "CameraView":
         """Returns the view for passes that raster the objects, or sample such a raster through the lens."""
-        return replace(self, antialiased=False)
+        return self._altered(antialiased=False)
 
     def with_matting(self, reach_px: int) -> "CameraView":
         """Returns the view for stages that find mattes within `reach_px` pixels of real things; 0 = none."""
-        return replace(self, matting_px=reach_px) if reach_px != self.matting_px else self
+        return self._altered(matting_px=reach_px)
+
+    def _altered(self, *, antialiased: bool | None = None, matting_px: int | None = None) -> "CameraView":
+        """Returns the view with other options: itself if they are its own, else one that shares what it found."""
+        wanted = (
+            self.antialiased if antialiased is None else antialiased,
+            self.matting_px if matting_px is None else matting_px,
+        )
+        if wanted == (self.antialiased, self.matting_px):
+            return self
+        altered = CameraView(self.camera, self.world_from_camera, *wanted)
+        vars(altered)["camera_from_world"] = self.camera_from_world
+        return altered
 
     @property
     def size(self) -> tuple[int, int]:

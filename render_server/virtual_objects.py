@@ -27,6 +27,9 @@ from deltalight.render_server.scene.mesh_loading import Asset, load_asset
 from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of, merge_for_gpu
 
 MARKER_FRAME = "marker:"
+CORNER_PICKS = np.array(
+    [[(index >> axis) & 1 for axis in range(3)] for index in range(8)]
+)  # of least, greatest
 
 
 class AnimatedObject:
@@ -187,11 +190,15 @@ class VirtualObjects:
             np.vstack(points),
             materials,
             objects=tuple(objects),
-            lamps=tuple(lamp for item in self._shown for lamp in self._lamps(item)),
+            lamps=tuple(
+                lamp
+                for item, placed in zip(self._shown, objects, strict=True)
+                for lamp in self._lamps(item, placed.world_from_asset)
+            ),
             swept_points=np.vstack(swept) if any(item.moves for item in objects) else None,
             extents=tuple(
-                ObjectExtent(lasting, np.stack(short_axis.bounds(self._upright(item))))
-                for item, lasting in zip(self._shown, swept, strict=True)
+                ObjectExtent(lasting, np.stack(short_axis.bounds(self._upright(item, placed))))
+                for item, placed, lasting in zip(self._shown, objects, swept, strict=True)
             ),
         )
 
@@ -218,13 +225,12 @@ class VirtualObjects:
             moves=moving is not None and not moving.is_still,
         )
 
-    def _lamps(self, item: SceneObject) -> list[Light]:
+    def _lamps(self, item: SceneObject, world_from_asset: Float64[np.ndarray, "4 4"]) -> list[Light]:
         """Returns the lights that come with an object, as bright as the document wants them; none if they are off."""
         moving = self._moving.get(item.id)
         kept = self._resting_lamps.get(item.id)
         if moving is None and kept is not None and kept[:2] == (item, self._board):
             return kept[2]
-        world_from_asset = world_from_frame(item, self._board) @ item.world_from_object()
         shining = (self._assets[item.asset] if moving is None else moving).lamps(world_from_asset)
         factor = np.full(3, item.lamps, np.float32)
         lamps = [lamp.scaled(factor) for lamp in shining] if item.lamps else []
@@ -261,11 +267,10 @@ class VirtualObjects:
         corners = _box_corners(self._moving[item.id].bounds)
         return np.asarray(corners @ matrix[:3, :3].T + matrix[:3, 3])
 
-    def _upright(self, item: SceneObject) -> Float64[np.ndarray, "8 3"]:
+    def _upright(self, item: SceneObject, placed: PlacedObject) -> Float64[np.ndarray, "8 3"]:
         """Returns the corners of the object's box at all times, about its middle in the world but not turned."""
         corners = _box_corners(self._lasting_bounds(item))
-        middle = corners.mean(axis=0)
-        matrix = world_from_frame(item, self._board) @ item.world_from_object()
+        middle, matrix = corners.mean(axis=0), placed.world_from_asset
         from_middle = (corners - middle) @ item.asset_rotation.T * item.pose.scale
         return np.asarray(matrix[:3, :3] @ middle + matrix[:3, 3] + from_middle)
 
@@ -320,5 +325,4 @@ def world_from_frame(item: SceneObject, board: BoardSpec | None) -> Float64[np.n
 
 def _box_corners(bounds: np.ndarray) -> Float64[np.ndarray, "8 3"]:
     """Returns the eight corners of a box given as (least, greatest)."""
-    picks = np.array([[(index >> axis) & 1 for axis in range(3)] for index in range(8)])
-    return np.asarray(np.asarray(bounds, np.float64)[picks, np.arange(3)])
+    return np.asarray(np.asarray(bounds, np.float64)[CORNER_PICKS, range(3)])

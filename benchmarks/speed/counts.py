@@ -23,6 +23,7 @@ ROWS = {
     "framebuffer_clears": "framebuffer clears",
     "buffer_clears": "buffer clears by the CPU",
     "buffer_clear_bytes": "cleared by the CPU, MB",
+    "uploads": "uploads",
     "uploaded_bytes": "uploaded, MB",
     "reads": "reads that wait for the GPU",
     "uniform_writes": "uniform writes",

@@ -38,8 +38,9 @@ class GpuCounts:
     """What was asked of OpenGL.
 
     `buffer_clears` are those of moderngl, which maps the buffer and clears it on the CPU; `uploaded_bytes` go into
-    buffers and textures, those of newly made ones included. `reads` wait for the GPU; the finished picture's own
-    and those of earlier frames' numbers are not counted. `uniform_writes` are of single uniforms: blocks are uploads.
+    buffers and textures, those of newly made ones included, in so many `uploads`. `reads` wait for the GPU; the
+    finished picture's own and those of earlier frames' numbers are not counted. `uniform_writes` are of single
+    uniforms: blocks are uploads.
     """
 
     dispatches: int = 0
@@ -47,6 +48,7 @@ class GpuCounts:
     framebuffer_clears: int = 0
     buffer_clears: int = 0
     buffer_clear_bytes: int = 0
+    uploads: int = 0
     uploaded_bytes: int = 0
     reads: int = 0
     uniform_writes: int = 0
@@ -97,6 +99,7 @@ class _Counter:
 
     def _upload(self, _: object, data: Any, *__: object, **___: object) -> None:  # noqa: ANN401 (any buffer)
         if not isinstance(data, moderngl.Buffer):  # what the GPU has is copied there
+            self.counts.uploads += 1
             self.counts.uploaded_bytes += memoryview(data).nbytes
 
     def _make_buffer(self, _: object, data: Any = None, **__: object) -> None:  # noqa: ANN401 (any buffer)

@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from functools import partial
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, cast
 
 import moderngl
 import numpy as np
@@ -30,7 +30,7 @@ CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
 Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
 PLAIN = (float, int, bool, tuple, list)  # values of uniforms that moderngl takes as they are
-NUMBERS = frozenset({float, int, bool})
+CONSTANT = frozenset({float, int, bool, tuple})  # those of them that nobody changes in place
 Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
 Bindings = Mapping[str, Binding]
 """GLSL names and what is bound to them; None stands for nothing: a texture without texels, an empty buffer."""
@@ -91,6 +91,7 @@ class Program:
         declared: Declarations,
     ) -> None:
         self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
+        self.compute = cast("moderngl.ComputeShader", program)  # if it is one that is dispatched
         self.users: set[int] = set()  # ids of the kernels that have not been released
         self._samplers: list[Slot] = []
         self._images: list[Slot] = []
@@ -160,7 +161,7 @@ class Program:
         for call in self._calls.of(resources):
             call()
         for slot, value in zip(self._uniforms, values, strict=True):
-            if type(value) not in NUMBERS or slot.last != value:
+            if type(value) not in CONSTANT or slot.last != value:
                 self._write(slot, value)
 
     def _require(self, names: Set[str], known: Bindings) -> None:
@@ -189,6 +190,10 @@ class Program:
     def _wrong(self, slot: Slot, value: object, wanted: str) -> BindingError:
         return BindingError(f"Kernel {self.label}: `{slot.name}` is {wanted}, not a {type(value).__name__}.")
 
+    def _require_held(self, slot: Slot, value: Any) -> None:  # noqa: ANN401 (textures and buffers)
+        if isinstance(value.mglo, moderngl.InvalidObject):
+            raise BindingError(f"Kernel {self.label}: `{slot.name}` was released; bind what replaces it.")
+
     def _sampler_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
         kind, texels = SAMPLERS[slot.kind]
         texture: Any = self._gpu.empty_texture(kind, f"{texels}1", 4) if value is None else value
@@ -199,9 +204,9 @@ class Program:
         kind, texels = SAMPLERS[slot.kind]
         if not isinstance(texture, Texture) or not isinstance(texture, kind):
             raise self._wrong(slot, texture, f"a {kind.__name__} that is sampled")
-        if (
-            texture.dtype[0].replace("n", "f") != texels
-        ):  # n: integers that are read as fractions of their greatest
+        self._require_held(slot, texture)
+        # n: integers that are read as fractions of their greatest
+        if texture.dtype[0].replace("n", "f") != texels:
             raise BindingError(
                 f"Kernel {self.label}: `{slot.name}` samples texels of type {texels}, not {texture.dtype}."
             )
@@ -219,6 +224,7 @@ class Program:
         kind = IMAGES[slot.kind]
         if not isinstance(texture, Texture) or not isinstance(texture, kind):
             raise self._wrong(slot, texture, f"a {kind.__name__} that is written or read texel by texel")
+        self._require_held(slot, texture)
         wanted = self._declared.formats[slot.name]
         found = image_format(texture)
         if wanted and found not in wanted:
@@ -237,11 +243,13 @@ class Program:
         buffer = nothing if value is None else value
         if not isinstance(buffer, moderngl.Buffer):
             raise self._wrong(slot, value, "a storage buffer")
+        self._require_held(slot, buffer)
         return buffer
 
     def _block_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
         if not isinstance(value, UniformBlock):
             raise self._wrong(slot, value, "a uniform block")
+        self._require_held(slot, value)
         if not value.fits(slot.member.size):
             raise BindingError(
                 f"Kernel {self.label}: block `{slot.name}` takes {slot.member.size} bytes, "
@@ -278,12 +286,6 @@ class Program:
     def local_size(self) -> tuple[int, int, int]:
         """Invocations of a workgroup."""
         return self._declared.local_size
-
-    @property
-    def compute(self) -> moderngl.ComputeShader:
-        """The program as one that is dispatched."""
-        assert isinstance(self.program, moderngl.ComputeShader)
-        return self.program
 
     def resources(self) -> dict[str, list[str]]:
         """Names of the active samplers, images, storage blocks and uniform blocks."""

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
-from weakref import ReferenceType, ref
 
 import numpy as np
 
@@ -25,7 +24,7 @@ class Slot:
 
 
 class BindingCalls:
-    """The calls that bind the resources of a program, for each set of them that it ran with while all of it lives.
+    """The calls that bind the resources of a program, for each set of them that it ran with lately.
 
     What was bound once needs no more checks, and most runs bind what the same run of the last frame did. `binders`
     check a resource each and return the call that binds it.
@@ -33,27 +32,28 @@ class BindingCalls:
 
     def __init__(self, binders: Sequence[Callable[[Any], Callable[[], None]]]) -> None:
         self._binders = binders
-        self._kept: dict[tuple[int, ...], tuple[Calls, list[ReferenceType[Any]]]] = {}
+        self._kept: dict[tuple[object, ...], Calls] = {}
 
     def of(self, items: Sequence[Any]) -> Calls:
-        """Returns the calls that bind these very objects; None among them stands for nothing."""
-        found = self._kept.get(tuple(map(id, items)))
-        if found is not None:
-            return found[0]
-        calls = [binder(item) for binder, item in zip(self._binders, items, strict=True)]
-        self._keep(items, calls)
+        """Returns the calls that bind these very objects; None among them stands for nothing.
+
+        Sets are told apart by what moderngl holds of OpenGL's objects (`mglo`): of a released one that is another
+        object, so that calls with its name, which may be another's by now, are never found.
+        """
+        try:
+            held = tuple([None if item is None else item.mglo for item in items])
+        except AttributeError:  # what has none cannot be bound, as its binder says
+            return self._made(items)
+        calls = self._kept.get(held)
+        if calls is None:
+            calls = self._made(items)
+            if len(self._kept) >= SETS_KEPT:
+                self._kept.clear()
+            self._kept[held] = calls
         return calls
 
-    def _keep(self, items: Sequence[Any], calls: Calls) -> None:
-        """Keeps the calls until one of the items ends: its id may be used again."""
-        if len(self._kept) >= SETS_KEPT:
-            self._kept.clear()
-        kept, ids = self._kept, tuple(map(id, items))
-
-        def forget(_: object) -> None:
-            kept.pop(ids, None)
-
-        kept[ids] = calls, [ref(item, forget) for item in items if item is not None]
+    def _made(self, items: Sequence[Any]) -> Calls:
+        return [binder(item) for binder, item in zip(self._binders, items, strict=True)]
 
 
 def values_of(names: Sequence[str]) -> Callable[[Mapping[str, Any]], tuple[Any, ...]]:

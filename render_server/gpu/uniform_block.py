@@ -89,6 +89,11 @@ class UniformBlock(Generic[Kind]):
         """Size in bytes."""
         return len(self._data)
 
+    @property
+    def mglo(self) -> object:
+        """What moderngl holds of the buffer."""
+        return self._buffer.mglo
+
     def fits(self, declared: int) -> bool:
         """Whether a program's block of that size in bytes, with or without its padding, is of these members."""
         return self.size == declared + -declared % ALIGNMENT

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.plugins import Plugin
+from deltalight.protocol.quality import Quality
 from deltalight.protocol.scene_method import DvctMethod, MethodSettings, NoneMethod
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.scene_output import Shading
@@ -124,6 +125,22 @@ def choose_method(
         remark = None if method.state_memory is None else method.state_memory(document, resolved)
     asked = Shading() if shading is None else shading
     return MethodChoice(method, document, document.limited(), resolved, asked, remark, plugin=plugin)
+
+
+class MethodChooser:
+    """Chooses methods, and keeps the last one: an object that is dragged asks for the same in every frame."""
+
+    def __init__(self, *, software: bool) -> None:
+        self._software = software
+        self._last: tuple[object, MethodChoice] | None = None  # and what was asked for
+
+    def choose(self, document: MethodSettings, shading: Shading | None, quality: Quality) -> MethodChoice:
+        """Returns `choose_method` of the document at that quality."""
+        asked = document, shading, quality
+        if self._last is None or self._last[0] != asked:
+            wanted = document.replaced(quality=quality)
+            self._last = asked, choose_method(wanted, shading, software=self._software)
+        return self._last[1]
 
 
 def _registered(settings: MethodSettings) -> tuple[RelightingMethod[Any], Plugin | None]:

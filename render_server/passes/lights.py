@@ -50,6 +50,29 @@ class LightingBlock(Block):
     """Radians, of layer 0; the last layer's is pi/2, cosine-weighted."""
 
 
+class _Rows:
+    """Records in a texture, a row each; one of zeros if there are none."""
+
+    def __init__(self, gpu: GpuContext, texels: int) -> None:
+        self._gpu, self._row_bytes = gpu, TEXEL_BYTES * texels
+        self._data = bytes(self._row_bytes)
+        self.texture = texture_2d(gpu, (texels, 1), 4, "u4", data=self._data)
+
+    def write(self, records: bytes) -> None:
+        """Replaces the records, if they are others: in a new texture if their number has changed."""
+        before, self._data = self._data, records or bytes(self._row_bytes)
+        if len(before) != len(self._data):
+            self.texture.release()
+            size = self._row_bytes // TEXEL_BYTES, len(self._data) // self._row_bytes
+            self.texture = texture_2d(self._gpu, size, 4, "u4", data=self._data)
+        elif before != self._data:
+            self.texture.write(self._data)
+
+    def release(self) -> None:
+        """Frees the texture."""
+        self.texture.release()
+
+
 class LightBuffers:
     """GPU buffers of the lights: their shadow maps of the real scene and the objects, and their records.
 
@@ -76,10 +99,7 @@ class LightBuffers:
         self.real_records = self.virtual_records = b""
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
-        self._light_rows, self._view_rows = (
-            texture_2d(gpu, (texels, 1), 4, "u4", data=bytes(TEXEL_BYTES * texels))
-            for texels in (LIGHT_TEXELS, VIEW_TEXELS)
-        )
+        self._light_rows, self._view_rows = _Rows(gpu, LIGHT_TEXELS), _Rows(gpu, VIEW_TEXELS)
         self._environment: moderngl.TextureArray | None = None
         self._environment_half_angle = 0.0
         self._block = UniformBlock(gpu, LightingBlock())
@@ -88,8 +108,8 @@ class LightBuffers:
     def bindings(self) -> dict[str, Binding]:
         """All bindings of the lights, by GLSL name."""
         return {
-            "light_rows": self._light_rows,
-            "light_view_rows": self._view_rows,
+            "light_rows": self._light_rows.texture,
+            "light_view_rows": self._view_rows.texture,
             "Lighting": self._block,
             "real_light_depth": self.real_atlas.depth,
             "virtual_light_depth": self.virtual_atlas.depth,
@@ -137,7 +157,7 @@ class LightBuffers:
         self.mirrors, self._virtual_count = list(mirrors), len(virtual_lights)
         lights = [*lights, *virtual_lights]
         self._make_mirror_maps()
-        shown = np.concatenate([receivers, virtual_points])
+        shown = np.concatenate([receivers, virtual_points]) if mirrors else receivers
         axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
         real = self._views_around_objects.of(lights, receivers, real_points)
         blocking = virtual_points if blocking is None else blocking
@@ -192,19 +212,8 @@ class LightBuffers:
             self.views_of_lights.append((range(ranges[0], first_real), range(ranges[2], first_virtual)))
         self.real_records = self._packed(self.real_views)
         self.virtual_records = self._packed(self.virtual_views)
-        packed = self.real_records + self.virtual_records
-        self._light_rows = self._with_rows(self._light_rows, records)
-        self._view_rows = self._with_rows(self._view_rows, packed)
-
-    def _with_rows(self, texture: moderngl.Texture, records: bytes) -> moderngl.Texture:
-        """Writes records to a texture, a row each; to a new one if their number has changed."""
-        row_bytes = TEXEL_BYTES * texture.width
-        data = records or bytes(row_bytes)
-        if len(data) == row_bytes * texture.height:
-            texture.write(data)
-            return texture
-        texture.release()
-        return texture_2d(self._gpu, (texture.width, len(data) // row_bytes), 4, "u4", data=data)
+        self._light_rows.write(records)
+        self._view_rows.write(self.real_records + self.virtual_records)
 
     def _packed(self, views: list[LightView]) -> bytes:
         columns = tile_columns(len(views))

@@ -54,6 +54,10 @@ class MeshBuffers:
         self._vertices = gpu.ctx.buffer(reserve=4)
         self._indices = gpu.ctx.buffer(reserve=4)
         self._sides = gpu.ctx.buffer(reserve=4)
+        self._held_triangles, self._held_sides = (
+            NO_TRIANGLES,
+            b"",
+        )  # what these two hold, as far as it is known
         self._placement: moderngl.Buffer | None = None
         self._corners: moderngl.Texture | None = None
         self._corner_texels = np.zeros(
@@ -98,31 +102,42 @@ class MeshBuffers:
     def write(self, mesh: GpuMesh) -> None:
         """Replaces the contents by those of `mesh`."""
         vertices = np.ascontiguousarray(mesh.vertices, np.float32)
-        self.reserve(len(vertices), len(mesh.triangles), mesh)
+        self._reserve(len(vertices), len(mesh.triangles), mesh)
         self._written = mesh
         self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
         if self.triangle_count:
             self._vertices.write(vertices)
-            self._indices.write(self.triangles)
+            if not np.array_equal(self.triangles, self._held_triangles):  # of an object that moves they stay
+                self._indices.write(self.triangles)
+        self._held_triangles = self.triangles
         self._write_placement(mesh.placement)
 
     def reserve(self, vertex_count: int, triangle_count: int, materials: GpuMesh) -> None:
         """Makes room for triangles of the materials of a mesh, which a kernel is to write (`solid`)."""
+        self._held_triangles = NO_TRIANGLES
+        self._reserve(vertex_count, triangle_count, materials)
+
+    def _reserve(self, vertex_count: int, triangle_count: int, materials: GpuMesh) -> None:
         vertex_bytes, index_bytes = vertex_count * VERTEX_BYTES, triangle_count * TRIANGLE_BYTES
         if vertex_bytes > self._vertices.size or index_bytes > self._indices.size:
             self.release()
             self._vertices = self._ctx.buffer(reserve=max(vertex_bytes, 4))
             self._indices = self._ctx.buffer(reserve=max(index_bytes, 4))
             self._sides = self._ctx.buffer(reserve=4)
+            self._held_triangles, self._held_sides = NO_TRIANGLES, b""
         self.triangles, self.triangle_count, self._written = NO_TRIANGLES, triangle_count, None
         self._shows_corners = False
         if triangle_count:
             self._write_sides(materials.material_table[:, DOUBLE_SIDED])
 
     def _write_sides(self, double_sided: Float32[np.ndarray, " k"]) -> None:
-        if self._sides.size != double_sided.nbytes:
-            self._sides.orphan(double_sided.nbytes)
-        self._sides.write(double_sided.tobytes())
+        sides = double_sided.tobytes()
+        if self._sides.size != len(sides):
+            self._sides.orphan(len(sides))
+        elif sides == self._held_sides:
+            return
+        self._sides.write(sides)
+        self._held_sides = sides
 
     def _write_placement(self, rows: Float32[np.ndarray, "n 6"] | None) -> None:
         if rows is None and self._placement is None:
@@ -176,14 +191,15 @@ def rewritten(
     return before
 
 
-def bvh_texture(gpu: GpuContext, data: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:
-    """Returns packed nodes or triangles in rows one after the other, as shaders/common/ray_mesh.glsl reads them.
+def bvh_rows(packed: bytes) -> bytes:
+    """Returns packed nodes or triangles as whole rows of texels, as shaders/common/ray_mesh.glsl reads them."""
+    return packed.ljust(max(-(-len(packed) // BVH_ROW_BYTES), 1) * BVH_ROW_BYTES, b"\0")
 
-    `before`: those before, which are overwritten or freed.
-    """
-    rows = max(-(-len(data) // BVH_ROW_BYTES), 1)
-    size = BVH_ROW_BYTES // TEXEL_BYTES, rows
-    return rewritten(gpu, before, size, "u4", data.ljust(rows * BVH_ROW_BYTES, b"\0"))
+
+def bvh_texture(gpu: GpuContext, rows: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:
+    """Returns a texture of `bvh_rows`. `before`: that of those before, which is overwritten or freed."""
+    size = BVH_ROW_BYTES // TEXEL_BYTES, len(rows) // BVH_ROW_BYTES
+    return rewritten(gpu, before, size, "u4", rows)
 
 
 class ObjectBvh:
@@ -237,14 +253,15 @@ class ObjectBvh:
     def _begin(self) -> None:
         """Begins to bring the hierarchy up to date, after what was begun before."""
         assert self._mesh is not None
-        before, positions, triangles = self._packed, np.ascontiguousarray(self._corners), self._mesh.triangles
+        before, corners, triangles = self._packed, self._corners, self._mesh.triangles
         self._built, self._is_traced = self._corners, False
 
         def packed() -> tuple[bytes, bytes]:
             if before is not None:
                 before.result()
+            positions = np.ascontiguousarray(corners)
             bvh = self._renewed(positions)
-            return bvh.packed(), bvh.packed_triangles(positions, triangles)
+            return bvh_rows(bvh.packed()), bvh_rows(bvh.packed_triangles(positions, triangles))
 
         self._packed = begun(packed)
 

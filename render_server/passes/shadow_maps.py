@@ -361,14 +361,12 @@ def tile_columns(count: int) -> int:
     return max(1, math.ceil(math.sqrt(count)))
 
 
-def pack_view(view: LightView, tile: int, columns: int, tile_size: int) -> Float64[np.ndarray, "28"]:
-    """Packs a std430 LightView: matrix by columns, tile, range, front."""
+def pack_view(view: LightView, tile: int, columns: int, tile_size: int) -> list[float]:
+    """Packs the 28 numbers of a std430 LightView: matrix by columns, tile, range, front."""
     x, y = (tile % columns) * tile_size, (tile // columns) * tile_size
-    return np.concatenate(
-        [
-            view.view_from_world.T.ravel(),
-            [x, y, tile_size, view.half_extent],
-            [view.near, view.far, float(view.orthographic), 0.0],
-            EVERYWHERE if view.front is None else view.front,
-        ]
-    )
+    return [
+        *view.view_from_world.T.ravel().tolist(),
+        *(x, y, tile_size, view.half_extent),
+        *(view.near, view.far, float(view.orthographic), 0.0),
+        *(EVERYWHERE if view.front is None else view.front.tolist()),
+    ]

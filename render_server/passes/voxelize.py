@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import moderngl
 import numpy as np
@@ -82,6 +83,21 @@ class PairCounts:
 
 
 @dataclass(frozen=True, eq=False)
+class FillingSize:
+    """How many triangles fill a volume, and which."""
+
+    triangle_count: int
+    placement: VolumePlacement
+
+    def is_like(self, other: "FillingSize") -> bool:
+        """Whether about as many pairs may be expected: of as many triangles, and as many voxels of about one size."""
+        mine, its = self.placement, other.placement
+        is_more = self.triangle_count > MORE_TRIANGLES * other.triangle_count
+        is_of_one_size = its.voxel_edge / FINER < mine.voxel_edge < its.voxel_edge * FINER
+        return not is_more and is_of_one_size and mine.size == its.size
+
+
+@dataclass(frozen=True, eq=False)
 class Filling:
     """A mesh that is to fill a volume, how many triangles it has now, and the bindings of both."""
 
@@ -90,16 +106,14 @@ class Filling:
     placement: VolumePlacement
     bindings: Bindings
 
-    def is_like(self, other: "Filling") -> bool:
-        """Whether about as many pairs may be expected: of as many triangles, and as many voxels of about one size."""
-        mine, its = self.placement, other.placement
-        is_more = self.triangle_count > MORE_TRIANGLES * other.triangle_count
-        is_of_one_size = its.voxel_edge / FINER < mine.voxel_edge < its.voxel_edge * FINER
-        return not is_more and is_of_one_size and mine.size == its.size
+    @property
+    def size(self) -> FillingSize:
+        """What is remembered of it, which does not hold the mesh."""
+        return FillingSize(self.triangle_count, self.placement)
 
 
 class EarlierCounts:
-    """What earlier fillings tell about the next one, so that the CPU need not wait for the GPU to count.
+    """What earlier fillings by one mesh tell about the next one, so that the CPU need not wait for the GPU to count.
 
     Where they tell nothing it waits, and in software always: it has nothing else to do. A filling that has more pairs
     than expected lacks them; two fillings later that is known, and the CPU waits.
@@ -108,10 +122,10 @@ class EarlierCounts:
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._late = DelayedRead(gpu, COUNTS_BYTES)
-        self._waiting: deque[tuple[Filling, PairCounts]] = deque()  # and the room that each had
-        self._known: tuple[Filling, PairCounts] | None = None
+        self._waiting: deque[tuple[FillingSize, PairCounts]] = deque()  # and the room that each had
+        self._known: tuple[FillingSize, PairCounts] | None = None
 
-    def expected(self, filling: Filling) -> PairCounts | None:
+    def expected(self, filling: FillingSize) -> PairCounts | None:
         """Returns for how many to make room; None: wait and see."""
         header = self._late.pop()
         if header is not None:
@@ -126,7 +140,7 @@ class EarlierCounts:
         pairs = GROWTH * counts.pairs + MORE_A_FACE * filling.placement.size**2
         return PairCounts(int(pairs), LEAST_LONG_PIECES + 2 * counts.long_pieces)
 
-    def wait(self, filling: Filling, pairs: moderngl.Buffer) -> PairCounts:
+    def wait(self, filling: FillingSize, pairs: moderngl.Buffer) -> PairCounts:
         """Waits for the counts of a filling, and forgets those of earlier ones."""
         self._late.forget()
         self._waiting.clear()
@@ -134,7 +148,7 @@ class EarlierCounts:
         self._known = filling, counts
         return counts
 
-    def note(self, filling: Filling, room: PairCounts, pairs: moderngl.Buffer) -> None:
+    def note(self, filling: FillingSize, room: PairCounts, pairs: moderngl.Buffer) -> None:
         """Notes a filling whose counts are not known yet."""
         self._late.push(pairs)
         self._waiting.append((filling, room))
@@ -152,8 +166,9 @@ class VoxelPairs:
         self._pairs, self._long, self._chosen = (gpu.ctx.buffer(reserve=4) for _ in range(3))
         self._find = Kernel(gpu, "voxel_pairs")
         self._cut = Kernel(gpu, "voxel_pairs", LONG=1)
-        self._earlier = EarlierCounts(gpu)
-        self._expected: PairCounts | None = None
+        # By mesh: the pairs of one tell nothing of another's.
+        self._earlier: WeakKeyDictionary[MeshBuffers, EarlierCounts] = WeakKeyDictionary()
+        self._begun: tuple[EarlierCounts, PairCounts | None] | None = None  # and what they tell
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -167,21 +182,28 @@ class VoxelPairs:
 
     def begin(self, filling: Filling) -> None:
         """Begins to list the pairs."""
-        self._expected = self._earlier.expected(filling)
+        mesh = filling.mesh.mesh
+        if mesh not in self._earlier:
+            self._earlier[mesh] = EarlierCounts(self._gpu)
+        earlier = self._earlier[mesh]
+        expected = earlier.expected(filling.size)
+        self._begun = earlier, expected
         guess = PairCounts(PAIRS_PER_TRIANGLE * filling.triangle_count, LEAST_LONG_PIECES)
-        self._make_room(self._expected or guess)
+        self._make_room(expected or guess)
         self._list(filling)
 
     def bound(self, filling: Filling) -> int:
         """Returns how many pairs there are at most."""
-        if self._expected is not None:
-            self._earlier.note(filling, self._expected, self._pairs)
-            return self._expected.pairs
-        counts = self._earlier.wait(filling, self._pairs)
+        assert self._begun is not None
+        earlier, expected = self._begun
+        if expected is not None:
+            earlier.note(filling.size, expected, self._pairs)
+            return expected.pairs
+        counts = earlier.wait(filling.size, self._pairs)
         while not counts.fits(self._room):
             self._make_room(counts)
             self._list(filling)
-            counts = self._earlier.wait(filling, self._pairs)
+            counts = earlier.wait(filling.size, self._pairs)
         return counts.pairs
 
     def _make_room(self, wanted: PairCounts) -> None:
@@ -228,7 +250,8 @@ class VoxelPairs:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._pairs, self._long, self._chosen, self._find, self._cut, self._earlier)
+        release_all(self._pairs, self._long, self._chosen, self._find, self._cut)
+        release_all(*self._earlier.values())
 
 
 class Voxelize:

@@ -4,6 +4,7 @@ In inverse depth w = 1/z a plane is an affine function of the ray (x/z, y/z), an
 structured light, sigma z^2, is the same everywhere (sigma). Both make w the quantity to fit and to compare.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -17,7 +18,7 @@ from deltalight.render_server.scene.threads import by_bands
 from deltalight.render_server.view import LENSES_KEPT
 
 ASSUMED_NOISE_SIGMA_M = 0.002
-MAX_SLOPE_DEG = 80.0
+MAX_SLOPE = float(np.tan(np.radians(80.0)))
 NOISE_SIGMAS = 3.0
 MAX_TILT_ERROR_RAD = 0.05
 MAX_RADIUS = 5
@@ -149,9 +150,8 @@ def jump_terms(depth: DepthImage, camera: CameraModel) -> tuple[float, float]:
 
 def jump_terms_of(sigma: float, camera: CameraModel) -> tuple[float, float]:
     """Returns the terms of `jump_threshold` for depth with noise of `sigma` m at 1 m."""
-    focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-    slope = float(np.tan(np.radians(MAX_SLOPE_DEG))) / focal
-    return slope, float(NOISE_SIGMAS * np.sqrt(2) * sigma)
+    focal = math.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    return MAX_SLOPE / focal, NOISE_SIGMAS * math.sqrt(2) * sigma
 
 
 def window_radius(depth: DepthImage, camera: CameraModel) -> int:
@@ -161,7 +161,7 @@ def window_radius(depth: DepthImage, camera: CameraModel) -> int:
     mean = float(np.mean(1 / known, dtype=np.float64)) if known.size else 0.0
     error = noise_sigma(depth) * float(camera.matrix[0, 0]) / max(mean, 1e-6)
     for radius in range(1, MAX_RADIUS):
-        if error <= MAX_TILT_ERROR_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
+        if error <= MAX_TILT_ERROR_RAD * math.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
             return radius
     return MAX_RADIUS
 

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64, Int64
 from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
-from deltalight.render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
+from deltalight.render_server.scene.depth_surface import MAX_SLOPE, noise_sigma
 from deltalight.render_server.scene.threads import begun
 from deltalight.render_server.view import LENSES_KEPT
 
@@ -42,23 +42,14 @@ class MotionThresholds:
 
 @dataclass(frozen=True, eq=False)
 class FrameSamples:
-    """A frame on a grid of GRID_STEP_PX pixels, sampled when asked: of a moving camera, poses alone tell enough.
-
-    `begun_color`: the colour, if it is found beside other work.
-    """
+    """A frame on a grid of GRID_STEP_PX pixels, sampled when asked: of a moving camera, poses alone tell enough."""
 
     frame: ViewFrame
-    begun_color: "Future[Float32[np.ndarray, 'gh gw 3']] | None" = None
-
-    @classmethod
-    def with_begun_color(cls, frame: ViewFrame) -> "FrameSamples":
-        """Begins to find the colour on another thread."""
-        return cls(frame, begun(partial(_downsampled_color, frame)))
 
     @cached_property
     def color(self) -> Float32[np.ndarray, "gh gw 3"]:
         """Mean linear colour."""
-        return _downsampled_color(self.frame) if self.begun_color is None else self.begun_color.result()
+        return _downsampled_color(self.frame)
 
     @cached_property
     def inverse_depth(self) -> Float32[np.ndarray, "gh gw"] | None:
@@ -77,8 +68,10 @@ class FrameSamples:
     @cached_property
     def mean_distance(self) -> float:
         """The mean distance; without depth that of the world's origin."""
-        if self._known.size:
-            return float(1 / self._known.mean(dtype=np.float64))
+        inverse = self.inverse_depth
+        known = 0 if inverse is None else int(np.count_nonzero(inverse))
+        if inverse is not None and known:
+            return known / float(inverse.sum(dtype=np.float64))
         assert self.frame.pose is not None
         return max(float(np.linalg.norm(self.frame.pose.world_from_camera[:3, 3])), 0.1)
 
@@ -114,13 +107,24 @@ class MotionDetector:
     def __init__(self, thresholds: MotionThresholds | None = None) -> None:
         self._thresholds = thresholds or MotionThresholds()
         self._reference: FrameSamples | None = None
+        self._expected: tuple[FrameSamples, Future[bool]] | None = None  # and whether it has changed
+
+    def expect(self, coming: FrameSamples) -> None:
+        """Begins to compare the frame that is taken next, on another thread."""
+        if self._reference is not None:
+            compare = partial(_has_changed, self._reference, coming, self._thresholds)
+            self._expected = coming, begun(compare)
 
     def update(self, current: FrameSamples) -> bool:
         """Returns whether anything moved; if so, the frame becomes the reference."""
-        if self._reference is not None and not _has_changed(self._reference, current, self._thresholds):
-            return False
-        self._reference = current
-        return True
+        expected, self._expected = self._expected, None
+        if expected is not None and expected[0] is current:
+            changed = expected[1].result()
+        else:
+            changed = self._reference is None or _has_changed(self._reference, current, self._thresholds)
+        if changed:
+            self._reference = current
+        return changed
 
 
 def _has_changed(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> bool:
@@ -225,7 +229,7 @@ def _compared(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds
     assert new.inverse_depth is not None
     assert new.frame.depth is not None
     samples, cells, inverse = _reprojected(old, new)
-    tilt = float(np.tan(np.radians(MAX_SLOPE_DEG))) * GRID_STEP_PX / new.frame.camera.matrix[0, 0]
+    tilt = MAX_SLOPE * GRID_STEP_PX / new.frame.camera.matrix[0, 0]
     limit = _depth_limit(new.frame.depth, thresholds) + tilt * inverse
     farthest, nearest = (edge.ravel()[cells] for edge in old.depth_range)
     low, high = (edge.reshape(-1, 3).take(cells, axis=0) for edge in old.color_range)
@@ -328,8 +332,8 @@ def _image_motions(old: FrameSamples, new: FrameSamples) -> Iterator[float]:
     new_from_old = np.linalg.inv(from_new) @ from_old
     for distance in _distances(old):
         points = distance * rays @ new_from_old[:3, :3].T + new_from_old[:3, 3]
-        shift = np.linalg.norm(before.camera.project(points) - pixels, axis=1)
-        yield float(np.nan_to_num(shift, nan=np.inf).max())
+        motion_px = float(short_axis.lengths(before.camera.project(points) - pixels).max())
+        yield math.inf if math.isnan(motion_px) else motion_px
 
 
 @lru_cache(maxsize=LENSES_KEPT)

@@ -73,6 +73,7 @@ def test_a_known_sequence_is_counted_exactly(gpu: GpuContext, fill: Kernel, out:
         framebuffer_clears=1,
         buffer_clears=2,
         buffer_clear_bytes=16 + 4,
+        uploads=4,
         uploaded_bytes=8 + 32 + 100 + 16,
         reads=3,
         uniform_writes=3,

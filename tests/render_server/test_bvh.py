@@ -13,7 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.mesh_buffers import MeshBuffers, ObjectBvh, bvh_texture
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers, ObjectBvh, bvh_rows, bvh_texture
 from deltalight.render_server.scene.bvh import LEAF_SIZE, Bvh, RayCaster, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -81,7 +81,7 @@ def traced(
     rows[:, 0, :3], rows[:, 1, :3] = origins, directions
     faces = bvh.packed_triangles(corners, vertices_of(corners))
     rays, hits = (gpu.ctx.buffer(content) for content in (rows.tobytes(), bytes(16 * len(origins))))
-    textures = [bvh_texture(gpu, packed) for packed in (bvh.packed(), faces)]
+    textures = [bvh_texture(gpu, bvh_rows(packed)) for packed in (bvh.packed(), faces)]
     hierarchy = {"bvh_nodes": textures[0], "bvh_faces": textures[1]}
     kernel = Kernel(gpu, SHADER)
     kernel.run((len(origins),), UNREAD, hierarchy, Rays=rays, Hits=hits, count=len(origins))

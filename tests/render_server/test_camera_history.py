@@ -5,7 +5,7 @@ import pytest
 
 from deltalight.protocol.frames import DepthImage
 from deltalight.render_server.camera_history import SAMPLE_STEP, CameraHistory
-from deltalight.render_server.scene.motion_detection import FrameSamples
+from deltalight.render_server.scene.motion_detection import FrameSamples, MotionDetector
 from deltalight.render_server.view import CameraView, PosedFrame
 from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at, plain
 
@@ -58,6 +58,17 @@ def test_a_still_camera_s_change_of_light_is_found_whatever_was_expected(expecte
     assert camera.update(brighter, is_unknown=False)
 
 
-def test_colour_that_is_found_beside_other_work_is_the_same() -> None:
-    taken = frame(checkered())
-    assert np.array_equal(FrameSamples.with_begun_color(taken).color, FrameSamples(taken).color)
+def test_a_frame_that_was_expected_moves_as_much_as_one_that_was_not() -> None:
+    """Also one that looks like the reference, but for a tenth of its pixels."""
+    board = checkered()
+    changed = board.copy()
+    changed[: len(board) // 10] //= 2
+    for picture, moves in ((board, False), (changed, True)):
+        found = []
+        for expected in (True, False):
+            detector, coming = MotionDetector(), FrameSamples(frame(picture))
+            assert detector.update(FrameSamples(frame(board)))
+            if expected:
+                detector.expect(coming)
+            found.append(detector.update(coming))
+        assert found == [moves, moves]

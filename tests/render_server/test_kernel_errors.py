@@ -93,6 +93,25 @@ def test_an_unknown_name_that_nothing_resembles_is_told(make: MakeKernel, given:
         make(PARTS, USES).run((1,), given, xyzzy=1)
 
 
+@pytest.mark.parametrize("name", ["picture", "filled", "Out", "Camera"])
+def test_what_was_released_is_not_bound_though_it_was_before(
+    gpu: GpuContext, make: MakeKernel, given: dict[str, Any], name: str
+) -> None:
+    """OpenGL gives its name to what is made next, which the kernel would read or overwrite instead."""
+    kernel = make(PARTS, USES)
+    mine = {
+        "picture": lambda: gpu.ctx.texture((4, 4), 4, dtype="f4"),
+        "filled": lambda: texture_2d(gpu, (4, 4), 4, "f2"),
+        "Out": lambda: gpu.ctx.buffer(reserve=16),
+        "Camera": lambda: UniformBlock(gpu, CameraBlock((1, 2, 3, 4), 5.0)),
+    }[name]()
+    kernel.run((1,), {**given, name: mine})
+    mine.release()
+    with pytest.raises(BindingError, match=f"Kernel tiny: `{name}` was released; bind what replaces it"):
+        kernel.run((1,), {**given, name: mine})
+    kernel.run((1,), given)
+
+
 WRONG_KINDS = [
     ("picture", lambda gpu: gpu.ctx.buffer(reserve=16), "a Texture that is sampled, not a Buffer"),
     ("picture", lambda gpu: gpu.ctx.texture3d((1, 1, 1), 4), "a Texture that is sampled, not a Texture3D"),

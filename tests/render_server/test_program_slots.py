@@ -1,4 +1,4 @@
-"""Calls that bind a program's resources: made once for each set of them, and forgotten with them."""
+"""Calls that bind a program's resources: made once for each set of them, while it exists."""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,7 +9,14 @@ Bound = list[tuple[str, object]]
 
 
 class Resource:
-    """Something that can be bound."""
+    """Something that can be bound, until it is released."""
+
+    def __init__(self) -> None:
+        self.mglo = object()
+
+    def release(self) -> None:
+        """Lets go of what was bound, as moderngl's objects do."""
+        self.mglo = object()
 
 
 def recording(bound: Bound, made: list[str]) -> BindingCalls:
@@ -35,7 +42,16 @@ def test_calls_of_the_same_resources_are_made_once() -> None:
     assert len(made) == 4
 
 
-def test_calls_are_kept_as_long_as_what_they_bind() -> None:
+def test_calls_of_what_was_released_are_not_found() -> None:
+    made: list[str] = []
+    calls, item = recording([], made), Resource()
+    calls.of((item, None))
+    item.release()
+    calls.of((item, None))
+    assert len(made) == 4
+
+
+def test_no_calls_of_what_ended_are_found() -> None:
     """Python gives the ids of what ended to what comes next: calls for that are made anew."""
     made: list[str] = []
     calls = recording([], made)

@@ -1,0 +1,117 @@
+"""Resources and stages of a frame graph, and the order in which stages run."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+from deltalight.protocol.plugins import Plugin
+from deltalight.render_server.graph_report import Clock, links
+from deltalight.render_server.lag import Lag
+
+T = TypeVar("T")
+Same = Callable[[Any, Any], bool]
+
+
+class GraphError(RuntimeError):
+    """Stages and resources do not fit together."""
+
+
+@dataclass(eq=False)
+class Resource(Generic[T]):
+    """A named texture, buffer or plain value, and a number that counts its changes; 0: never written.
+
+    `clocks` are what makes it change: those of its source, or of everything that its stage reads (known from the
+    graph's first run or report on).
+    """
+
+    name: str
+    clocks: frozenset[Clock]
+    stage: "Stage | None" = None
+    version: int = 0
+    _value: T | None = field(default=None, repr=False)
+
+    @property
+    def value(self) -> T:
+        """The last value written.
+
+        Raises:
+            GraphError: nothing was written yet.
+        """
+        if self.version == 0:
+            raise GraphError(f"Resource `{self.name}` is read before it is written.")
+        return self._value  # type: ignore[return-value]
+
+    def write(self, value: T, same: Same | None = None) -> None:
+        """Replaces the value; the version stays if `same` finds the new value equal to the old one."""
+        if self.version == 0 or same is None or not same(self._value, value):
+            self.version += 1
+        self._value = value
+
+
+@dataclass(eq=False)
+class Stage:
+    """A function of resources.
+
+    `plugin`: whose stage it is; `lag`: what it may wait for; `view`: which of the views declared it; `seen`: versions
+    of its inputs when it last ran, in the graph's run number `ran_in`.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    inputs: tuple[Resource[Any], ...]
+    outputs: tuple[Resource[Any], ...]
+    same: Same | None
+    plugin: Plugin | None = None
+    lag: Lag | None = None
+    view: int = 0
+    seen: tuple[int, ...] | None = None
+    ran_in: int = 0
+
+    @property
+    def clocks(self) -> frozenset[Clock]:
+        """The clocks that make it run."""
+        return self.outputs[0].clocks
+
+
+def in_order(stages: Iterable[Stage]) -> list[Stage]:
+    """Returns stages in topological order; the given order breaks ties.
+
+    Raises:
+        GraphError: stages read each other in a circle.
+    """
+    order: list[Stage] = []
+    for stage in stages:
+        _place(stage, order, [])
+    return order
+
+
+def _place(stage: Stage, order: list[Stage], waiting: list[Stage]) -> None:
+    """Appends a stage to the order, after everything that it reads."""
+    if stage in order:
+        return
+    if stage in waiting:
+        raise GraphError(f"Stages read each other in a circle: {links(waiting[waiting.index(stage) :])}.")
+    for item in stage.inputs:
+        if item.stage is not None:
+            _place(item.stage, order, [*waiting, stage])
+    order.append(stage)
+
+
+def complete_clocks(order: Sequence[Stage]) -> None:
+    """Gives what each of the stages, in order, writes the clocks of all that it reads."""
+    for stage in order:
+        clocks = frozenset(clock for item in stage.inputs for clock in item.clocks)
+        for output in stage.outputs:
+            output.clocks = clocks
+
+
+def needed_for(targets: Iterable[Resource[Any]]) -> set[Resource[Any]]:
+    """Returns the targets and all that they are made from."""
+    needed: set[Resource[Any]] = set()
+    open_ = list(targets)
+    while open_:
+        item = open_.pop()
+        if item not in needed:
+            needed.add(item)
+            open_ += () if item.stage is None else item.stage.inputs
+    return needed
