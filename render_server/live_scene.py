@@ -39,7 +39,7 @@ from deltalight.render_server.precomputed import Precomputed
 from deltalight.render_server.real_geometry import RealGeometry
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
-from deltalight.render_server.view import CameraView, PosedFrame
+from deltalight.render_server.view import CameraView, PosedFrame, scaled_size
 from deltalight.render_server.virtual_objects import VirtualObjects
 
 # Work on a frame at rest, until its picture has the best quality; a stage that was begun is finished.
@@ -285,7 +285,7 @@ class LiveScene:
         if objects is None or self._real is None or not lit:
             return []
         level = self._level(whole=whole)
-        sized = [each.at(_scaled(each.view.size, level.scale)) for each in taken]
+        sized = [each.at(scaled_size(each.view.size, level.scale)) for each in taken]
         self._fit_graphs([each.view for each in sized])
         with self.timers.measure("upload"):
             for graph, each in zip(self._graphs, sized, strict=True):
@@ -421,7 +421,7 @@ class LiveScene:
 
     def _enlarged_to(self, size: tuple[int, int], scale: float) -> Enlarge | None:
         """Returns what brings pictures of that scale to the size; None if they have it."""
-        if _scaled(size, scale) == size:
+        if scaled_size(size, scale) == size:
             return None
         if self._enlarge is None or self._enlarge.size != size:
             release_all(self._enlarge)
@@ -484,11 +484,6 @@ class LiveScene:
             self._albedo,
             self._precomputed,
         )
-
-
-def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
-    """Returns a picture size at that scale."""
-    return max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
 
 
 def _fit(graphs: Sequence[FrameGraph], views: Sequence[CameraView]) -> bool:

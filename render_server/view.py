@@ -187,6 +187,11 @@ class PosedFrame:
         return self._sizes[size]
 
 
+def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Returns a picture size at that scale."""
+    return max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
+
+
 def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
     """Returns width and height of the composite; a missing one follows from the camera's aspect ratio.
 

@@ -24,6 +24,7 @@ from deltalight.render_server.passes.shadow_maps import (
     frame_along,
     mirror_views,
     pack_view,
+    require_atlas_fits,
     texel_size_m,
     tile_columns,
 )
@@ -187,6 +188,7 @@ class LightBuffers:
     def _atlas_for(self, atlas: ShadowMapAtlas, tiles: int) -> ShadowMapAtlas:
         if atlas.tiles == max(tiles, 1):
             return atlas
+        require_atlas_fits(self._gpu, tiles, self.tile_size)
         atlas.release()
         return ShadowMapAtlas(self._gpu, max(tiles, 1), self.tile_size)
 

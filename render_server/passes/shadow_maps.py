@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.protocol import short_axis
+from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
@@ -105,6 +106,20 @@ def most_maps_bytes(lights: Sequence[Light], tile_size: int) -> int:
     """Returns the most bytes that maps of the real scene and of the objects take; `tile_size` in texels."""
     views = sum(1 if isinstance(light, DirectionalLight) else MOST_VIEWS for light in lights)
     return 2 * atlas_bytes(views, tile_size)
+
+
+def require_atlas_fits(gpu: GpuContext, tiles: int, tile_size: int) -> None:
+    """Refuses an atlas that is larger than a texture may be.
+
+    Raises:
+        DeltalightError: it is; the sentence says which `rsm_size` fits.
+    """
+    limit, columns = int(gpu.ctx.info["GL_MAX_TEXTURE_SIZE"]), tile_columns(tiles)
+    if columns * tile_size > limit:
+        raise DeltalightError(
+            f"the lights need {tiles} shadow maps of {tile_size} texels an edge, and a texture of this GPU has no "
+            f"more than {limit}; set `rsm_size` to {limit // columns} or less, or use fewer lights."
+        )
 
 
 class ShadowMaps:

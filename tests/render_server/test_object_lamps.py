@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from deltalight.benchmarks.gltf_plate import Plate
 from deltalight.protocol.errors import DeltalightError
@@ -404,4 +405,17 @@ def test_without_lamps_nothing_is_stated(gpu: GpuContext, tmp_path: Path) -> Non
     model = lamp_model(tmp_path / "lamp.glb", POINT, {"translation": [0, 0, 0.05]}, HOLDER)
     renderer = SceneRenderer(gpu, Stage(tmp_path).document([{**model, "lamps": 0}], [ambient(SKY)], floor()))
     assert not any("shadow maps" in each for each in renderer.notices)
+    renderer.release()
+
+
+def test_lights_whose_maps_no_texture_holds_are_refused_with_the_size_that_fits(
+    gpu: GpuContext, tmp_path: Path
+) -> None:
+    lamps = [sphere_light((0.1 * nth, 0.0, 0.3)) for nth in range(12)]
+    limit = int(gpu.ctx.info["GL_MAX_TEXTURE_SIZE"])
+    stage = Stage(tmp_path)
+    plate = stage.virtual(trimesh.creation.box((0.1, 0.1, 0.1)))
+    renderer = SceneRenderer(gpu, stage.document([plate], lamps, floor(), rsm_size=4096))
+    with pytest.raises(DeltalightError, match=rf"no more than {limit}; set `rsm_size` to \d+ or less"):
+        renderer.render(frame(depth=None))
     renderer.release()
