@@ -5,8 +5,9 @@
 FOLDER is `2.0` of a checkout of glTF-Sample-Models or `Models` of glTF-Sample-Assets: it has a folder a model. With
 names, only these models are drawn. OUT gets a picture a model and `sheet.png` with all of them.
 
-Models stand upright in their rest pose, seen from in front (glTF's +z), in a room with a sky, a dark ground and a
-window: its horizon shows whether mirror images are level. Screenshots have other views and lights, so compare by eye.
+Models are in their rest pose, flat ones seen from in front (glTF's +z), others from the right and above, in a room
+with a sky, a dark ground and a window: its horizon shows whether mirror images are level. Screenshots have other
+views and lights, so compare by eye.
 """
 
 import sys
@@ -26,12 +27,20 @@ from deltalight.benchmarks.measured_materials import FOCAL, SIDE, codes_of, draw
 from deltalight.benchmarks.relief_materials import latitude_longitude
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_png
+from deltalight.protocol.poses import rotation_from_wxyz
 from deltalight.render_server.scene.mesh_loading import load_asset
 
 EDGE = 320  # pixels, of a picture
 FILLED = 0.95  # of the picture's edge, at most
 WHITE = 0.8  # of the sensor's, that a white surface shows which faces the camera
 GROUND = 120  # code
+FLAT = 0.3  # depth of a model that is seen from in front, over the longer of its other edges
+ABOVE_RIGHT = (
+    0.931,
+    0.206,
+    -0.294,
+    -0.065,
+)  # turns that side to the viewer: by -35 degrees about y, then 25 about x
 COLUMNS = 3  # pairs side by side on the sheet
 LAYOUTS = ("glTF-Binary/*.glb", "glTF/*.gltf", "*.glb", "*.gltf")
 
@@ -84,10 +93,14 @@ def _radiance(d: Float64[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
 def _fitted(bounds: Float32[np.ndarray, "2 3"]) -> dict[str, Any]:
     """Returns the pose that puts a model before the camera of `drawn_document`."""
     low, high = bounds.astype(float)
-    width, height, depth = high - low
+    sides = high - low
+    wxyz = (1.0, 0.0, 0.0, 0.0) if sides[2] < FLAT * sides[:2].max() else ABOVE_RIGHT
+    turn = rotation_from_wxyz(wxyz)
+    width, height, depth = abs(turn) @ sides
     half = FILLED * SIDE / FOCAL / 2  # of what the picture shows 1 m away
     scale = half / (max(width, height) / 2 + half * depth / 2)
-    return {"scale": scale, "translation_m": (-scale * (low + high) / 2).tolist()}
+    middle = scale * turn @ (low + high) / 2
+    return {"scale": scale, "rotation_wxyz": wxyz, "translation_m": (-middle).tolist()}
 
 
 def drawn(path: Path, room: Path) -> tuple[UInt8[np.ndarray, "h w 3"], str | None]:
