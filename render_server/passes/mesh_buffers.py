@@ -77,7 +77,7 @@ class MeshBuffers:
 
     @property
     def solid(self) -> dict[str, Binding]:
-        """Vertices, triangles, and whether each material has two sides, for passes that walk triangles."""
+        """Vertices, triangles, and the sides of each material (`DOUBLE_SIDED`), for passes that walk triangles."""
         return {
             "Vertices": self._vertices,
             "Indices": self._indices,

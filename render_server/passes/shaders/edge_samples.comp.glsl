@@ -53,14 +53,7 @@ bool is_there(uint triangle, int k) {
 bool is_there(uint triangle, int k) { return true; }
 #endif
 
-#ifdef HIDES_BACKS
-bool shows_back(uint triangle) { return !hides_back(material_of(triangle)); }
-#else
-bool shows_back(uint triangle) { return true; }
-#endif
-
 void meet(uint triangle) {
-    bool from_both_sides = shows_back(triangle);
     Plane plane = plane_of(corners_of(triangle));
     mat3 products = mat3(plane.normal, plane.u, plane.v);   // of all three with a ray: linear in it
     vec3 at = ray * products, beside = right * products, below = down * products;
@@ -69,7 +62,7 @@ void meet(uint triangle) {
         float scale = 1.0 / found.x, z = plane.height * scale;
         vec2 uv = found.yz * scale;
         bool is_nearer = z < depth[k] || (z == depth[k] && triangle < nearest[k]);
-        bool is_met = (found.x < 0.0 || (from_both_sides && found.x > 0.0)) && all(greaterThanEqual(vec3(uv, 1.0 - uv.x - uv.y), vec3(-EDGE)));
+        bool is_met = found.x != 0.0 && all(greaterThanEqual(vec3(uv, 1.0 - uv.x - uv.y), vec3(-EDGE)));
         if (is_met && z >= NEAR && is_nearer && is_there(triangle, k)) {
             depth[k] = z;
             nearest[k] = triangle;

@@ -1,6 +1,7 @@
 // World position + depth along the optical axis, normal + material, texture coordinate, vertex colour; with MATERIAL_MAPS
 // what the maps give in place of the last two. CUTOUTS: some materials have alpha. HIDES_BACKS: some are not seen from behind. MEASURED: some go by the light.
 #include "common/fragment.glsl"
+#pragma switch HIDES_BACKS
 in vec3 world;
 in vec3 normal;
 in vec2 uv;

@@ -5,7 +5,6 @@
 #pragma switch CUTOUTS
 #pragma switch PACKS_EXTENDED
 #pragma switch MEASURED
-#pragma switch HIDES_BACKS
 
 struct Fragment {
     vec3 world;
