@@ -35,12 +35,8 @@ FILLED = 0.95  # of the picture's edge, at most
 WHITE = 0.8  # of the sensor's, that a white surface shows which faces the camera
 GROUND = 120  # code
 FLAT = 0.3  # depth of a model that is seen from in front, over the longer of its other edges
-ABOVE_RIGHT = (
-    0.931,
-    0.206,
-    -0.294,
-    -0.065,
-)  # turns that side to the viewer: by -35 degrees about y, then 25 about x
+# Turns that side to the viewer: by -35 degrees about y, then by 25 about x.
+ABOVE_RIGHT = (0.931, 0.206, -0.294, -0.065)
 COLUMNS = 3  # pairs side by side on the sheet
 LAYOUTS = ("glTF-Binary/*.glb", "glTF/*.gltf", "*.glb", "*.gltf")
 
