@@ -72,10 +72,10 @@ def _place(light: Float64[np.ndarray, "n 3"], view: Float64[np.ndarray, "n 3"]) 
     return np.stack([sines, turn / np.pi, light[:, 2] * view[:, 2]], axis=1)
 
 
-def _camera() -> CameraModel:
-    middle = (SIDE - 1) / 2
+def _camera(side: int = SIDE) -> CameraModel:
+    middle, focal = (side - 1) / 2, FOCAL * side / SIDE
     return CameraModel(
-        SIDE, SIDE, np.array([[FOCAL, 0, middle], [0, FOCAL, middle], [0, 0, 1]]), "plumb_bob", np.zeros(5)
+        side, side, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), "plumb_bob", np.zeros(5)
     )
 
 
@@ -138,24 +138,35 @@ def drawn_picture(
 ) -> Float64[np.ndarray, "h w 3"]:
     """Returns the object as Deltalight draws it; without `material`, as its file has it."""
     given = {} if material is None else {"material": {"precomputed": str(material)}}
-    document = {
-        "objects": [{"asset": str(asset), "up_axis": "z", **given}],
-        "lights": lights,
-        "method": {"name": "none"},
-        "shading": {"name": shading},
-    }
+    thing = {"asset": str(asset), "up_axis": "z", **given}
+    document = {"objects": [thing], "lights": lights, "shading": {"name": shading}}
+    return drawn_document(document, np.zeros((SIDE, SIDE, 3), np.uint8))
+
+
+def drawn_document(
+    document: dict[str, Any], ground: UInt8[np.ndarray, "side side 3"]
+) -> Float64[np.ndarray, "side side 3"]:
+    """Returns a scene document's objects before a picture `FAR_M` away, in linear light.
+
+    The camera is at `EYE`, looks along -z and has +y above.
+
+    Raises:
+        DeltalightError: an object cannot be loaded.
+    """
+    side = len(ground)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = EYE
-    depth = np.full((SIDE, SIDE), FAR_M, np.float32)
+    depth = np.full((side, side), FAR_M, np.float32)
     view = ViewFrame(
-        color=np.zeros((SIDE, SIDE, 3), np.uint8),
+        color=ground,
         frame_id=0,
         timestamp_ns=0,
-        camera=_camera(),
+        camera=_camera(side),
         pose=BoardPose(pose),
-        depth=DepthImage(depth, depth > 0, _camera(), 0.001),
+        depth=DepthImage(depth, depth > 0, _camera(side), 0.001),
     )
-    renderer = SceneRenderer(_gpu(), parse_scene(document), with_linear=True)
+    scene = parse_scene({"method": {"name": "none"}, **document})
+    renderer = SceneRenderer(_gpu(), scene, with_linear=True)
     try:
         linear = renderer.render(view).linear
     finally:

@@ -98,6 +98,7 @@ class EdgeTriangles:
             (min(mesh.triangle_count, MOST_WALKERS),),
             scene,
             own,
+            mesh.solid,
             mesh_corners=mesh.corners,
             clip_from_world=view.clip_from_camera @ view.camera_from_world,
             triangle_count=mesh.triangle_count,

@@ -77,7 +77,7 @@ class MeshBuffers:
 
     @property
     def solid(self) -> dict[str, Binding]:
-        """Vertices, triangles, and whether each material has two sides, for passes that walk triangles."""
+        """Vertices, triangles, and the sides of each material (`DOUBLE_SIDED`), for passes that walk triangles."""
         return {
             "Vertices": self._vertices,
             "Indices": self._indices,
@@ -297,6 +297,7 @@ class MaterialTable:
             if each is not None
         ]
         self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
+        self._hides_backs = draws_maps and any(material.hides_back for material in mesh.materials)
         self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
         self.smoothest = _smoothest(mesh)
         self.smoothest_coat = _smoothest_coat(mesh)
@@ -332,6 +333,7 @@ class MaterialTable:
             "data_maps": None if self._data is None else self._data.texture,
             "MATERIAL_MAPS": self._has_maps,
             "CUTOUTS": self._has_cutouts,
+            "HIDES_BACKS": self._hides_backs,
             "EXTENDED": self._is_extended,
             "PACKS_EXTENDED": self._is_extended and self._has_maps,
             "TRANSMISSION": self.transmits,

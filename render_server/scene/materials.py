@@ -48,6 +48,9 @@ class Material:
     `coat` is the fraction of the surface under a clear lacquer of index 1.5 (KHR_materials_clearcoat), `sheen` the
     colour of fibres between it and the base (KHR_materials_sheen); both have their own roughness.
 
+    `double_sided` surfaces shade both sides. Those that `hides_back` are not seen from behind, and still cast
+    shadows.
+
     `measured` replaces the rest where the camera sees the surface; elsewhere a Lambertian of its albedo does.
     `by_light` replaces the light of lamps there alone, and that of a map in image-based shading.
     """
@@ -69,6 +72,7 @@ class Material:
     sheen_roughness: float = 0.0
     is_unlit: bool = False
     double_sided: bool = False
+    hides_back: bool = False
     alpha_mode: AlphaMode = AlphaMode.OPAQUE
     alpha: float = 1.0
     vertex_cutoff: float | None = None
@@ -247,6 +251,7 @@ class Material:
         coat = extensions.get("KHR_materials_clearcoat", {})
         sheen = extensions.get("KHR_materials_sheen", {})
         color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
+        is_double_sided = bool(description.get("doubleSided", False))
         material = cls(
             base_color=color[:3],
             metallic=float(pbr.get("metallicFactor", 1.0)),
@@ -262,7 +267,8 @@ class Material:
             coat_roughness=float(coat.get("clearcoatRoughnessFactor", 0.0)),
             sheen=np.array(sheen.get("sheenColorFactor", [0, 0, 0]), np.float32),
             sheen_roughness=float(sheen.get("sheenRoughnessFactor", 0.0)),
-            double_sided=bool(description.get("doubleSided", False)),
+            double_sided=is_double_sided,
+            hides_back=not is_double_sided,
             metallic_roughness_map=textures.data(pbr.get("metallicRoughnessTexture")),
             normal_map=textures.data(description.get("normalTexture"), "scale"),
             occlusion_map=textures.data(description.get("occlusionTexture"), "strength"),
@@ -417,9 +423,9 @@ def _first(value: Any, default: float) -> float:  # noqa: ANN401 - as in the fil
 def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]:
     """Packs materials for a shader, five vectors each.
 
-    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, row + 1 of
-    `measured_table`, 0: not measured, a place that the GPU knows, layers of a stack, -1: unlit), (absorption 1/m,
-    index of refraction; 0: thin).
+    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (1 double sided, -1 not seen from
+    behind, row + 1 of `measured_table`, 0: not measured, a place that the GPU knows, layers of a stack, -1: unlit),
+    (absorption 1/m, index of refraction; 0: thin).
     """
     measured = 0
     table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
@@ -427,7 +433,7 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]
         row[0:4] = *material.base_color, material.metallic
         row[4:8] = *material.dielectric_f0, material.roughness
         row[8:12] = *material.emission, material.transmission
-        row[12] = material.double_sided
+        row[12] = -1.0 if material.hides_back else material.double_sided
         if material.measured is not None:
             measured += 1
             row[13] = measured

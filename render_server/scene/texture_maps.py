@@ -102,6 +102,8 @@ def _codes(image: Image.Image, mode: str) -> UInt8[np.ndarray, "h w c"]:
     if image.width * image.height > MAX_TEXTURE_PIXELS:
         raise ValueError(f"a texture of {image.width}x{image.height} pixels is too large")
     try:
+        if image.mode == "P":  # whose transparency the loader warns of when it is converted to anything else
+            image = image.convert("RGBA")
         return np.asarray(image.convert(mode))
     except (OSError, SyntaxError, ValueError) as error:
         raise ValueError(f"a texture cannot be decoded: {error}") from error

@@ -158,3 +158,19 @@ def test_facts_of_an_asset_hold_the_means_of_its_textures(tmp_path: Path) -> Non
     facts = mesh_facts(plate.write(tmp_path / "plate.glb"))["material"]
     assert facts["emission"] == pytest.approx([0.125, 0.0625, 0])
     assert (facts["roughness"], facts["metallic"]) == (0.2, 0.4)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_palette_with_transparency_is_read_without_a_warning(tmp_path: Path) -> None:
+    """Khronos' CesiumLogoFlat.png has one; an opaque material shows its colours, transparent or not."""
+    picture = Image.new("P", (2, 1))
+    picture.putpalette([255, 0, 0, 0, 0, 255])
+    picture.putdata([0, 1])
+    data = io.BytesIO()
+    picture.save(data, "PNG", transparency=bytes([0, 128]))
+    plate = Plate(1, 1)
+    plate.material["pbrMetallicRoughness"] = {"baseColorTexture": plate.encoded(data.getvalue())}
+    (mesh,) = load_asset(plate.write(tmp_path / "plate.glb")).meshes
+    shown = mesh.material.base_color_map
+    assert shown is not None
+    assert shown.texels[0, :, :3].tolist() == [[1, 0, 0], [0, 0, 1]]

@@ -1,15 +1,28 @@
 // Triangles of the objects at the edges that the picture has of them. FIND_THIN: marks the tiles of the raster in which a triangle may
 // show that no texel's centre there shows, because it is thinner than a texel. Otherwise: lists the triangles that may show in a marked
 // tile; a large one in the lists of larger tiles, marked or not; and counts the workgroups of edge_samples.comp.glsl, whose list is
-// complete by now.
+// complete by now. HIDES_BACKS: some triangles are not seen from behind.
 #include "common/plane.glsl"
 #include "common/raster_tiles.glsl"
 #include "common/walk.glsl"
+#pragma switch HIDES_BACKS
 
 layout(local_size_x = 64) in;
 layout(std430) buffer Tiles { Tile tiles[]; };
 uniform mat4 clip_from_world;
 uniform uint triangle_count;
+
+#ifdef HIDES_BACKS
+#include "common/solid_mesh.glsl"
+layout(std430) readonly buffer Sides { float sides[]; };   // of each material, as flags.x in common/materials.glsl
+
+bool is_hidden(uint triangle, mat3 corners) {
+    vec3 n = cross(corners[1] - corners[0], corners[2] - corners[0]);
+    return dot(n, corners[0] - camera_position) > 0.0 && sides[material_of(triangle)] < 0.0;
+}
+#else
+bool is_hidden(uint triangle, mat3 corners) { return false; }
+#endif
 
 // In texels; whole: beyond the near plane; beside: all of it before that plane, or beyond one side of the raster.
 struct Projected { vec2 a; vec2 b; vec2 c; bool is_whole; bool is_beside; };
@@ -92,11 +105,12 @@ void mark_along_longest(Projected p, ivec2 first, ivec2 last) {
     }
 }
 
-void find_thin(mat3 corners) {
+void find_thin(uint triangle) {
+    mat3 corners = corners_of(triangle);
     Projected at = projected(corners);
     vec3 n = cross(corners[1] - corners[0], corners[2] - corners[0]);
     float size = length(n);
-    if (!at.is_whole || size == 0.0 || at.is_beside) return;
+    if (!at.is_whole || size == 0.0 || at.is_beside || is_hidden(triangle, corners)) return;
     n *= (dot(n, camera_position - corners[0]) < 0.0 ? -1.0 : 1.0) / size;
     ivec2 first = max(ivec2(ceil(low_of(at) - HALF)), ivec2(0)), last = min(ivec2(floor(high_of(at) + HALF)), raster_size - 1);
     if (any(greaterThan(last - first, ivec2(MOST_TEXELS)))) {
@@ -112,7 +126,7 @@ void find_thin(mat3 corners) {
 
 void main() {
     uint i = first_item();
-    if (i < triangle_count) do find_thin(corners_of(i)); while ((i += items_apart()) < triangle_count);
+    if (i < triangle_count) do find_thin(i); while ((i += items_apart()) < triangle_count);
 }
 #else
 #include "common/counted_groups.glsl"
@@ -141,8 +155,9 @@ void add_to_tiles(uint triangle, Projected p, ivec2 first, ivec2 last, int level
 
 // One that is not whole may be anywhere.
 void list(uint triangle) {
-    Projected at = projected(corners_of(triangle));
-    if (at.is_beside) return;
+    mat3 corners = corners_of(triangle);
+    Projected at = projected(corners);
+    if (at.is_beside || is_hidden(triangle, corners)) return;
     vec2 low = at.is_whole ? low_of(at) - MARGIN : vec2(0.0), high = at.is_whole ? high_of(at) + MARGIN : vec2(raster_size);
     int level = at.is_whole ? 0 : LEVELS - 1;
     while (level < LEVELS - 1 && any(greaterThanEqual(tile_of(high, level) - tile_of(low, level), ivec2(MOST_TILES)))) ++level;

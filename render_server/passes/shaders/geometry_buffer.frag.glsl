@@ -1,6 +1,7 @@
 // World position + depth along the optical axis, normal + material, texture coordinate, vertex colour; with MATERIAL_MAPS
-// what the maps give in place of the last two. CUTOUTS: some materials have alpha. MEASURED: some go by the light.
+// what the maps give in place of the last two. CUTOUTS: some materials have alpha. HIDES_BACKS: some are not seen from behind. MEASURED: some go by the light.
 #include "common/fragment.glsl"
+#pragma switch HIDES_BACKS
 in vec3 world;
 in vec3 normal;
 in vec2 uv;
@@ -33,7 +34,7 @@ Fragment interpolated() {
     f.uv = uv;
     f.tint = tint;
     f.material = int(material);
-    f.is_front = gl_FrontFacing;
+    f.is_back = gl_FrontFacing;   // rows go downwards, which turns the winding
 #ifdef CUTOUTS
     f.opacity = opacity_of_vertices(clear);
 #endif
@@ -51,6 +52,9 @@ Fragment interpolated() {
 void main() {
     Fragment f = interpolated();
     Surface s = surface_at(f, true);
+#ifdef HIDES_BACKS
+    if (f.is_back && hides_back(f.material)) discard;
+#endif
 #ifdef CUTOUTS
     if (is_left_out(f, gl_FragCoord.xy, 0.0)) discard;
 #endif

@@ -14,7 +14,7 @@ struct Fragment {
     vec2 uv;
     vec3 tint;
     int material;
-    bool is_front;
+    bool is_back;    // seen from behind
 #ifdef CUTOUTS
     float opacity;   // of its vertices
 #endif
@@ -54,7 +54,7 @@ vec2 place_on_texture(Fragment f, vec3 n, float roughness) {
 #ifdef CUTOUTS
 // `place`: of the raster's texel. `blend_sample` 0..1: samples of one pixel show different parts of what is blended.
 bool is_left_out(Fragment f, vec2 place, float blend_sample) {
-    float layer = 2.0 * float(f.material) + float(f.is_front);
+    float layer = 2.0 * float(f.material) + float(f.is_back);
     float even = fract(even_noise(place + APART * layer) + blend_sample);
     return is_cut_out(f.material, fragment_opacity(f), even);
 }

@@ -23,7 +23,7 @@ struct MaterialEntry {
     vec4 base_color;   // rgb linear; metallic
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
-    vec4 flags;        // double-sided; row + 1 of the measured, layer + 1 of a texture by light, 0: none; layers of a stack, -1: unlit
+    vec4 flags;        // 1: double-sided, -1: not to be seen from behind; row + 1 of the measured, layer + 1 of a texture by light, 0: none; layers of a stack, -1: unlit
     vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
 #ifdef EXTENDED
     vec4 coat;         // fraction under the coat, its roughness; the sheen's
@@ -37,6 +37,7 @@ struct MaterialEntry {
 layout(std430) readonly buffer Materials { MaterialEntry materials[]; };
 
 bool is_two_sided(int index) { return materials[index].flags.x > 0.5; }
+bool hides_back(int index) { return materials[index].flags.x < -0.5; }
 
 // An unlit surface glows with its base colour, which the vertex colour multiplies.
 vec3 glow_tint(MaterialEntry e, vec3 tint) { return e.flags.w < 0.0 ? tint : vec3(1.0); }

@@ -60,7 +60,7 @@ Fragment fragment_at(uint triangle, vec3 ray, vec3 right, vec3 down) {
     f.uv = (uv * weights).xy;
     f.tint = corner_vectors(corners, 8u) * weights;
     f.material = material_of(triangle);
-    f.is_front = towards > 0.0;
+    f.is_back = towards > 0.0;
 #ifdef CUTOUTS
     uvec3 last = corners * VERTEX_FLOATS + 11u;
     f.opacity = opacity_of_vertices(dot(weights, fract(vec3(vertices[last.x], vertices[last.y], vertices[last.z]))));
