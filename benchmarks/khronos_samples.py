@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -150,8 +150,12 @@ def _sheet(pairs: Sequence[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h 
     return np.asarray(np.vstack(rows), np.uint8)
 
 
-def main(folder: Path, out: Path, names: Sequence[str] = ()) -> None:
-    """Writes the pictures; prints a line a model as soon as it is drawn."""
+def write_pairs(folder: Path, out: Path, names: Sequence[str] = ()) -> None:
+    """Writes the pictures; prints a line a model as soon as it is drawn.
+
+    Raises:
+        DeltalightError: there is no model, or none of a name.
+    """
     samples = samples_of(folder, names)
     out.mkdir(parents=True, exist_ok=True)
     pairs = []
@@ -166,8 +170,20 @@ def main(folder: Path, out: Path, names: Sequence[str] = ()) -> None:
     write_png(out / "sheet.png", _sheet(pairs))
 
 
-if __name__ == "__main__":
+def main(
+    folder: Annotated[
+        Path, typer.Argument(help="`2.0` of glTF-Sample-Models or `Models` of glTF-Sample-Assets.")
+    ],
+    out: Annotated[Path, typer.Argument(help="Folder of the pictures.")],
+    names: Annotated[list[str] | None, typer.Argument(help="Models to draw; all, if none is named.")] = None,
+) -> None:
+    """Draw Khronos' sample models beside the screenshots of their authors."""
     try:
-        main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])
+        write_pairs(folder, out, names or ())
     except DeltalightError as error:
-        sys.exit(str(error))
+        sys.stderr.write(f"{error}\n")
+        raise typer.Exit(2) from None
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -87,11 +87,12 @@ def read_polynomial_texture(folder: Path) -> PolynomialTexture:
     """
     info = read_info(folder, "a PTM")
     kind = (info.get("type"), info.get("colorspace"), info.get("nplanes"))
-    if kind not in (_SEPARATE, _LUMINANCE):
+    is_separate = kind == _SEPARATE
+    if not is_separate and kind != _LUMINANCE:
         raise DeltalightError(
             f"{folder}/{INFO_NAME} describes no PTM of RGB or LRGB coefficients; {_ADVICE}."
         )
-    count = (_SEPARATE if kind == _SEPARATE else _LUMINANCE)[2]
+    read, count = (_separate_terms, 3 * TERMS) if is_separate else (_luminance_terms, 3 + TERMS)
     try:
         scale, bias = (
             finite_array(info["materials"][0][key]).astype(np.float32).reshape(count)
@@ -99,8 +100,7 @@ def read_polynomial_texture(folder: Path) -> PolynomialTexture:
         )
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DeltalightError(f"{folder}/{INFO_NAME} lacks whole scales and biases; {_ADVICE}.") from error
-    terms = _separate_terms if kind == _SEPARATE else _luminance_terms
-    planes = terms(_pictures(folder, count // 3), scale, bias)
+    planes = read(_pictures(folder, count // 3), scale, bias)
     return PolynomialTexture(
         np.stack([averaged(plane, MOST_TEXELS_EDGE).astype(np.float16) for plane in planes])
     )

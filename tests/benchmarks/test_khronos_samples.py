@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deltalight.benchmarks.gltf_plate import Plate
-from deltalight.benchmarks.khronos_samples import EDGE, GROUND, main, samples_of
+from deltalight.benchmarks.khronos_samples import EDGE, GROUND, samples_of, write_pairs
 from deltalight.protocol.errors import DeltalightError
 
 RED, SCREENSHOT_RED = (0.8, 0.0, 0.0, 1.0), (200, 0, 0)
@@ -36,7 +36,7 @@ def test_each_model_is_drawn_beside_its_screenshot(
     add(folder, "Broken", "glTF-Binary").write_bytes(b"glTF")
     add(folder, "Plate", "glTF-Binary", (100, 50))
     (folder / "Unrelated").mkdir()
-    main(folder, out)
+    write_pairs(folder, out)
     broken, plate = capsys.readouterr().out.splitlines()
     assert broken.startswith("1/2 Broken: refused: ")
     assert plate.startswith("2/2 Plate: drawn in part: ")
