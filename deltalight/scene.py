@@ -4,10 +4,11 @@ import json
 from pathlib import Path
 from typing import Any, Self
 
+from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing
 from deltalight.protocol.scene import SceneDocument, load_scene, resolve_asset
-from deltalight.protocol.scene_objects import Material, Pose, SceneObject
+from deltalight.protocol.scene_objects import Material, SceneObject
 
 
 class Scene:
@@ -19,6 +20,9 @@ class Scene:
 
     def __init__(self, document: SceneDocument | None = None) -> None:
         self.document = document or SceneDocument()
+
+    def __repr__(self) -> str:
+        return f"<Scene with {', '.join(self._names()) or 'no objects'}>"
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -60,7 +64,7 @@ class Scene:
             material: replaces the asset's own.
 
         Raises:
-            DeltalightError: there is no such file, or the name is taken.
+            DeltalightError: there is no such file, the name is taken, or a value does not fit.
         """
         found = Path(resolve_asset(str(asset), Path.cwd()))
         if not found.is_file():
@@ -68,8 +72,9 @@ class Scene:
         name = self._free_name(found.stem) if name is None else name
         if name in self._names():
             raise DeltalightError(f"The scene has an object `{name}` already; give another name.")
-        pose = Pose(translation_m=at, rotation_wxyz=rotation_wxyz, scale=scale)
-        added = SceneObject(id=name, asset=str(found), pose=pose, material=material)
+        pose = {"translation_m": at, "rotation_wxyz": rotation_wxyz, "scale": scale}
+        fields = {"id": name, "asset": str(found), "pose": pose, "material": material}
+        added = validate(SceneObject, fields, f"the object `{name}`")
         self.document = self.document.replaced(objects=(*self.document.objects, added))
         return name
 

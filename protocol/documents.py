@@ -43,8 +43,12 @@ class StrictModel(BaseModel):
         return data
 
     def replaced(self, **changes: object) -> Self:
-        """Return a validated copy with some fields changed."""
-        return type(self).model_validate({**dict(self), **changes})
+        """Return a validated copy with some fields changed.
+
+        Raises:
+            DeltalightError: there is no such field, or a value does not fit.
+        """
+        return validate(type(self), {**dict(self), **changes}, type(self).__name__)
 
 
 def read_mapping(path: Path, *, unique_keys: bool = False) -> dict[str, Any]:
@@ -156,6 +160,14 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
             return f"`{place}` names the unknown kind `{tag}`; {advice} {', '.join(expected)}."
         case "value_error":
             message = str(context["error"])
+        case "tuple_type" | "list_type":
+            message = "must be a list"
+        case "model_type" | "dict_type" | "model_attributes_type":
+            message = "must be an object with keys and values"
+        case "too_short":
+            message = f"must have at least {context['min_length']} in it, and has {context['actual_length']}"
+        case "too_long":
+            message = f"must have at most {context['max_length']} in it, and has {context['actual_length']}"
         case _:
             message = fault["msg"]
     message = (message[:1].lower() + message[1:]).rstrip(".")

@@ -231,6 +231,18 @@ def test_wrong_messages_close_only_their_own_connection(live: LiveApi, message: 
         read_frame(other)
 
 
+@pytest.mark.parametrize(("query", "order"), [("?view=foo", None), ("", "view foo")])
+def test_a_view_that_there_is_not_ends_the_connection_with_a_sentence(
+    live: LiveApi, query: str, order: str | None
+) -> None:
+    with live_socket(live.address, query) as socket:
+        if order is not None:
+            socket.send(order)
+        with pytest.raises(websockets.ConnectionClosed, match="no such view; ask for one of composite, "):
+            list(iter(lambda: socket.recv(timeout=PATIENCE_S), None))
+    assert socket.close_code == 1008
+
+
 @pytest.mark.parametrize("orders", [("codec h264", "codec jpeg"), ("view delta", "view")])
 def test_who_changes_view_or_codec_all_the_time_is_closed(live: LiveApi, orders: tuple[str, str]) -> None:
     with live_socket(live.address) as socket, suppress(websockets.ConnectionClosed):

@@ -214,7 +214,12 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         (("up", "--source", f"{tmp_path}/absent.mcap"), "absent.mcap"),
         (("up", "--source", "synthetic", "--scene", f"{tmp_path}/absent.json"), "absent.json"),
         (("--log-level", "loud", "doctor"), "log level"),
+        (
+            ("up", "--source", "synthetic", "--data", f"{tmp_path}/data", "--port", 5601),
+            "give --port another",
+        ),
         (("demo", "--method", "exakt"), "the nearest is exact"),
+        (("demo", "--out", f"{tmp_path}/pictures"), "add --headless"),
         (("bench", "speed", "--methods", "guess"), "exact"),
         (("bench", "speed", "--motions", "stil"), "still"),
         (("bench", "counts", "--methods", "path"), "exact"),
