@@ -192,6 +192,16 @@ def test_doctor_finds_what_the_demo_needs(cli: RunCli) -> None:
     assert f"port {ports.PAGE_PORT}" in checks
 
 
+def test_doctor_prints_commands_in_one_piece(cli: RunCli, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = (
+        "/opt/station/environments/deltalight/bin/python -m pip install 'opencv-contrib-python-headless<5'"
+    )
+    check = doctor.Check("OpenNI 2 cameras", "note", "this OpenCV was built without it", f"run `{command}`")
+    monkeypatch.setattr("deltalight.services.doctor.examine", lambda: [check])
+    monkeypatch.setenv("COLUMNS", "60")
+    assert command in cli("doctor").stdout
+
+
 def test_doctor_says_what_is_missing_without_opengl(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -223,6 +233,9 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         (("bench", "speed", "--methods", "guess"), "exact"),
         (("bench", "speed", "--motions", "stil"), "still"),
         (("bench", "counts", "--methods", "path"), "exact"),
+        (("bench", "speed", "--out", tmp_path), "is a folder; name a file in it"),
+        (("bench", "sweep", "--out", "/proc/sweep.json"), "cannot be written"),
+        (("graph", "--svg", tmp_path), "is a folder; name a file in it"),
         (("bench", "quality", "--methods", "exact:cone_cont=9"), "cone_count"),
         (("bench", "quality", "--scenes", "tabletopp"), "tabletop"),
         (("bench", "quality", "--spp", 3, "--scenes", "tabletop", "--out", f"{tmp_path}/quality"), "even"),
