@@ -13,6 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.yaml_text import parse_yaml
 
 Model = TypeVar("Model", bound=BaseModel)
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"  # of nodes, cameras and rooms
 LONGEST_WORD = 200  # characters of a word that are compared and shown: longer than any known one
 
 
@@ -164,6 +165,8 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
             message = "must be a list"
         case "model_type" | "dict_type" | "model_attributes_type":
             message = "must be an object with keys and values"
+        case "string_pattern_mismatch" if context["pattern"] == NAME_PATTERN:
+            message = "must be letters, digits, dashes and underscores, at most 64 that begin with a letter or digit"
         case "too_short":
             message = f"must have at least {context['min_length']} in it, and has {context['actual_length']}"
         case "too_long":
