@@ -1,14 +1,20 @@
 """A scene that code can change: objects added, moved and removed."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Float
 
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing
 from deltalight.protocol.scene import SceneDocument, load_scene, resolve_asset
 from deltalight.protocol.scene_objects import Material, SceneObject
+
+Vector = Sequence[float] | Float[np.ndarray, "..."]
 
 
 class Scene:
@@ -47,10 +53,10 @@ class Scene:
         self,
         asset: str | Path,
         *,
-        at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        at: Vector = (0.0, 0.0, 0.0),
         name: str | None = None,
         scale: float = 1.0,
-        rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+        rotation_wxyz: Vector = (1.0, 0.0, 0.0, 0.0),
         material: Material | None = None,
     ) -> str:
         """Adds an object and returns its name.
@@ -72,7 +78,7 @@ class Scene:
         name = self._free_name(found.stem) if name is None else name
         if name in self._names():
             raise DeltalightError(f"The scene has an object `{name}` already; give another name.")
-        pose = {"translation_m": at, "rotation_wxyz": rotation_wxyz, "scale": scale}
+        pose = {"translation_m": tuple(at), "rotation_wxyz": tuple(rotation_wxyz), "scale": scale}
         fields = {"id": name, "asset": str(found), "pose": pose, "material": material}
         added = validate(SceneObject, fields, f"the object `{name}`")
         self.document = self.document.replaced(objects=(*self.document.objects, added))
@@ -88,13 +94,13 @@ class Scene:
         objects = [item.replaced(**fields) if item.id == name else item for item in self.document.objects]
         self.document = self.document.replaced(objects=tuple(objects))
 
-    def move(self, name: str, to: tuple[float, float, float]) -> None:
+    def move(self, name: str, to: Vector) -> None:
         """Moves an object's origin to a position in the world, m; rotation and scale stay.
 
         Raises:
-            DeltalightError: there is no such object.
+            DeltalightError: there is no such object, or no such position.
         """
-        self.change(name, pose=self._require(name).pose.replaced(translation_m=to))
+        self.change(name, pose=self._require(name).pose.replaced(translation_m=tuple(to)))
 
     def remove(self, name: str) -> None:
         """Removes an object.

@@ -168,6 +168,8 @@ def test_objects_are_named_changed_and_saved(scene: dl.Scene, cube: Path, tmp_pa
         "cube 2",
         "mine",
     ]
+    scene.move("cube 2", to=np.array([0.1, 0.2, 0.3], np.float32))
+    assert scene.document.objects[-2].pose.translation_m == pytest.approx((0.1, 0.2, 0.3))
     scene.change("cube", material=dl.Material(metallic=1.0), visible=False)
     scene.save(tmp_path / "saved.json")
     assert dl.Scene.load(tmp_path / "saved.json").document == scene.document
