@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -246,6 +246,34 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         assert done.returncode == 2, done.stderr
         assert sentence in done.stderr
         assert "Traceback" not in done.stderr
+
+
+def test_up_names_the_page_once_it_answers(
+    cli: RunCli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Supervisor:
+        def __init__(self, _specs: object) -> None:
+            pass
+
+        def __enter__(self) -> "Supervisor":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def run(self, until: Callable[[], bool] | None = None) -> None:
+            print("waits until it answers" if until else "runs")
+
+    monkeypatch.setattr("deltalight.services.supervisor.Supervisor", Supervisor)
+    options = ("--port", "--node-port", "--composite-port", "--control-port")
+    chosen = [word for pair in zip(options, ports.private_ports(4), strict=True) for word in pair]
+    done = cli("up", "--source", "synthetic", "--data", tmp_path, *chosen)
+    said = done.stdout.splitlines()
+    assert [line.partition(" at http")[0] for line in said] == [
+        "waits until it answers",
+        "The dashboard is",
+        "runs",
+    ], done.stderr
 
 
 @pytest.mark.parametrize(
