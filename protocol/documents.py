@@ -159,6 +159,14 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
             hint = nearest(tag, expected)
             advice = f"the nearest is `{hint}` of" if hint else "use one of"
             return f"`{place}` names the unknown kind `{tag}`; {advice} {', '.join(expected)}."
+    wrong = wrong_in_words(fault)
+    return f"`{place}` is wrong: {wrong}{_given(fault['input'])}." if place else f"{wrong}."
+
+
+def wrong_in_words(fault: ErrorDetails) -> str:
+    """Say what is wrong with a value, in JSON's words, without a full stop; places and values are the caller's."""
+    context = fault.get("ctx", {})
+    match fault["type"]:
         case "value_error":
             message = str(context["error"])
         case "tuple_type" | "list_type":
@@ -173,8 +181,7 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
             message = f"must have at most {context['max_length']} in it, and has {context['actual_length']}"
         case _:
             message = fault["msg"]
-    message = (message[:1].lower() + message[1:]).rstrip(".")
-    return f"`{place}` is wrong: {message}{_given(fault['input'])}." if place else f"{message}."
+    return (message[:1].lower() + message[1:]).rstrip(".")
 
 
 def _given(value: object) -> str:
