@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.commands.options import writable
 
 if TYPE_CHECKING:
     from deltalight.benchmarks.speed.measure import SpeedJob
@@ -22,7 +23,9 @@ DEFAULT_MOTIONS = "camera,object,arm,lamps,still"
 
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default: the demo's.")]
 Device = Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")]
-ReportFile = Annotated[Path | None, typer.Option("--out", "-o", help="File for the report as JSON.")]
+ReportFile = Annotated[
+    Path | None, typer.Option("--out", "-o", callback=writable, help="File for the report as JSON.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 
 METHODS_HELP = (
@@ -234,7 +237,9 @@ def plot(
             "same scenes."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.svg", help="File for the picture.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", callback=writable, metavar="FILE.svg", help="File for the picture.")
+    ],
     motion: Annotated[str, typer.Option(help="What moves while frames are timed.")] = "camera",
 ) -> None:
     """Plot speed against quality, a point for each method that both reports have."""

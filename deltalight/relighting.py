@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -11,6 +11,7 @@ from jaxtyping import Float32, UInt8
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame, linear_color
 from deltalight.protocol.method_names import require_method, with_method
+from deltalight.protocol.quality import Quality, require_quality
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import create_context
 from deltalight.render_server.renderer import CompositeFrame, PictureLayers, SceneRenderer
@@ -20,7 +21,7 @@ HALF_PRECISION = 2.0**-10  # of a value: what the renderer's 16-bit pictures rou
 DARKEST = 1e-4  # radiance of the camera's picture, camera units, below which a ratio to it says nothing
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RelitPicture:
     """A relit frame, in numpy arrays of one size. Camera units: 1.0 = sensor white at the reference exposure.
 
@@ -45,6 +46,10 @@ class RelitPicture:
     coverage: Float32[np.ndarray, "h w"]
     depth: Float32[np.ndarray, "h w"]
     composite: CompositeFrame
+
+    def __repr__(self) -> str:
+        height, width = self.color.shape[:2]
+        return f"<RelitPicture of frame {self.composite.frame_id}, {width}x{height}, {self.composite.status}>"
 
     @classmethod
     def of(cls, frame: ViewFrame, composite: CompositeFrame, layers: PictureLayers) -> Self:
@@ -83,12 +88,13 @@ class Renderer:
     def __init__(
         self,
         method: str | None = None,
-        quality: Literal["live", "balanced", "best"] | None = "best",
+        quality: Quality | None = "best",
         *,
         device: int | None = None,
     ) -> None:
         self._method = None if method is None else require_method(method)
-        self._quality, self._is_closed = quality, False
+        self._quality = None if quality is None else require_quality(quality)
+        self._is_closed = False
         self._gpu = create_context(device)
         self._renderer: SceneRenderer | None = None
 

@@ -1,13 +1,20 @@
 """A scene that code can change: objects added, moved and removed."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+from jaxtyping import Float
+
+from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing
 from deltalight.protocol.scene import SceneDocument, load_scene, resolve_asset
-from deltalight.protocol.scene_objects import Material, Pose, SceneObject
+from deltalight.protocol.scene_objects import Material, SceneObject
+
+Vector = Sequence[float] | Float[np.ndarray, "..."]
 
 
 class Scene:
@@ -19,6 +26,9 @@ class Scene:
 
     def __init__(self, document: SceneDocument | None = None) -> None:
         self.document = document or SceneDocument()
+
+    def __repr__(self) -> str:
+        return f"<Scene with {', '.join(self._names()) or 'no objects'}>"
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -43,10 +53,10 @@ class Scene:
         self,
         asset: str | Path,
         *,
-        at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        at: Vector = (0.0, 0.0, 0.0),
         name: str | None = None,
         scale: float = 1.0,
-        rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+        rotation_wxyz: Vector = (1.0, 0.0, 0.0, 0.0),
         material: Material | None = None,
     ) -> str:
         """Adds an object and returns its name.
@@ -60,7 +70,7 @@ class Scene:
             material: replaces the asset's own.
 
         Raises:
-            DeltalightError: there is no such file, or the name is taken.
+            DeltalightError: there is no such file, the name is taken, or a value does not fit.
         """
         found = Path(resolve_asset(str(asset), Path.cwd()))
         if not found.is_file():
@@ -68,8 +78,9 @@ class Scene:
         name = self._free_name(found.stem) if name is None else name
         if name in self._names():
             raise DeltalightError(f"The scene has an object `{name}` already; give another name.")
-        pose = Pose(translation_m=at, rotation_wxyz=rotation_wxyz, scale=scale)
-        added = SceneObject(id=name, asset=str(found), pose=pose, material=material)
+        pose = {"translation_m": tuple(at), "rotation_wxyz": tuple(rotation_wxyz), "scale": scale}
+        fields = {"id": name, "asset": str(found), "pose": pose, "material": material}
+        added = validate(SceneObject, fields, f"the object `{name}`")
         self.document = self.document.replaced(objects=(*self.document.objects, added))
         return name
 
@@ -83,13 +94,13 @@ class Scene:
         objects = [item.replaced(**fields) if item.id == name else item for item in self.document.objects]
         self.document = self.document.replaced(objects=tuple(objects))
 
-    def move(self, name: str, to: tuple[float, float, float]) -> None:
+    def move(self, name: str, to: Vector) -> None:
         """Moves an object's origin to a position in the world, m; rotation and scale stay.
 
         Raises:
-            DeltalightError: there is no such object.
+            DeltalightError: there is no such object, or no such position.
         """
-        self.change(name, pose=self._require(name).pose.replaced(translation_m=to))
+        self.change(name, pose=self._require(name).pose.replaced(translation_m=tuple(to)))
 
     def remove(self, name: str) -> None:
         """Removes an object.

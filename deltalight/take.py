@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self, overload
+from typing import Self, SupportsIndex, overload
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.source import Source, open_source
@@ -51,17 +51,28 @@ class Take(Sequence[ViewFrame]):
         return len(self._frames)
 
     @overload
-    def __getitem__(self, index: int) -> ViewFrame: ...
+    def __getitem__(self, index: SupportsIndex) -> ViewFrame: ...
 
     @overload
     def __getitem__(self, index: slice) -> "Take": ...
 
-    def __getitem__(self, index: int | slice) -> "ViewFrame | Take":
-        if isinstance(index, int):
-            return self._built(self._source[self._frames[index]])
+    def __getitem__(self, index: SupportsIndex | slice) -> "ViewFrame | Take":
+        if not isinstance(index, slice):
+            return self._built(self._source[self._number(index)])
         part = object.__new__(Take)
         part._source, part._built, part._frames = self._source, self._built, self._frames[index]
         return part
+
+    def _number(self, index: SupportsIndex) -> int:
+        try:
+            return self._frames[index]
+        except IndexError:
+            raise IndexError(
+                f"The take has {len(self)} frames, counted from 0, and none at {index}."
+            ) from None
+
+    def __repr__(self) -> str:
+        return f"<Take of {len(self)} frames>"
 
 
 class LiveTake:

@@ -148,7 +148,7 @@ class BoardSpec(StrictModel):
         known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
         if isinstance(value, str) and value not in known:
             hint = nearest(value, known)
-            raise ValueError(f"OpenCV has no such dictionary, the nearest name is {hint or known[0]}")
+            raise ValueError(f"there is no such dictionary in OpenCV, the nearest name is {hint or known[0]}")
         return value
 
     @model_validator(mode="after")

@@ -43,7 +43,7 @@ def sample_from_stamps(t0: int, t1: int, t2: int, t3: int) -> ClockSample:
     """
     round_trip = (t3 - t0) - (t2 - t1)
     if t3 < t0 or t2 < t1 or round_trip < 0:
-        raise DeltalightError("a clock was set while it was compared: compare again")
+        raise DeltalightError("a clock was set while it was compared; compare again.")
     # Halves are rounded up, so that the bound still holds.
     return ClockSample(((t1 - t0) + (t2 - t3)) // 2, (round_trip + 1) // 2 + 1, t3)
 
@@ -66,7 +66,7 @@ def measure_offset(exchange: Exchange, rounds: int = 8, now: Clock = time.time_n
             continue
     if not samples:
         raise DeltalightError(
-            "the clocks jumped in every exchange: see whether something sets them all the time"
+            "the clocks jumped in every exchange; see whether something sets them all the time."
         )
     return min(samples, key=lambda sample: sample.bound_ns)
 
@@ -128,9 +128,9 @@ def clock_exchange(
         reply = request(question, timeout_s)
         t1, t2 = reply.payload.get("received_ns"), reply.payload.get("sent_ns")
         if not isinstance(t1, int) or not isinstance(t2, int):
-            raise DeltalightError(f"the server does not tell its time ({reply.error}): update it")
+            raise DeltalightError(f"the server does not tell its time ({reply.error}); update it.")
         if not (0 <= t1 <= LATEST_NS and 0 <= t2 <= LATEST_NS):
-            raise DeltalightError("the server's clock is centuries off: set it")
+            raise DeltalightError("the server's clock is centuries off; set it.")
         return t1, t2
 
     return exchange

@@ -72,7 +72,7 @@ class DatasetWriter:
         """Append a frame; its line number becomes its frame_id."""
         if frame.timestamp_ns <= self._last_ns:
             raise DeltalightError(
-                f"frame {frame.frame_id} is not later than the one before; write frames in order"
+                f"frame {frame.frame_id} is not later than the one before; write frames in order."
             )
         if self._first is None:
             self._begin(frame)

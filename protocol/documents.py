@@ -13,6 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.yaml_text import parse_yaml
 
 Model = TypeVar("Model", bound=BaseModel)
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"  # of nodes, cameras and rooms
 LONGEST_WORD = 200  # characters of a word that are compared and shown: longer than any known one
 
 
@@ -43,8 +44,12 @@ class StrictModel(BaseModel):
         return data
 
     def replaced(self, **changes: object) -> Self:
-        """Return a validated copy with some fields changed."""
-        return type(self).model_validate({**dict(self), **changes})
+        """Return a validated copy with some fields changed.
+
+        Raises:
+            DeltalightError: there is no such field, or a value does not fit.
+        """
+        return validate(type(self), {**dict(self), **changes}, type(self).__name__)
 
 
 def read_mapping(path: Path, *, unique_keys: bool = False) -> dict[str, Any]:
@@ -154,12 +159,29 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
             hint = nearest(tag, expected)
             advice = f"the nearest is `{hint}` of" if hint else "use one of"
             return f"`{place}` names the unknown kind `{tag}`; {advice} {', '.join(expected)}."
+    wrong = wrong_in_words(fault)
+    return f"`{place}` is wrong: {wrong}{_given(fault['input'])}." if place else f"{wrong}."
+
+
+def wrong_in_words(fault: ErrorDetails) -> str:
+    """Say what is wrong with a value, in JSON's words, without a full stop; places and values are the caller's."""
+    context = fault.get("ctx", {})
+    match fault["type"]:
         case "value_error":
             message = str(context["error"])
+        case "tuple_type" | "list_type":
+            message = "must be a list"
+        case "model_type" | "dict_type" | "model_attributes_type":
+            message = "must be an object with keys and values"
+        case "string_pattern_mismatch" if context["pattern"] == NAME_PATTERN:
+            message = "must be letters, digits, dashes and underscores, at most 64 that begin with a letter or digit"
+        case "too_short":
+            message = f"must have at least {context['min_length']} in it, and has {context['actual_length']}"
+        case "too_long":
+            message = f"must have at most {context['max_length']} in it, and has {context['actual_length']}"
         case _:
             message = fault["msg"]
-    message = (message[:1].lower() + message[1:]).rstrip(".")
-    return f"`{place}` is wrong: {message}{_given(fault['input'])}." if place else f"{message}."
+    return (message[:1].lower() + message[1:]).rstrip(".")
 
 
 def _given(value: object) -> str:

@@ -11,6 +11,7 @@ _TCP = re.compile(
     r"(?P<host>\[[0-9A-Fa-f:.]+\]|[^:/@\[\]]+):(?P<port>\d{1,5}|\*)"
 )
 _IPC = re.compile(r"ipc://.+")
+MAX_PORT = 65535
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ def parse_endpoint(endpoint: str) -> Endpoint:
     if _IPC.fullmatch(endpoint):
         return Endpoint(endpoint)
     parts = _TCP.fullmatch(endpoint)
-    if parts is None:
-        raise DeltalightError(f"{endpoint} is not an endpoint: write tcp://127.0.0.1:PORT or ipc://PATH")
+    if parts is None or (parts["port"] != "*" and int(parts["port"]) > MAX_PORT):
+        raise DeltalightError(f"{endpoint} is not an endpoint; write tcp://127.0.0.1:PORT or ipc://PATH.")
     host, port = parts["host"], parts["port"]
     return Endpoint(f"tcp://{host}:{port}", parts["peer"], host.strip("[]"), 0 if port == "*" else int(port))
 

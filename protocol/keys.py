@@ -67,7 +67,7 @@ class Keys:
             names = ", ".join(others)
             advice = f"write tcp://NAME@HOST:PORT with one of {names}" if others else TRUST_HINT
             raise DeltalightError(
-                f"{endpoint.address} needs the key of its host, and {len(others)} are trusted: {advice}"
+                f"{endpoint.address} needs the key of its host, and {len(others)} are trusted; {advice}."
             )
         return trusted[others[0]]
 
@@ -75,7 +75,7 @@ class Keys:
         if name not in trusted:
             hint = nearest(name, trusted)
             known = f"the nearest trusted name is {hint}, else {TRUST_HINT}" if hint else TRUST_HINT
-            raise DeltalightError(f"no key of `{name}` is trusted for {endpoint.address}: {known}")
+            raise DeltalightError(f"no key of `{name}` is trusted for {endpoint.address}; {known}.")
         return trusted[name]
 
 
@@ -126,7 +126,9 @@ def create_keys(name: str, folder: Path) -> tuple[Path, Path]:
     _check_name(name)
     public, secret = folder / f"{name}{PUBLIC}", folder / f"{name}{SECRET}"
     if public.exists() or secret.exists():
-        raise DeltalightError(f"{folder} has keys called `{name}`: choose another name, or remove them first")
+        raise DeltalightError(
+            f"{folder} has keys called `{name}`; choose another name, or remove them first."
+        )
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         # A temporary folder is private, so that others can read the secret key at no time.
@@ -138,7 +140,7 @@ def create_keys(name: str, folder: Path) -> tuple[Path, Path]:
             made_public.replace(public)
     except OSError as error:
         raise DeltalightError(
-            f"keys cannot be written to {folder} ({error.strerror}): name another folder"
+            f"keys cannot be written to {folder} ({error.strerror}); name another folder."
         ) from error
     return public, secret
 
@@ -151,20 +153,20 @@ def load_keys(name: str | None, folder: Path, *, purpose: str = "this", on_loopb
     """
     own = own_keys(folder)
     if name is None and len(own) > 1:
-        raise DeltalightError(f"{folder} has the keys {', '.join(own)}: say which with `name` of [keys]")
+        raise DeltalightError(f"{folder} has the keys {', '.join(own)}; say which with `name` of [keys].")
     if (name is None and not own) or (name is not None and name not in own):
         raise DeltalightError(
-            f"{purpose} needs keys and {folder} has none{f' called `{name}`' if name else ''}: {CREATE_HINT}"
+            f"{purpose} needs keys and {folder} has none{f' called `{name}`' if name else ''}; {CREATE_HINT}."
         )
     chosen = name or own[0]
     path = folder / f"{chosen}{SECRET}"
     if path.stat().st_mode & _OTHERS:
         raise DeltalightError(
-            f"others can read the secret key {path}: run `chmod 600 {path}`, or make a new one"
+            f"others can read the secret key {path}; run `chmod 600 {path}`, or make a new one."
         )
     public, secret = _read(path)
     if secret is None:
-        raise DeltalightError(f"{path} holds no secret key: {CREATE_HINT}")
+        raise DeltalightError(f"{path} holds no secret key; {CREATE_HINT}.")
     return Keys(chosen, public, secret, folder, on_loopback)
 
 
@@ -175,20 +177,20 @@ def trust(file: Path, folder: Path, name: str | None = None) -> Path:
         DeltalightError: the file holds no public key or a secret one, or another key has the name.
     """
     if not file.is_file():
-        raise DeltalightError(f"{file} is not a file: {TRUST_HINT}")
+        raise DeltalightError(f"{file} is not a file; {TRUST_HINT}.")
     public, secret = _read(file)
     if secret is not None:
-        raise DeltalightError(f"{file} holds a secret key, which stays on its host: give its {PUBLIC} file")
+        raise DeltalightError(f"{file} holds a secret key, which stays on its host; give its {PUBLIC} file.")
     chosen = name or file.name.removesuffix(PUBLIC)
     _check_name(chosen)
     kept = folder / TRUSTED / f"{chosen}{PUBLIC}"
     if kept.is_file() and _read(kept)[0] != public:
-        raise DeltalightError(f"another key is trusted as `{chosen}`: give --name, or remove {kept} first")
+        raise DeltalightError(f"another key is trusted as `{chosen}`; give --name, or remove {kept} first.")
     try:
         kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         shutil.copyfile(file, kept)
     except OSError as error:
-        raise DeltalightError(f"{kept} cannot be written ({error.strerror}): name another folder") from error
+        raise DeltalightError(f"{kept} cannot be written ({error.strerror}); name another folder.") from error
     return kept
 
 
@@ -214,10 +216,12 @@ def _read(path: Path) -> tuple[bytes, bytes | None]:
         return zmq.auth.load_certificate(path)
     except (OSError, ValueError) as error:
         raise DeltalightError(
-            f"{path} is not a key file: give one that `deltalight keys create` made"
+            f"{path} is not a key file; give one that `deltalight keys create` made."
         ) from error
 
 
 def _check_name(name: str) -> None:
     if not _NAME.fullmatch(name):
-        raise DeltalightError(f"`{name}` is not a valid name for keys: use letters, digits, - and _")
+        raise DeltalightError(
+            f"`{name}` is not a valid name for keys; use letters, digits, - and _, and begin with a letter or digit."
+        )

@@ -7,6 +7,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field, StringConstraints
 
+from deltalight.protocol.documents import NAME_PATTERN
+
 MAX_EDGE_PX = 16384
 MAX_LIGHTS = 64
 MAX_EXPOSURES = 24
@@ -97,7 +99,6 @@ def _rectangle(edges: "Rectangle") -> "Rectangle":
     return edges
 
 
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 Name = Annotated[str, StringConstraints(pattern=NAME_PATTERN)]
 Label = Annotated[str, StringConstraints(min_length=1, max_length=MAX_LABEL)]
 Sentence = Annotated[str, StringConstraints(max_length=MAX_SENTENCE)]

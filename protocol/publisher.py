@@ -54,11 +54,11 @@ class Publisher:
         largest = max(len(piece) for piece in multipart)
         if largest > MAX_PART_BYTES:
             raise DeltalightError(
-                f"a part has {largest} bytes and {MAX_PART_BYTES} are allowed: send smaller pictures"
+                f"a part has {largest} bytes and {MAX_PART_BYTES} are allowed; send smaller pictures."
             )
         with self._lock:
             if self._socket.closed:
-                raise DeltalightError("the publisher is closed: open a new one to send")
+                raise DeltalightError("the publisher is closed; open a new one to send.")
             self._socket.send_multipart(multipart)
 
     def close(self, linger_ms: int = 0) -> None:

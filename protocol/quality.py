@@ -1,9 +1,22 @@
 """Qualities of a moving picture: what each gives up for speed (docs/speed.md, quality and speed)."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
+
+from deltalight.protocol.errors import DeltalightError
 
 Quality = Literal["live", "balanced", "best"]
+
+
+def require_quality(name: Quality) -> Quality:
+    """Return the name if there is such a quality.
+
+    Raises:
+        DeltalightError: there is none.
+    """
+    if name not in get_args(Quality):
+        raise DeltalightError(f"'{name}' is not a quality; use one of {', '.join(get_args(Quality))}.")
+    return name
 
 
 @dataclass(frozen=True)

@@ -64,8 +64,8 @@ class ReplyMemory:
             return None
         if request.revision < last.revision or request.payload != last.payload:
             raise DeltalightError(
-                f"revision {request.revision} of {request.op} is not newer than the applied {last.revision}: "
-                f"send {last.revision + 1} or higher"
+                f"revision {request.revision} of {request.op} is not newer than the applied {last.revision}; "
+                f"send {last.revision + 1} or higher."
             )
         return last.reply.model_copy(update={"id": request.id})
 
@@ -232,7 +232,7 @@ class RequestClient:
         """
         deadline = time.monotonic() + timeout_s
         if not self._lock.acquire(timeout=timeout_s):
-            raise DeltalightError(f"{self.endpoint} is still busy with another request: try again")
+            raise DeltalightError(f"{self.endpoint} is still busy with another request; try again.")
         try:
             reply = self._asked(control, deadline, timeout_s)
             if reply.id == UNREADABLE_ID and reply.schema_version < self._version:
@@ -253,7 +253,7 @@ class RequestClient:
         ):
             trust = "" if self._keys is None else f" and trusts {self._keys.name}.key"
             raise DeltalightError(
-                f"no answer from {self.endpoint} within {timeout_s:g} s: check that the server is running{trust}"
+                f"no answer from {self.endpoint} within {timeout_s:g} s; check that the server is running{trust}."
             )
         return decode_control(socket.recv_multipart(), ControlReply)
 
@@ -268,7 +268,7 @@ class RequestClient:
 
     def _connected(self) -> "zmq.Socket[bytes]":
         if self._context.closed:
-            raise DeltalightError(f"the client of {self.endpoint} is closed: open a new one to ask")
+            raise DeltalightError(f"the client of {self.endpoint} is closed; open a new one to ask.")
         if self._socket is None:
             self._socket = open_socket(self._context, zmq.REQ, max_bytes=MAX_PIECE_BYTES)
             attach(self._socket, self.endpoint, bind=False, keys=self._keys)

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz
@@ -140,10 +140,17 @@ class Animation(StrictModel):
         return min(max(time_s, 0.0), duration_s)
 
 
+def _addressable(name: str) -> str:
+    """Refuse the names that browsers and HTTP clients take out of addresses: `objects/..` is the scene itself."""
+    if name in (".", ".."):
+        raise ValueError("`.` and `..` cannot be part of an address, so choose another name")
+    return name
+
+
 class SceneObject(StrictModel):
     """A virtual object."""
 
-    id: str = Field(
+    id: Annotated[str, AfterValidator(_addressable)] = Field(
         default="object", min_length=1, max_length=200, description="Unique name; default `object<index>`."
     )
     asset: Asset = Field(description=f"Mesh: {ASSET_TEXT}")

@@ -46,7 +46,7 @@ def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
     parts = parse_endpoint(endpoint)
     if parts.needs_keys and keys is None:
         raise DeltalightError(
-            f"{endpoint} is reachable from other hosts, which requires keys: {CREATE_HINT}, or use 127.0.0.1"
+            f"{endpoint} is reachable from other hosts, which requires keys; {CREATE_HINT}, or use 127.0.0.1."
         )
     return parts
 
@@ -92,6 +92,6 @@ def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool, keys: Keys |
         verb = "listen at" if bind else "connect to"
         reason = zmq.strerror(error.errno or 0)  # the error's own text would name the endpoint again
         raise DeltalightError(
-            f"cannot {verb} {endpoint} ({reason}): choose another, or stop the program that holds it"
+            f"cannot {verb} {endpoint} ({reason}); choose another, or stop the program that holds it."
         ) from error
     return socket.get_string(zmq.LAST_ENDPOINT)

@@ -40,7 +40,7 @@ def parse_yaml(text: str, *, unique_keys: bool = False) -> Any:  # noqa: ANN401 
         _require_limits(text)
         return yaml.load(text, _UniqueLoader if unique_keys else _Loader)
     except (yaml.YAMLError, ArithmeticError, RecursionError) as error:  # 1:60:60... is a number in YAML 1.1
-        raise ValueError(str(error)) from error
+        raise ValueError(str(error).replace('in "<unicode string>",', "at")) from error
 
 
 def _integer(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, cast
-from urllib.parse import urlencode
+from urllib.parse import quote, urlencode
 
 import httpx
 import numpy as np
@@ -154,7 +154,7 @@ class Scene:
 
     def change_object(self, object_id: str, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
         """Change keys of an object; the others stay."""
-        self._change("PATCH", f"/objects/{object_id}", keys)
+        self._change("PATCH", _object_path(object_id), keys)
 
     def move(
         self, object_id: str, *, translation_m: Place | None = None, rotation_wxyz: Rotation | None = None
@@ -165,7 +165,7 @@ class Scene:
 
     def remove_object(self, object_id: str) -> None:
         """Remove an object."""
-        self._change("DELETE", f"/objects/{object_id}", None)
+        self._change("DELETE", _object_path(object_id), None)
 
     def set_lights(self, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
         """Change keys of the lights (`mode`, `manual`, `environment`, ...)."""
@@ -204,6 +204,11 @@ class Scene:
 
     def _take(self, answer: Any) -> None:  # noqa: ANN401 - JSON
         self._answer = answer
+
+
+def _object_path(object_id: str) -> str:
+    """Where an object is in its scene; ids may hold any character, such as `?`."""
+    return f"/objects/{quote(object_id, safe='')}"
 
 
 class Client:

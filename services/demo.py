@@ -56,8 +56,8 @@ def run_live(method: str, *, port: int, with_browser: bool, spares: Mapping[str,
         plan.require_free_ports()
         address = f"http://{ports.LOOPBACK}:{port}"
         with Supervisor(plan.specs(), spares=spares) as supervisor:
-            print(f"The dashboard is at {address} (press Ctrl-C to stop).", flush=True)
             supervisor.run(until=lambda: ports.answers(port))
+            print(f"The dashboard is at {address} (press Ctrl-C to stop).", flush=True)
             if with_browser and _has_display():
                 webbrowser.open(address)
             supervisor.run()

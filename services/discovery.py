@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from deltalight.protocol.documents import nearest
+from deltalight.protocol.documents import NAME_PATTERN, nearest
 from deltalight.protocol.envelope import is_readable_version
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import TRUST_HINT, KeySettings, key_folder, trusted_keys
-from deltalight.protocol.message_fields import NAME_PATTERN
 from deltalight.protocol.messages import MESSAGE_TYPES, OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
 from deltalight.sensor_node.announce import SERVICE_TYPE
 

@@ -32,6 +32,17 @@ def make_output_folder(folder: Path) -> Path:
     return folder
 
 
+def require_output_file(path: Path) -> None:
+    """Check a file that is written after long work, so that the work is not lost; create its folder if missing.
+
+    Raises:
+        DeltalightError: it is a folder, or its folder cannot be written.
+    """
+    if path.is_dir():
+        raise DeltalightError(f"The output '{path}' is a folder; name a file in it.")
+    make_output_folder(path.parent)
+
+
 def require_new_recording(path: Path) -> None:
     """Check the name of a recording to be written; create its folder if missing.
 

@@ -109,14 +109,17 @@ class HostPlan:
         """Check every port before a child is started.
 
         Raises:
-            DeltalightError: another program listens on one of them.
+            DeltalightError: another program listens on one of them, or two are the same.
         """
+        chosen = [
+            ports.ChosenPort(self.composite_port, "composite of the render server", "--composite-port"),
+            ports.ChosenPort(self.control_port, "control of the render server", "--control-port"),
+        ]
         if self.source is not None:
-            ports.require_free(self.node_port, "sensor node", "--node-port")
-        ports.require_free(self.composite_port, "composite of the render server", "--composite-port")
-        ports.require_free(self.control_port, "control of the render server", "--control-port")
+            chosen.append(ports.ChosenPort(self.node_port, "sensor node", "--node-port"))
         if self.data is not None:
-            ports.require_free(self.page_port, "dashboard", "--port")
+            chosen.append(ports.ChosenPort(self.page_port, "dashboard", "--port"))
+        ports.require_all_free(chosen)
 
     @property
     def _commands(self) -> HostCommands:

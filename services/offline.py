@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     Write = Callable[[int, ViewFrame, CompositeFrame], None]
 
 INDEX_FILE = "frames.jsonl"
+# What people name who expect one file: a folder of that name would surprise them.
+OTHER_FILES = {".avi", ".gif", ".jpeg", ".jpg", ".mkv", ".mov", ".mp4", ".png", ".webm"}
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,10 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
         require_openexr("--exr" if job.with_exr else "--layers exr")
     if job.is_video and job.with_linear:
         raise DeltalightError("--exr and --layers write files beside pictures; name a folder with --out.")
+    if not job.is_video and job.out.suffix.lower() in OTHER_FILES:
+        raise DeltalightError(
+            f"'{job.out}' is not an output; name a folder for the pictures, or NAME{VIDEO_SUFFIX} for a video."
+        )
     if job.is_video:
         require_video_support()
         require_absent(job.out)

@@ -3,7 +3,8 @@
 import random
 import socket
 from collections import deque
-from collections.abc import Container
+from collections.abc import Container, Sequence
+from typing import NamedTuple
 
 from deltalight.protocol.errors import DeltalightError
 
@@ -52,6 +53,32 @@ def require_free(port: int, purpose: str, option: str) -> None:
         raise DeltalightError(
             f"Port {port} ({purpose}) is in use by another program; stop it, or choose another with {option}."
         )
+
+
+class ChosenPort(NamedTuple):
+    """A port, what is to listen on it, and the option that chooses another."""
+
+    port: int
+    purpose: str
+    option: str
+
+
+def require_all_free(chosen: Sequence[ChosenPort]) -> None:
+    """Check the ports of one host before anything starts.
+
+    Raises:
+        DeltalightError: another program listens on one of them, or two are the same.
+    """
+    taken: dict[int, str] = {}
+    for each in chosen:
+        if each.port in taken:
+            raise DeltalightError(
+                f"Port {each.port} is given for both the {taken[each.port]} and the {each.purpose};"
+                f" give {each.option} another."
+            )
+        taken[each.port] = each.purpose
+    for each in chosen:
+        require_free(*each)
 
 
 def used_ports() -> deque[int]:

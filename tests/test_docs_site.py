@@ -1,5 +1,6 @@
 """The documentation as a site: it builds without a warning, loads nothing from elsewhere, quotes what is said."""
 
+import ast
 import logging
 import re
 from html.parser import HTMLParser
@@ -84,6 +85,19 @@ def spoken() -> str:
     """All sources, with the parts of each string joined."""
     texts = (path.read_text(encoding="utf-8") for room in ROOMS for path in (ROOT / room).rglob("*.py"))
     return "\n".join(re.sub(r'"\n\s*f?"', "", text) for text in texts)
+
+
+def literal_end(message: ast.expr) -> str:
+    last = message.values[-1] if isinstance(message, ast.JoinedStr) else message
+    return last.value if isinstance(last, ast.Constant) and isinstance(last.value, str) else "."
+
+
+def test_errors_that_users_see_end_as_sentences() -> None:
+    for path in (path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "DeltalightError" and node.args:
+                end = literal_end(node.args[0])
+                assert end.endswith((".", "?")), f"{path}:{node.lineno} ends with {end!r}"
 
 
 def test_the_errors_page_quotes_what_the_code_says() -> None:

@@ -67,7 +67,8 @@ def test_a_take_is_a_sequence_of_frames(take: dl.Take) -> None:
     frame = take[0]
     assert frame.pose is not None
     assert frame.depth is not None
-    with pytest.raises(IndexError):
+    assert take[np.int64(3)].frame_id == take[3].frame_id
+    with pytest.raises(IndexError, match="has 30 frames, counted from 0, and none at 30"):
         take[30]
     assert take.scene is not None
     assert take.scene.document.objects[0].id == load_scene(SCENE).objects[0].id
@@ -167,6 +168,8 @@ def test_objects_are_named_changed_and_saved(scene: dl.Scene, cube: Path, tmp_pa
         "cube 2",
         "mine",
     ]
+    scene.move("cube 2", to=np.array([0.1, 0.2, 0.3], np.float32))
+    assert scene.document.objects[-2].pose.translation_m == pytest.approx((0.1, 0.2, 0.3))
     scene.change("cube", material=dl.Material(metallic=1.0), visible=False)
     scene.save(tmp_path / "saved.json")
     assert dl.Scene.load(tmp_path / "saved.json").document == scene.document
@@ -178,6 +181,15 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         "does not exist; correct the path": lambda: scene.add(tmp_path / "cup.glb"),
         "has an object `knot` already": lambda: scene.add(cube, name="knot"),
         "is not a method; the nearest is dlpv": lambda: dl.Renderer("dlvp"),
+        "'fast' is not a quality; use one of live, balanced, best": lambda: dl.Renderer(quality="fast"),  # type: ignore[arg-type]
+        r"the object `cube`: the key `pose.translation_m\[2\]` is missing": lambda: scene.add(
+            cube, at=(1, 2)
+        ),  # type: ignore[arg-type]
+        "`pose.scale` is wrong: input should be greater than 0": lambda: scene.add(cube, scale=0),
+        "unknown key `colour`": lambda: scene.change("knot", colour="red"),
+        "the nearest known key is `volume_size`": lambda: scene.document.replaced(
+            method={"name": "dvct", "volume_siz": 32}
+        ),
         "cannot be read|does not exist|no such": lambda: dl.open(tmp_path / "none.mcap"),
     }
     for sentence, call in cases.items():

@@ -95,7 +95,7 @@ def parse_motions(text: str) -> list[str]:
         if name not in MOTIONS:
             close = nearest(name, MOTIONS)
             hint = "" if close is None else f"; the nearest is {close}"
-            raise DeltalightError(f"'{name}' is no motion{hint}; use {', '.join(MOTIONS)}.")
+            raise DeltalightError(f"'{name}' is not a motion{hint}; use {', '.join(MOTIONS)}.")
     if len(set(names)) < len(names):
         raise DeltalightError(f"--motions '{text}' names one thing twice; write each once.")
     return names

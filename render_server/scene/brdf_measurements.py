@@ -91,7 +91,7 @@ def _numbers(path: Path) -> Float64[np.ndarray, " n"]:
         numbers = np.array(words, np.float64)
     except ValueError as error:
         raise DeltalightError(
-            f"{path.name} holds something else than numbers; it is not a .brdf file."
+            f"{path.name} holds something other than numbers; it is not a .brdf file."
         ) from error
     if not (np.abs(numbers) < _LARGEST).all():  # nor a number
         raise DeltalightError(

@@ -77,7 +77,7 @@ def read_ptm(path: Path) -> PolynomialTexture:
     kind, _, rest = rest.partition(b"\n")
     kind = kind.strip()
     if version.strip() != _VERSION or kind not in _TEXEL_BYTES:
-        raise DeltalightError(f"{path} is no uncompressed PTM of RGB or LRGB coefficients; {_ADVICE}.")
+        raise DeltalightError(f"{path} is not an uncompressed PTM of RGB or LRGB coefficients; {_ADVICE}.")
     file = _parsed(path, rest, _TEXEL_BYTES[kind])
     with np.errstate(over="ignore"):  # beyond float16: refused next
         planes = [averaged(plane, MOST_TEXELS_EDGE).astype(np.float16) for plane in file.planes(kind)]

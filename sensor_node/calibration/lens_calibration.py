@@ -56,6 +56,10 @@ def calibrate_lens(collected: ViewCollector, target: Target, kind: LensKind) -> 
         DeltalightError: there are too few views, or no lens fits them.
     """
     views, size = collected.views, collected.size
+    if not collected.seen:
+        raise DeltalightError(
+            "the source holds no pictures of this camera; give a folder or a recording that does."
+        )
     if collected.brightest is None or len(views) < LEAST_VIEWS:
         raise DeltalightError(
             f"only {len(views)} of {collected.seen} pictures can be used as views of the target and {LEAST_VIEWS} "

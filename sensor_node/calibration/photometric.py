@@ -261,6 +261,7 @@ def parse_card(text: str, albedo: float) -> GreyCard:
         return GreyCard(center_m=((x0 + x1) / 2, (y0 + y1) / 2), size_m=size, albedo=albedo)
     except ValueError as error:
         raise DeltalightError(
-            f"--card {text} with --card-albedo {albedo} is no card; write two opposite corners x0,y0,x1,y1 in metres "
-            "in the board's frame (+x right, +y up from the first marker's top-left corner), albedo above 0 to 1."
+            f"--card {text} with --card-albedo {albedo} is not a card; write two opposite corners x0,y0,x1,y1 in "
+            "metres in the board's frame (+x right, +y up from the first marker's top-left corner), and an albedo"
+            " above 0 and up to 1."
         ) from error

@@ -49,7 +49,7 @@ class PlaybackClient:
         try:
             reply = self._client.request(request, timeout_s)
         except DeltalightError as fault:
-            raise UnansweredError(f"The replay does not answer ({fault}).") from fault
+            raise UnansweredError(f"The replay does not answer ({str(fault).rstrip('.')}).") from fault
         if reply.error is not None:
             raise DeltalightError(reply.error)
         self.last = Position(recording=self._recording, **reply.payload)  # type: ignore[arg-type]

@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from deltalight.protocol.documents import wrong_in_words
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import as_sentence
 from deltalight.services.api.render_link import UnansweredError
@@ -158,7 +159,7 @@ class Problems:
         first = fault.errors()[0]
         if first["type"] == "json_invalid":
             return self._not_json()
-        return self.response(422, "invalid", f"`{_place(first['loc'])}` is wrong: {_lower(first['msg'])}.")
+        return self.response(422, "invalid", f"`{_place(first['loc'])}` is wrong: {wrong_in_words(first)}.")
 
 
 def describe_problems(schema: dict[str, Any]) -> dict[str, Any]:
@@ -188,7 +189,3 @@ def _slug(status: int) -> str:
 
 def _place(steps: tuple[int | str, ...]) -> str:
     return ".".join(map(str, steps))
-
-
-def _lower(message: str) -> str:
-    return (message[:1].lower() + message[1:]).rstrip(".")

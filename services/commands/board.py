@@ -11,6 +11,8 @@ from deltalight.protocol.errors import DeltalightError
 if TYPE_CHECKING:
     from deltalight.protocol.board import BoardSpec
 
+LONGEST_MM = 9_999.0  # board.yaml takes lengths below 10 m
+
 
 class BoardType(StrEnum):
     """Kinds of boards that are printed."""
@@ -61,9 +63,14 @@ def board(
     columns: Annotated[
         int | None, typer.Option(min=1, max=100, help="Columns of markers (for charuco: of squares).")
     ] = None,
-    marker_mm: Annotated[float | None, typer.Option(help="Outer edge of a marker, mm.")] = None,
+    marker_mm: Annotated[
+        float | None, typer.Option(min=1, max=LONGEST_MM, help="Outer edge of a marker, mm.")
+    ] = None,
     separation_mm: Annotated[
-        float | None, typer.Option(help="White gap between markers, mm (charuco: square less marker).")
+        float | None,
+        typer.Option(
+            min=0, max=LONGEST_MM, help="White gap between markers, mm (charuco: square less marker)."
+        ),
     ] = None,
     dictionary: Annotated[str | None, typer.Option(help="OpenCV's name of the dictionary.")] = None,
     first_id: Annotated[int, typer.Option(min=0, help="Id of the first marker.")] = 0,
@@ -73,7 +80,9 @@ def board(
             help="Id of a marker to fix to a lamp, on a page of its own; may be given more than once."
         ),
     ] = None,
-    lamp_marker_mm: Annotated[float, typer.Option(help="Outer edge of the lamps' markers, mm.")] = 40.0,
+    lamp_marker_mm: Annotated[
+        float, typer.Option(min=1, max=LONGEST_MM, help="Outer edge of the lamps' markers, mm.")
+    ] = 40.0,
     force: Annotated[bool, typer.Option("--force", help="Overwrite older files.")] = False,
 ) -> None:
     """Write a marker board as a true-scale PDF, and its board.yaml."""

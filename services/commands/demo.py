@@ -37,6 +37,8 @@ def demo(
     if headless:
         _write(method, frames, out, as_json=as_json)
         return
+    if out is not None or as_json:
+        raise DeltalightError("--out and --json are for a headless demo; add --headless, or leave them out.")
     require_free(port, "dashboard", "--port")
     with uncollected():
         from deltalight.services.demo import run_live

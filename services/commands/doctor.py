@@ -27,9 +27,14 @@ def _print_table(checks: list[dict[str, str]]) -> None:
 
     marks = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "missing": "[red]missing[/]"}
     table = Table(box=None)
-    for heading in ("", "What", "Found", "What to do"):
-        table.add_column(heading, overflow="fold")  # text to be typed must not be cut
+    for heading in ("", "What", "Found"):
+        table.add_column(heading, overflow="fold")
     for check in checks:
-        texts = (escape(check[key]) for key in ("name", "detail", "hint"))
-        table.add_row(marks[check["state"]], *texts)
-    Console().print(table)
+        table.add_row(marks[check["state"]], escape(check["name"]), escape(check["detail"]))
+    console = Console()
+    console.print(table)
+    for check in checks:
+        if check["hint"]:  # in one piece, because it may hold a command to be copied
+            console.print(
+                f"\n{check['name']}: {check['hint']}", markup=False, highlight=False, soft_wrap=True
+            )

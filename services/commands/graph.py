@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from deltalight.protocol.method_names import require_method
-from deltalight.services.commands.options import MethodName
+from deltalight.services.commands.options import MethodName, writable
 
 if TYPE_CHECKING:
     from deltalight.services.frame_account import FrameAccount
@@ -20,7 +20,9 @@ NARROWEST = 150  # columns of a table that no terminal shows
 def graph(
     *,
     method: MethodName = "dvct",
-    svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the graph to an SVG file.")] = None,
+    svg: Annotated[
+        Path | None, typer.Option(callback=writable, metavar="FILE", help="Write the graph to an SVG file.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the graph as JSON.")] = False,
 ) -> None:
     """Show the stages of a frame: what each reads and writes, how long it takes, and what is kept between frames.

@@ -93,7 +93,7 @@ def allow_host(
 
     place = _folder(folder)
     if name not in trusted_keys(place):
-        raise DeltalightError(f"no key of `{name}` is trusted in {place}: see `deltalight keys list`")
+        raise DeltalightError(f"no key of `{name}` is trusted in {place}; see `deltalight keys list`.")
     if everything == bool(words):
         raise DeltalightError("name the streams that the host may send, or give --everything.")
     allow(place, name, None if everything else words)

@@ -83,6 +83,19 @@ SMALLEST_EDGE = 16
 LARGEST_EDGE = 8192
 
 
+def writable(path: Path | None) -> Path | None:
+    """Check the file that an option names, if any, before the command begins its work.
+
+    Raises:
+        DeltalightError: it cannot be written.
+    """
+    from deltalight.services.files import require_output_file
+
+    if path is not None:
+        require_output_file(path)
+    return path
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """Parse `WxH` into width and height in pixels.
 

@@ -9,7 +9,15 @@ import typer
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.commands.options import ConfigFile, Data, NodeName, data_folder
-from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT, ROOMS_PORT
+from deltalight.services.ports import (
+    COMPOSITE_PORT,
+    CONTROL_PORT,
+    LOOPBACK,
+    NODE_PORT,
+    PAGE_PORT,
+    ROOMS_PORT,
+    answers,
+)
 
 if TYPE_CHECKING:
     from deltalight.services.host import HostCommands
@@ -134,6 +142,7 @@ def up(
         )
         plan.require_free_ports()
         with Supervisor(plan.specs()) as supervisor:
+            supervisor.run(until=lambda: answers(port))
             typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (press Ctrl-C to stop).")
             supervisor.run()
 

@@ -113,7 +113,8 @@ class DirectoryClient:
             reply = self._client.request(request, ANSWER_TIMEOUT_S)
         except DeltalightError as fault:
             raise SilentDirectoryError(
-                f"the directory of rooms does not answer ({fault}); check that `deltalight up --rooms` is running."
+                f"the directory of rooms does not answer ({str(fault).rstrip('.')});"
+                " check that `deltalight up --rooms` is running."
             ) from fault
         if reply.error is not None:
             raise DeltalightError(reply.error)

@@ -55,10 +55,11 @@ class RoomsHost:
         """Check the ports that have been chosen, before a child is started.
 
         Raises:
-            DeltalightError: another program listens on one of them.
+            DeltalightError: another program listens on one of them, or they are the same.
         """
-        ports.require_free(self.page_port, "dashboard", "--port")
-        ports.require_free(self.rooms_port, "directory of rooms", "--rooms-port")
+        page = ports.ChosenPort(self.page_port, "dashboard", "--port")
+        directory = ports.ChosenPort(self.rooms_port, "directory of rooms", "--rooms-port")
+        ports.require_all_free([page, directory])
 
     @cached_property
     def node_ports(self) -> dict[str, int]:

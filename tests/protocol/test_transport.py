@@ -257,7 +257,8 @@ def test_endpoints_that_leave_the_host_are_refused(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["", "127.0.0.1:5000", "udp://127.0.0.1:5000", "tcp://127.0.0.1", "inproc://a"]
+    "endpoint",
+    ["", "127.0.0.1:5000", "udp://127.0.0.1:5000", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "inproc://a"],
 )
 def test_what_is_no_endpoint_is_refused(endpoint: str) -> None:
     with pytest.raises(DeltalightError, match="not an endpoint"):

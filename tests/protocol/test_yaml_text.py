@@ -44,6 +44,15 @@ def test_what_exceeds_a_limit_is_one_sentence(text: str, reason: str) -> None:
     assert "\n" not in str(fault.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "place"), [("objects:\n\t- a\n", "at line 2, column 1"), ("\x02", "at position 0")]
+)
+def test_the_place_of_a_fault_is_that_in_the_document(text: str, place: str) -> None:
+    with pytest.raises(DeltalightError, match=f" {place}") as fault:
+        parse_mapping(text, "scene.yaml", is_json=False)
+    assert "unicode string" not in str(fault.value)
+
+
 def test_scene_files_of_the_command_line_have_the_same_limits(tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
     path.write_text(nested(18, "{{<<: [{0}, {0}]}}"))

@@ -144,7 +144,7 @@ WHOLE = brdf_text(PAINT)
         ("", "is not a complete .brdf file"),
         ("# only a comment\n", "is not a complete .brdf file"),
         (WHOLE[: len(WHOLE) // 2 - 30], "is not a complete .brdf file"),
-        ("ply\nformat ascii 1.0\n", "holds something else than numbers"),
+        ("ply\nformat ascii 1.0\n", "holds something other than numbers"),
         (WHOLE.replace(" 0.", " nan ", 1), "not finite"),
         (WHOLE.replace(" 0.", " 1e300 ", 1), "beyond 1e"),
         (WHOLE.replace("400 410", "410 400"), "is not a complete .brdf file"),

@@ -284,15 +284,15 @@ def test_a_ptm_file_of_colors(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda content: content.replace(b"PTM_1.2", b"PTM_1.1"), "no uncompressed PTM of RGB or LRGB"),
-        (lambda content: content.replace(b"_LRGB", b"_JPEG_LRGB"), "no uncompressed PTM of RGB or LRGB"),
+        (lambda content: content.replace(b"PTM_1.2", b"PTM_1.1"), "not an uncompressed PTM of RGB or LRGB"),
+        (lambda content: content.replace(b"_LRGB", b"_JPEG_LRGB"), "not an uncompressed PTM of RGB or LRGB"),
         (lambda content: content[:-1], r"has 431 bytes of 8x6 texels, not 432; it is damaged"),
         (lambda content: content[:40], "lacks its size, scales or biases"),
         (lambda content: content.replace(b"\n8\n", b"\n-8\n"), "lacks its size, scales or biases"),
         (lambda content: content.replace(b"2.5", b"nan"), "lacks its size, scales or biases"),
         (lambda content: content.replace(b"2.5", b"1e9"), "coefficients beyond 65504 times white"),
         (lambda content: content.replace(b"2.5", b"1e300"), "coefficients beyond 65504 times white"),
-        (lambda content: b"", "no uncompressed PTM of RGB or LRGB"),  # noqa: ARG005
+        (lambda content: b"", "not an uncompressed PTM of RGB or LRGB"),  # noqa: ARG005
     ],
 )
 def test_bad_ptm_files(tmp_path: Path, change: Callable[[bytes], bytes], sentence: str) -> None:

@@ -268,7 +268,7 @@ class Desk:
         ]
 
     def beyond_the_edge(self) -> list[str]:
-        """Controls of the bars that the window cuts off, and the page itself where it scrolls sideways."""
+        """What does not fit: controls that the window cuts off, a page that scrolls sideways, figures over panels."""
         outside: list[str] = self.page.evaluate(
             """() => [...document.querySelectorAll(":is(.top, .stage-bar, .drawer-bar) :is(button, label, select)")]
                 .filter((each) => { const { left, right } = each.getBoundingClientRect();
@@ -277,6 +277,11 @@ class Desk:
         )
         if self.page.evaluate("document.documentElement.scrollWidth > innerWidth"):
             outside.append("the page")
+        if self.page.evaluate(
+            """() => { const strip = document.querySelector(".status-strip");
+                return getComputedStyle(strip).overflowX === "visible" && strip.scrollWidth > strip.clientWidth; }"""
+        ):
+            outside.append("the figures below the picture")
         return outside
 
     def drop(self, name: str, content: bytes, place: tuple[float, float]) -> None:

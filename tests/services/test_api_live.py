@@ -114,11 +114,14 @@ def test_two_viewers_look_at_different_views_of_the_same_frames(live: LiveApi) -
     assert "view" in sentence(live.client.get("/live.jpg", params={"view": "sideways"}), 422)
 
 
-def test_a_view_that_there_is_not_ends_the_connection(live: LiveApi) -> None:
-    with live_socket(live.address) as socket:
-        socket.send("view sideways")
-        with pytest.raises(websockets.ConnectionClosed, match=r"output\.view"):
+@pytest.mark.parametrize(("query", "order"), [("?view=sideways", None), ("", "view sideways")])
+def test_a_view_that_there_is_not_ends_the_connection(live: LiveApi, query: str, order: str | None) -> None:
+    with live_socket(live.address, query) as socket:
+        if order is not None:
+            socket.send(order)
+        with pytest.raises(websockets.ConnectionClosed, match="no such view; ask for one of composite, "):
             follow(socket)
+    assert socket.close_code == 1008
 
 
 def test_a_composite_without_a_camera_is_refused() -> None:

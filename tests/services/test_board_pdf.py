@@ -193,6 +193,7 @@ def test_a_board_that_does_not_fit_is_refused_with_what_does() -> None:
         (("--out", "board.pdf", "--dictionary", "DICT_4X4_60"), "nearest name is DICT_4X4_50"),
         (("--out", "board.pdf", "--rows", "9", "--columns", "9", "--marker-mm", "10"), "ids go from 0 to 49"),
         (("--out", "board.pdf", "--lamp-marker", "3"), "also on the board"),
+        (("--out", "board.pdf", "--dictionary", "4X4"), "there is no such dictionary in OpenCV"),
         (("--out", "old.pdf"), "already exists"),
     ],
 )
@@ -206,3 +207,12 @@ def test_wrong_use_is_a_sentence(
     assert sentence in str(done.exception)
     assert (tmp_path / "old.yaml").read_text() == "kept"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["old.yaml"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--marker-mm", "nan"), ("--separation-mm", "-1"), ("--lamp-marker-mm", "1e9")]
+)
+def test_a_wrong_size_is_named_as_it_was_given(arguments: tuple[str, str]) -> None:
+    done = board_command("--out", "board.pdf", *arguments)
+    assert done.exit_code == 2
+    assert f"Invalid value for '{arguments[0]}'" in done.output

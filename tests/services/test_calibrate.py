@@ -17,6 +17,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
 from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 from deltalight.services.cli import app
+from deltalight.services.demo import RECORDING
 from tests.sensor_node.calibration_samples import picture, poses
 from tests.services.conftest import RunCli
 
@@ -131,6 +132,10 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for index in range(0, 90, 14):
             writer.add(camera.frame_at(index))
     return path
+
+
+def test_a_recording_without_pictures_of_the_camera_is_told(tmp_path: Path) -> None:
+    assert "holds no pictures of this camera" in sentence(calibrate("fisheye", RECORDING, "--out", tmp_path))
 
 
 def test_extrinsics_are_refused_or_kept_and_never_overwritten(take: Path, tmp_path: Path) -> None:

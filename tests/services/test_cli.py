@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -192,6 +192,16 @@ def test_doctor_finds_what_the_demo_needs(cli: RunCli) -> None:
     assert f"port {ports.PAGE_PORT}" in checks
 
 
+def test_doctor_prints_commands_in_one_piece(cli: RunCli, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = (
+        "/opt/station/environments/deltalight/bin/python -m pip install 'opencv-contrib-python-headless<5'"
+    )
+    check = doctor.Check("OpenNI 2 cameras", "note", "this OpenCV was built without it", f"run `{command}`")
+    monkeypatch.setattr("deltalight.services.doctor.examine", lambda: [check])
+    monkeypatch.setenv("COLUMNS", "60")
+    assert command in cli("doctor").stdout
+
+
 def test_doctor_says_what_is_missing_without_opengl(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -214,10 +224,18 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         (("up", "--source", f"{tmp_path}/absent.mcap"), "absent.mcap"),
         (("up", "--source", "synthetic", "--scene", f"{tmp_path}/absent.json"), "absent.json"),
         (("--log-level", "loud", "doctor"), "log level"),
+        (
+            ("up", "--source", "synthetic", "--data", f"{tmp_path}/data", "--port", 5601),
+            "give --port another",
+        ),
         (("demo", "--method", "exakt"), "the nearest is exact"),
+        (("demo", "--out", f"{tmp_path}/pictures"), "add --headless"),
         (("bench", "speed", "--methods", "guess"), "exact"),
         (("bench", "speed", "--motions", "stil"), "still"),
         (("bench", "counts", "--methods", "path"), "exact"),
+        (("bench", "speed", "--out", tmp_path), "is a folder; name a file in it"),
+        (("bench", "sweep", "--out", "/proc/sweep.json"), "cannot be written"),
+        (("graph", "--svg", tmp_path), "is a folder; name a file in it"),
         (("bench", "quality", "--methods", "exact:cone_cont=9"), "cone_count"),
         (("bench", "quality", "--scenes", "tabletopp"), "tabletop"),
         (("bench", "quality", "--spp", 3, "--scenes", "tabletop", "--out", f"{tmp_path}/quality"), "even"),
@@ -228,6 +246,34 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         assert done.returncode == 2, done.stderr
         assert sentence in done.stderr
         assert "Traceback" not in done.stderr
+
+
+def test_up_names_the_page_once_it_answers(
+    cli: RunCli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Supervisor:
+        def __init__(self, _specs: object) -> None:
+            pass
+
+        def __enter__(self) -> "Supervisor":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def run(self, until: Callable[[], bool] | None = None) -> None:
+            print("waits until it answers" if until else "runs")
+
+    monkeypatch.setattr("deltalight.services.supervisor.Supervisor", Supervisor)
+    options = ("--port", "--node-port", "--composite-port", "--control-port")
+    chosen = [word for pair in zip(options, ports.private_ports(4), strict=True) for word in pair]
+    done = cli("up", "--source", "synthetic", "--data", tmp_path, *chosen)
+    said = done.stdout.splitlines()
+    assert [line.partition(" at http")[0] for line in said] == [
+        "waits until it answers",
+        "The dashboard is",
+        "runs",
+    ], done.stderr
 
 
 @pytest.mark.parametrize(

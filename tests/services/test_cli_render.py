@@ -276,6 +276,13 @@ def test_out_that_is_a_file_or_cannot_be_made(cli: RunCli, take: Path, tmp_path:
         assert_refused(cli("render", take / "take", "--scene", take / "scene.json", "--out", out), sentence)
 
 
+def test_out_that_looks_like_another_file_makes_no_folder(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    for name in ("take.mov", "frame.PNG", "take.MP4"):
+        done = cli("render", take / "take", "--scene", take / "scene.json", "--out", tmp_path / name)
+        assert_refused(done, "name a folder for the pictures, or NAME.mp4 for a video")
+        assert not (tmp_path / name).exists()
+
+
 def test_source_without_scene_needs_one(cli: RunCli, take: Path, tmp_path: Path) -> None:
     assert_refused(cli("render", take / "take", "--out", tmp_path / "out"), "--scene")
 

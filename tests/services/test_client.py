@@ -142,6 +142,17 @@ def test_methods_are_compared_and_the_stream_watched(
     assert all(re.fullmatch(rf"\d+ \d+ ms \S+ \({HEIGHT}, {WIDTH}, 3\)", line) for line in lines[3:])
 
 
+def test_names_of_objects_may_hold_what_addresses_may_not(client: Client) -> None:
+    scene = client.create_scene(SceneDocument(name="names"))
+    for name in ("a?b#c", "a/b", "50 % ü"):
+        assert scene.add_object("knot.obj", id=name) == name
+        scene.move(name, translation_m=(1.0, 0.0, 0.0))
+        (item,) = scene.document.objects
+        assert (item.id, item.pose.translation_m) == (name, (1, 0, 0))
+        scene.remove_object(name)
+    scene.delete()
+
+
 def test_a_scene_is_made_changed_and_deleted(client: Client) -> None:
     scene = client.create_scene(SceneDocument(name="made here"))
     assert (scene.revision, scene.document.name, scene.picture) == (1, "made here", None)

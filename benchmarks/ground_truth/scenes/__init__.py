@@ -43,8 +43,6 @@ def scene_named(name: str) -> BenchmarkScene:
     known = {scene.name: scene for scene in (*SCENES, *MATERIAL_SCENES)}
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-        hint = f" did you mean `{near[0]}`?" if near else ""
-        raise DeltalightError(
-            f"There is no benchmark scene `{name}`;{hint} Known scenes: {', '.join(known)}."
-        )
+        advice = f"did you mean `{near[0]}`? There are" if near else "use one of"
+        raise DeltalightError(f"There is no benchmark scene `{name}`; {advice} {', '.join(known)}.")
     return known[name]

@@ -3,11 +3,11 @@
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from fastapi import APIRouter, Body, Query, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field
 
 from deltalight import __version__
 from deltalight.protocol.message_fields import MAX_EDGE_PX
@@ -32,6 +32,8 @@ ORDERS_PER_S, ORDERS_AT_ONCE = 10.0, 40  # changes of view and codec by one view
 BOUNDARY = "frame"
 CODECS: dict[str, LiveCodec] = {"jpeg": "jpeg", "h264": "h264"}
 _TOO_MANY_ORDERS = "change view, camera and codec less often"
+VIEWS: dict[str, ShownView] = {name: name for name in get_args(ShownView)}
+UNKNOWN_VIEW = f"there is no such view; ask for one of {', '.join(VIEWS)}"
 UNKNOWN_CODEC = f"there is no such codec; ask for one of {', '.join(CODECS)}"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 RETRY_AFTER_S = "1"  # pictures come many times a second, or not for a while
@@ -47,7 +49,6 @@ WantedCamera = Annotated[
     str | None,
     Query(max_length=64, description="Name of the camera's node; default: the first camera."),
 ]
-_VIEW: TypeAdapter[ShownView | None] = TypeAdapter(ShownView | None)
 
 live_router = APIRouter(tags=["live"])
 events_router = APIRouter(tags=["state"])
@@ -116,19 +117,23 @@ def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
 async def live(
     socket: WebSocket,
     shared: Shared,
-    view: WantedView = None,
+    view: str | None = None,
     codec: str = "jpeg",
-    camera: WantedCamera = None,
+    camera: str | None = None,
 ) -> None:
-    """Send the newest frame whenever this viewer acknowledged enough; others are not affected."""
+    """Send the newest frame whenever this viewer acknowledged enough; others are not affected.
+
+    Wrong parameters are refused after the handshake: browsers do not tell pages why one failed.
+    """
     await socket.accept()
-    refusal = "" if codec in CODECS else UNKNOWN_CODEC
+    refusal = "" if view is None or view in VIEWS else UNKNOWN_VIEW
+    refusal = refusal or ("" if codec in CODECS else UNKNOWN_CODEC)
     refusal = refusal or _why_not(shared.live, camera)
     if refusal:
         await socket.close(POLICY_VIOLATION, refusal)
         return
     under_way = _UnderWay()
-    with shared.live.viewer(view, CODECS[codec], camera) as viewer:
+    with shared.live.viewer(VIEWS.get(view or ""), CODECS[codec], camera) as viewer:
         await _first_of(_send_frames(socket, viewer, under_way), _take_messages(socket, viewer, under_way))
 
 
@@ -297,18 +302,17 @@ async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay
             orders.take("")
     except WebSocketDisconnect:
         return
-    except (ValueError, KeyError):  # it acknowledged a frame that it never got, sent bytes, or named no view
-        await socket.close(POLICY_VIOLATION, "acknowledge each frame once; views are as in output.view")
+    except (ValueError, KeyError):  # it acknowledged a frame that it never got, or sent bytes
+        await socket.close(POLICY_VIOLATION, "send `ack` as text, once for each frame")
 
 
 def _obey(viewer: Viewer, order: str) -> str:
-    """Show a viewer another view or camera, or in another codec; return why not, else nothing.
-
-    Raises:
-        ValueError: there is no such view.
-    """
+    """Show a viewer another view or camera, or in another codec; return why not, else nothing."""
     if order.startswith("view"):
-        viewer.look_at(_VIEW.validate_python(order.removeprefix("view").strip() or None))
+        name = order.removeprefix("view").strip()
+        if name and name not in VIEWS:
+            return UNKNOWN_VIEW
+        viewer.look_at(VIEWS.get(name))
         return ""
     if order.startswith("camera"):
         camera = order.removeprefix("camera").strip() or None

@@ -7,8 +7,8 @@ from fastapi import APIRouter, Body, Depends, Path
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
 
+from deltalight.protocol.documents import NAME_PATTERN
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.message_fields import NAME_PATTERN
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.rooms import Rooms
