@@ -450,7 +450,7 @@ def test_a_method_leaves_no_objects_and_says_what_it_holds(
 @pytest.mark.slow
 def test_speed_is_told_by_frames_and_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.METHODS", ("paper",))
-    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.SIZES", {"small": ((64, 48), 32)})
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.SIZES", {"small": ((72, 54), 32)})
     monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.SPEED_FRAMES", 2)
     step = findings(tmp_path)
     take_step("deltalight.benchmarks.gpu_check.steps:speed", step)

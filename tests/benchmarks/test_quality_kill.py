@@ -18,7 +18,7 @@ if importlib.util.find_spec("mitsuba") is None:
 pytestmark = pytest.mark.slow(seconds=15)
 ROOT = Path(__file__).parents[2]
 SCENE = "natural_light"
-SIZE = ("--size", "64x48", "--spp", "8", "--volume", "32")
+SIZE = ("--size", "72x54", "--spp", "8", "--volume", "32")
 PATIENCE_S = 120.0
 
 

@@ -6,6 +6,7 @@ tests replay; the corpus grows in a folder of its own.
 """
 
 import argparse
+import atexit
 import json
 import os
 import re
@@ -13,8 +14,10 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 from deltalight.protocol.files import write_bytes
@@ -26,8 +29,6 @@ MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 300
 LONGEST_INPUT = 32_768
 DISTILLED_BYTES = 6_000  # of a target
 MOST_CRASHES = 20
-# A new process inherits its parent's peak memory, which libFuzzer would take for its own: a shell between.
-OWN_PEAK = ("sh", "-c", '"$@"; exit "$?"', "sh")
 NO_ATHERIS = "fuzzing needs atheris, which there is for Linux on x86-64 and Python up to 3.13"
 
 
@@ -122,31 +123,37 @@ def _left(plan: Plan, passed_s: float, executions: int) -> str | None:
 
 
 def run_fuzzer(target: str, grown: Path, kept: Path, *options: str) -> tuple[int, str]:
-    """Fuzz with libFuzzer's options until its process ends; return the exit code and what it told.
+    """Fuzz with libFuzzer's options until its process ends; return the exit code (minus a signal) and what it told.
 
     The corpus grows in `grown`, beside which the first inputs lie (`write_seeds`); what fails goes to `kept`.
     """
     folders = [str(each) for each in (grown, _seed_folder(grown), KEPT / target)]
     limits = [f"-rss_limit_mb={MEMORY_MB}", f"-malloc_limit_mb={ALLOCATION_MB}", f"-timeout={HANG_S}"]
-    command = [
-        *OWN_PEAK,
-        sys.executable,
-        "-m",
-        "tests.fuzz.child",
-        target,
-        *options,
-        *limits,
-        f"-max_len={LONGEST_INPUT}",
-    ]
-    artifacts = f"-artifact_prefix={kept}/"
-    done = subprocess.run(
-        [*command, artifacts, "-print_final_stats=1", *folders],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
+    limits += [f"-max_len={LONGEST_INPUT}", f"-artifact_prefix={kept}/", "-print_final_stats=1"]
+    parent = _parent()
+    assert parent.stdin is not None
+    assert parent.stdout is not None
+    with NamedTemporaryFile() as told:
+        parent.stdin.write(json.dumps([target, [*options, *limits, *folders], told.name]) + "\n")
+        parent.stdin.flush()
+        code = parent.stdout.readline()
+        if not code:
+            raise RuntimeError("The process that forks fuzzers has ended; its lines above say why.")
+        return int(code), told.read().decode(errors="replace")
+
+
+@cache
+def _parent() -> subprocess.Popen[str]:
+    """Start the process that forks fuzzers, which ends with this one: its standard input does."""
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "tests.fuzz.child"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-        check=False,
     )
-    return done.returncode, done.stderr.decode(errors="replace")
+    atexit.register(parent.communicate)
+    return parent
 
 
 def told_figure(told: str, name: str) -> int:

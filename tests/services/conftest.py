@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 ROOT = Path(__file__).parents[2]
-WIDTH, HEIGHT = 64, 48
+WIDTH, HEIGHT = 72, 54  # no power of two (CONTRIBUTING.md)
 DATABASES = ("sqlite", "postgres")
 IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
 
@@ -114,7 +114,7 @@ def cli_process(homes: None) -> RunCli:
 
 
 def camera() -> CameraModel:
-    matrix = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    matrix = np.array([[60.0, 0, WIDTH / 2 - 0.5], [0, 60.0, HEIGHT / 2 - 0.5], [0, 0, 1]])
     return CameraModel(WIDTH, HEIGHT, matrix, "plumb_bob", np.zeros(5))
 
 

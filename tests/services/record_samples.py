@@ -35,7 +35,7 @@ from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
 from deltalight.services.stream_queue import StreamQueue
 from tests.protocol.fisheye_samples import coded
 
-WIDTH, HEIGHT = 64, 48
+WIDTH, HEIGHT = 72, 54  # no power of two (CONTRIBUTING.md)
 PATIENCE_S = 60
 STARTED_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 33_333_333

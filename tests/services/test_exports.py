@@ -25,10 +25,10 @@ from deltalight.services.exports.ros_bags import import_bag
 from deltalight.services.exports.scene_glb import write_scene_glb
 from tests.protocol.fisheye_samples import assert_same_frames, linear
 from tests.services.conftest import RunCli
-from tests.services.record_samples import frames, write
+from tests.services.record_samples import HEIGHT, WIDTH, frames, write
 
 MATRIX = np.array([[60.0, 0, 30.0], [0, 61.0, 25.0], [0, 0, 1]])
-LENS = CameraModel(64, 48, MATRIX, "plumb_bob", np.array([-0.1, 0.02, 0.001, 0.002, 0.0]))
+LENS = CameraModel(WIDTH, HEIGHT, MATRIX, "plumb_bob", np.array([-0.1, 0.02, 0.001, 0.002, 0.0]))
 POSE = rigid_matrix(rotation_from_wxyz((0.9, 0.2, -0.3, 0.1)), (0.3, -0.2, 0.5))
 POINT = (POSE @ [0.2, -0.1, 1.5, 1])[:3]  # in front of the camera
 PIXEL = LENS.project(np.array([[0.2, -0.1, 1.5]]))[0]
@@ -43,7 +43,9 @@ def quietly(numbers: range) -> Iterable[int]:
 def recording(tmp_path: Path) -> Path:
     """Two frames, one of them without a pose, before a wall at a known distance."""
     path = tmp_path / "take.mcap"
-    wall = DepthImage(np.full((48, 64), DEPTH_M, np.float32), np.ones((48, 64), bool), LENS, 0.001)
+    wall = DepthImage(
+        np.full((HEIGHT, WIDTH), DEPTH_M, np.float32), np.ones((HEIGHT, WIDTH), bool), LENS, 0.001
+    )
     first, second = (replace(frame, camera=LENS, depth=wall, response=None) for frame in frames(2))
     with RecordingWriter(path) as writer:
         writer.add(replace(first, world_from_camera=POSE))
@@ -63,7 +65,7 @@ def test_colmap_projects_a_point_onto_our_pixel(recording: Path, tmp_path: Path)
     assert (copied.frames, copied.notes[-1]) == (1, "1 frames without a pose were left out.")
     model = tmp_path / "out" / "sparse" / "0"
     _, name, width, height, *numbers = rows(model / "cameras.txt")[0]
-    assert (name, width, height) == ("OPENCV", "64", "48")
+    assert (name, width, height) == ("OPENCV", str(WIDTH), str(HEIGHT))
     fx, fy, cx, cy, k1, k2, p1, p2 = map(float, numbers)
     (image,) = rows(model / "images.txt")
     w, x, y, z, *place = map(float, image[1:8])
@@ -85,7 +87,7 @@ def rows(path: Path) -> list[list[str]]:
 
 def test_colmap_names_the_model_of_each_lens() -> None:
     def named(model: Any, terms: list[float]) -> list[str]:  # noqa: ANN401
-        return camera_line(CameraModel(64, 48, LENS.matrix, model, np.array(terms))).split()[1::3][:1]
+        return camera_line(CameraModel(WIDTH, HEIGHT, LENS.matrix, model, np.array(terms))).split()[1::3][:1]
 
     assert named("plumb_bob", []) == ["PINHOLE"]
     assert named("plumb_bob", [0.1, 0, 0, 0, 0.2]) == ["FULL_OPENCV"]

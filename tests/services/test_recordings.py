@@ -28,7 +28,7 @@ from deltalight.services.recording_copies import (
 from deltalight.services.recording_info import describe_recording
 from tests.protocol.fisheye_samples import assert_same_frames, linear
 from tests.services.conftest import RunCli
-from tests.services.record_samples import BOARD, PERIOD_NS, camera, frames, write
+from tests.services.record_samples import BOARD, HEIGHT, PERIOD_NS, WIDTH, camera, frames, write
 
 SCENE = parse_scene({"name": "kept"})
 CUT_EVERY = 4096
@@ -80,7 +80,7 @@ def test_info_says_what_is_in_a_recording(tmp_path: Path) -> None:
     assert found["duration_s"] == pytest.approx(6 * PERIOD_NS / 1e9)
     assert found["bytes"] == path.stat().st_size
     assert found["streams"]["/color/image"]["messages"] == 6
-    assert found["streams"]["/depth/image"]["bytes"] > 6 * 64 * 48 * 2
+    assert found["streams"]["/depth/image"]["bytes"] > 6 * WIDTH * HEIGHT * 2
     assert found["color"]["camera"] == camera().to_dict()
     assert found["color"]["exposure_s"] == [0.0125, 0.0125]
     assert found["color"]["has_response"]
@@ -249,7 +249,7 @@ def test_a_real_dataset_survives_both_ways(shared_data: Path, tmp_path: Path) ->
 
 
 def test_depth_without_steps_is_rounded_and_told(tmp_path: Path) -> None:
-    depth_m = np.random.default_rng(1).uniform(0.5, 2, (48, 64)).astype(np.float32)
+    depth_m = np.random.default_rng(1).uniform(0.5, 2, (HEIGHT, WIDTH)).astype(np.float32)
     depth = DepthImage(depth_m, depth_m > 0, camera())
     write(tmp_path / "a.mcap", [replace(frames(1)[0], depth=depth)])
     assert "32-bit floats" in CliRunner().invoke(app, ["recordings", "info", str(tmp_path / "a.mcap")]).stdout

@@ -29,27 +29,32 @@ int class_of(ivec2 at, float z, ivec2 size) {
 // Bits whose neighbours within REACH in a row are all set.
 uint narrowed(uint row) { return row & (row << 1) & (row >> 1) & (row << 2) & (row >> 2); }
 
-// Sums over the pixels within SIGHT whose neighbours within REACH are all of their class.
+// The pixels of a row that are in front (x) and behind (y) as those within REACH beside them; bit i is offset
+// i - SIGHT - REACH.
+uvec2 classes_of_row(ivec2 first, float z, ivec2 size) {
+    uvec2 row = uvec2(0u);
+    for (int i = 0; i < SPAN; ++i) {
+        int c = class_of(first + ivec2(i, 0), z, size);
+        row |= uvec2(c == 1, c == 2) << uint(i);
+    }
+    return uvec2(narrowed(row.x), narrowed(row.y));
+}
+
+// Sums over the pixels within SIGHT whose neighbours within REACH are all of their class. The rows within REACH are
+// five variables: an array would make Mesa unroll the loops, which takes seconds to compile.
 void look_around(ivec2 pixel, float z, out Side front, out Side back) {
     ivec2 size = textureSize(real_surface_position, 0);
     vec3 ray = ray_of(pixel);
     front = back = no_side();
-    uvec2 rows[SPAN];
-    for (int j = 0; j < SPAN; ++j) {
-        uvec2 row = uvec2(0u);
-        for (int i = 0; i < SPAN; ++i) {
-            int c = class_of(pixel + ivec2(i, j) - SIGHT - REACH, z, size);
-            row |= uvec2(c == 1, c == 2) << uint(i);
-        }
-        rows[j] = uvec2(narrowed(row.x), narrowed(row.y));
-    }
-    for (int j = REACH; j < SPAN - REACH; ++j) {
-        uvec2 row = rows[j - 2] & rows[j - 1] & rows[j] & rows[j + 1] & rows[j + 2];
+    uvec2 a = uvec2(0u), b = a, c = a, d = a;
+    for (int j = -SIGHT - REACH; j <= SIGHT + REACH; ++j) {
+        uvec2 e = classes_of_row(pixel + ivec2(-SIGHT - REACH, j), z, size), row = a & b & c & d & e;
         for (int i = REACH; i < SPAN - REACH; ++i) {
-            ivec2 offset = ivec2(i, j) - SIGHT - REACH;
+            ivec2 offset = ivec2(i - SIGHT - REACH, j - REACH);
             if (((row.x >> uint(i)) & 1u) != 0u) add(front, pixel, offset, ray);
             if (((row.y >> uint(i)) & 1u) != 0u) add(back, pixel, offset, ray);
         }
+        a = b, b = c, c = d, d = e;
     }
     finish(front);
     finish(back);
