@@ -43,13 +43,8 @@ from deltalight.render_server.methods.method import (
     resolve_joint_maps,
 )
 from deltalight.render_server.methods.volume_placement import Placements, only_one, volume_placements
-from deltalight.render_server.methods.voxel_volumes import (
-    FAR_SIZE,
-    DirectionalVoxels,
-    VoxelSet,
-    joint_voxels,
-    placed_volume,
-)
+from deltalight.render_server.methods.voxel_sets import FAR_SIZE, VoxelSet
+from deltalight.render_server.methods.voxel_volumes import DirectionalVoxels, joint_voxels, placed_volume
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones
 from deltalight.render_server.passes.lights import LightBuffers
