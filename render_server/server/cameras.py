@@ -15,8 +15,8 @@ import structlog
 
 from deltalight.protocol.messages import MAX_CAMERAS, CameraEntry, CameraStatus, Message
 from deltalight.protocol.subscriber import ReceivedMultipart
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, PairingSettings
-from deltalight.render_server.started_frame import CameraFrame
 
 SILENT_NS = 2 * 10**9  # without a frame; or this many of the camera's periods, if they are longer
 SILENT_PERIODS = 5

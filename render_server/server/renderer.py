@@ -11,8 +11,8 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.frame_budget import Level
-from deltalight.render_server.started_frame import CameraFrame
 
 
 class OtherView(Protocol):

@@ -17,7 +17,7 @@ from deltalight.protocol.frames import ViewFrame, linear_color
 from deltalight.protocol.message_fields import Name
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.protocol.scene import SceneDocument, parse_scene
-from deltalight.render_server.started_frame import CameraFrame
+from deltalight.render_server.camera_frames import CameraFrame
 
 CAMERA_VIEW = "camera"
 EXR_NAME = "composite.exr"

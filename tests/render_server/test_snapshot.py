@@ -12,10 +12,10 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.radiance_files import read_linear
 from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
-from deltalight.render_server.started_frame import CameraFrame
 from tests.render_server.scenes import (
     Stage,
     ambient,
