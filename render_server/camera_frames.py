@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.render_server.frame_graph import ShownBuffers
-from deltalight.render_server.live_scene import RelitFrame
 from deltalight.render_server.picking import ShownFrame
 from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts
+from deltalight.render_server.relit_frame import RelitFrame
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import CameraView, PosedFrame
 

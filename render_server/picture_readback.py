@@ -13,11 +13,12 @@ from deltalight.protocol.scene_output import Output
 from deltalight.render_server.camera_frames import FrameSource
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import AsyncReadback
-from deltalight.render_server.live_scene import LiveScene, RelitFrame
+from deltalight.render_server.live_scene import LiveScene
 from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import raster_texels
 from deltalight.render_server.post_effects.bloom import bloomed
 from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
+from deltalight.render_server.relit_frame import RelitFrame
 from deltalight.render_server.view import CameraView
 
 
