@@ -26,7 +26,7 @@ Axis = Float32[np.ndarray, "3"] | tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class LightRecord:
-    """A light as `Light` of shaders/common/lights.glsl holds it, whose kinds `kind` counts."""
+    """A light as `Light` of shaders/common/light_shapes.glsl holds it, whose kinds `kind` counts."""
 
     kind: int
     place: Float32[np.ndarray, "3"]

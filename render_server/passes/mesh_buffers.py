@@ -392,7 +392,7 @@ def _measured_texture(gpu: GpuContext, mesh: GpuMesh) -> moderngl.Texture | None
 
 
 def _transmittances(mesh: GpuMesh) -> Float32[np.ndarray, "k 4"]:
-    """Returns what each material lets through of light in its shadow, and its alpha (common/lights.glsl)."""
+    """Returns what each material lets through of light in its shadow, and its alpha (common/tinted_shadows.glsl)."""
     rows = np.zeros((len(mesh.materials), 4), np.float32)
     for index, material in enumerate(mesh.materials):
         if material.transmits:
