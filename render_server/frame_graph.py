@@ -36,7 +36,7 @@ from deltalight.render_server.passes.gbuffer import GeometryBuffer
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.precomputed import Precomputed
+from deltalight.render_server.precomputation.precomputed import Precomputed
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.view import NOWHERE, CameraView, Rectangle
 

@@ -9,7 +9,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.methods.registry import MethodChoice
-from deltalight.render_server.precomputed import Precomputed
+from deltalight.render_server.precomputation.precomputed import Precomputed
 from deltalight.render_server.view import CameraView
 
 

@@ -31,7 +31,7 @@ from deltalight.render_server.methods.registry import MethodChoice, MethodChoose
 from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.shadow_maps import most_maps_bytes
 from deltalight.render_server.passes.voxels import MEGABYTE
-from deltalight.render_server.precomputed import Precomputed
+from deltalight.render_server.precomputation.precomputed import Precomputed
 from deltalight.render_server.real_geometry import RealGeometry
 from deltalight.render_server.relit_frame import Fade, RelitFrame
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from deltalight.render_server.frame import FrameResources
     from deltalight.render_server.graph import Graph
     from deltalight.render_server.methods.lighting import Layers
-    from deltalight.render_server.occlusion_fields import OcclusionFields
+    from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 
 Settings = TypeVar("Settings", bound=MethodSettings)
 LEAST_VOLUME = 32  # voxels an edge

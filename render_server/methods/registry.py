@@ -27,8 +27,8 @@ from deltalight.render_server.methods.method import (
     Setup,
 )
 from deltalight.render_server.methods.precomputed_transfer import precomputed_radiance
-from deltalight.render_server.occlusion_fields import OcclusionFields
-from deltalight.render_server.precomputed_transfers import ObjectTransfers, require_rigid_transfer
+from deltalight.render_server.precomputation.light_transfers import ObjectTransfers, require_rigid_transfer
+from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 
 BUILT_IN: tuple[RelightingMethod[Any], ...] = (DVCT, DLPV, AROOF, DIFFERENTIAL)
 _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
