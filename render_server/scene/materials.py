@@ -1,7 +1,6 @@
 """Surface materials of virtual and modelled real objects, from scenes and asset files."""
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
@@ -13,12 +12,10 @@ from PIL import Image
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Material as MaterialDocument
-from deltalight.render_server.scene.gaussian_brdf import TABLE_TEXELS, GaussianBrdf
+from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.texture_maps import TextureMap, TextureReader, linear_texture
-from deltalight.render_server.scene.texture_stack import TextureStack
 from deltalight.render_server.scene.textures_by_light import TextureByLight
 
-MATERIAL_FLOATS, COATING_FLOATS = 20, 8
 DARKEST_ATTENUATION = 1e-4  # black has no logarithm
 COAT_F0 = 0.04  # reflectance of a clear coat at normal incidence, of index 1.5
 MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
@@ -242,47 +239,10 @@ class Material:
         Raises:
             GltfFaultError: a texture cannot be used.
         """
-        pbr = description.get("pbrMetallicRoughness", {})
-        extensions = description.get("extensions", {})
-        strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-        specular = extensions.get("KHR_materials_specular", {})
-        transmission = extensions.get("KHR_materials_transmission", {})
-        volume = extensions.get("KHR_materials_volume", {})
-        coat = extensions.get("KHR_materials_clearcoat", {})
-        sheen = extensions.get("KHR_materials_sheen", {})
+        pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
         color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
-        is_double_sided = bool(description.get("doubleSided", False))
-        material = cls(
-            base_color=color[:3],
-            metallic=float(pbr.get("metallicFactor", 1.0)),
-            roughness=float(pbr.get("roughnessFactor", 1.0)),
-            ior=extensions.get("KHR_materials_ior", {}).get("ior"),
-            f0_tint=_f0_tint(specular),
-            emission=np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
-            transmission=float(transmission.get("transmissionFactor", 0.0)),
-            is_thin=not volume.get("thicknessFactor", 0.0),
-            attenuation_color=np.array(volume.get("attenuationColor", [1, 1, 1]), np.float32),
-            attenuation_distance_m=float(volume.get("attenuationDistance", math.inf)),
-            coat=float(coat.get("clearcoatFactor", 0.0)),
-            coat_roughness=float(coat.get("clearcoatRoughnessFactor", 0.0)),
-            sheen=np.array(sheen.get("sheenColorFactor", [0, 0, 0]), np.float32),
-            sheen_roughness=float(sheen.get("sheenRoughnessFactor", 0.0)),
-            double_sided=is_double_sided,
-            hides_back=not is_double_sided,
-            metallic_roughness_map=textures.data(pbr.get("metallicRoughnessTexture")),
-            normal_map=textures.data(description.get("normalTexture"), "scale"),
-            occlusion_map=textures.data(description.get("occlusionTexture"), "strength"),
-            emissive_map=textures.color(description.get("emissiveTexture")),
-            coat_map=textures.data(coat.get("clearcoatTexture")),
-            coat_roughness_map=textures.data(coat.get("clearcoatRoughnessTexture")),
-            coat_normal_map=textures.data(coat.get("clearcoatNormalTexture"), "scale"),
-            sheen_map=textures.color(sheen.get("sheenColorTexture"), with_alpha=True),
-            sheen_roughness_map=textures.color(sheen.get("sheenRoughnessTexture"), with_alpha=True),
-            specular_map=textures.color(specular.get("specularTexture"), with_alpha=True),
-            specular_color_map=textures.color(specular.get("specularColorTexture"), with_alpha=True),
-            transmission_map=textures.data(transmission.get("transmissionTexture")),
-            name=str(description.get("name", "")),
-        )
+        factors, maps = _gltf_factors(description), _gltf_maps(description, textures)
+        material = cls(base_color=color[:3], **factors, **maps)
         mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
         base_map = textures.color(pbr.get("baseColorTexture"), with_alpha=mode != AlphaMode.OPAQUE)
         material = replace(material, base_color_map=base_map)
@@ -397,6 +357,62 @@ class Material:
         )
 
 
+def _gltf_factors(description: dict[str, Any]) -> dict[str, Any]:
+    """Returns a glTF material's fields that are no textures, but for its base colour and alpha."""
+    pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
+    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    transmission = extensions.get("KHR_materials_transmission", {})
+    volume = extensions.get("KHR_materials_volume", {})
+    coat = extensions.get("KHR_materials_clearcoat", {})
+    sheen = extensions.get("KHR_materials_sheen", {})
+    is_double_sided = bool(description.get("doubleSided", False))
+    return {
+        "metallic": float(pbr.get("metallicFactor", 1.0)),
+        "roughness": float(pbr.get("roughnessFactor", 1.0)),
+        "ior": extensions.get("KHR_materials_ior", {}).get("ior"),
+        "f0_tint": _f0_tint(extensions.get("KHR_materials_specular", {})),
+        "emission": np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
+        "transmission": float(transmission.get("transmissionFactor", 0.0)),
+        "is_thin": not volume.get("thicknessFactor", 0.0),
+        "attenuation_color": np.array(volume.get("attenuationColor", [1, 1, 1]), np.float32),
+        "attenuation_distance_m": float(volume.get("attenuationDistance", math.inf)),
+        "coat": float(coat.get("clearcoatFactor", 0.0)),
+        "coat_roughness": float(coat.get("clearcoatRoughnessFactor", 0.0)),
+        "sheen": np.array(sheen.get("sheenColorFactor", [0, 0, 0]), np.float32),
+        "sheen_roughness": float(sheen.get("sheenRoughnessFactor", 0.0)),
+        "double_sided": is_double_sided,
+        "hides_back": not is_double_sided,
+        "name": str(description.get("name", "")),
+    }
+
+
+def _gltf_maps(description: dict[str, Any], textures: TextureReader) -> dict[str, TextureMap | None]:
+    """Returns a glTF material's textures, but for that of its base colour.
+
+    Raises:
+        GltfFaultError: a texture cannot be used.
+    """
+    pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
+    specular = extensions.get("KHR_materials_specular", {})
+    transmission = extensions.get("KHR_materials_transmission", {})
+    coat = extensions.get("KHR_materials_clearcoat", {})
+    sheen = extensions.get("KHR_materials_sheen", {})
+    return {
+        "metallic_roughness_map": textures.data(pbr.get("metallicRoughnessTexture")),
+        "normal_map": textures.data(description.get("normalTexture"), "scale"),
+        "occlusion_map": textures.data(description.get("occlusionTexture"), "strength"),
+        "emissive_map": textures.color(description.get("emissiveTexture")),
+        "coat_map": textures.data(coat.get("clearcoatTexture")),
+        "coat_roughness_map": textures.data(coat.get("clearcoatRoughnessTexture")),
+        "coat_normal_map": textures.data(coat.get("clearcoatNormalTexture"), "scale"),
+        "sheen_map": textures.color(sheen.get("sheenColorTexture"), with_alpha=True),
+        "sheen_roughness_map": textures.color(sheen.get("sheenRoughnessTexture"), with_alpha=True),
+        "specular_map": textures.color(specular.get("specularTexture"), with_alpha=True),
+        "specular_color_map": textures.color(specular.get("specularColorTexture"), with_alpha=True),
+        "transmission_map": textures.data(transmission.get("transmissionTexture")),
+    }
+
+
 def _f0_tint(specular: dict[str, Any]) -> Float32[np.ndarray, "3"]:
     """Returns what KHR_materials_specular makes of the reflectance at normal incidence."""
     color = np.array(specular.get("specularColorFactor", [1, 1, 1]), np.float32)
@@ -418,71 +434,3 @@ def _mean_red(each: TextureMap | None) -> float:
 
 def _first(value: Any, default: float) -> float:  # noqa: ANN401 - as in the file
     return default if value is None else float(np.atleast_1d(value)[0])
-
-
-def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]:
-    """Packs materials for a shader, five vectors each.
-
-    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (1 double sided, -1 not seen from
-    behind, row + 1 of `measured_table`, 0: not measured, a place that the GPU knows, layers of a stack, -1: unlit),
-    (absorption 1/m, index of refraction; 0: thin).
-    """
-    measured = 0
-    table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
-    for row, material in zip(table, materials, strict=True):
-        row[0:4] = *material.base_color, material.metallic
-        row[4:8] = *material.dielectric_f0, material.roughness
-        row[8:12] = *material.emission, material.transmission
-        row[12] = -1.0 if material.hides_back else material.double_sided
-        if material.measured is not None:
-            measured += 1
-            row[13] = measured
-        if isinstance(material.by_light, TextureStack):
-            row[15] = len(material.by_light.layers)
-        elif material.is_unlit:
-            row[15] = -1
-        row[16:20] = *material.absorption_per_m, 0.0 if material.is_thin else material.refraction_index
-    return table
-
-
-def coating_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 8"]:
-    """Packs what lies over the bases, two vectors each: (coat, its roughness, the sheen's, 0), (sheen R G B, 0)."""
-    table = np.zeros((len(materials), COATING_FLOATS), np.float32)
-    for row, material in zip(table, materials, strict=True):
-        row[:3] = material.coat, material.coat_roughness, material.sheen_roughness
-        row[4:7] = material.sheen
-    return table
-
-
-def measured_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 93 4"]:
-    """Returns the rows of the measured ones among the materials (common/measured.glsl)."""
-    rows = [material.measured.table_row() for material in materials if material.measured is not None]
-    return np.array(rows, np.float32).reshape(-1, TABLE_TEXELS, 4)
-
-
-def map_table(
-    materials: Sequence[Material],
-    repeats_per_m: Float32[np.ndarray, " k"],
-    layer_of: Callable[[TextureMap], int],
-    count: int,
-) -> Float32[np.ndarray, "k _"]:
-    """Packs alpha and the first `count` maps for a shader, 1 + 3 `count` vectors each, behind all other rows.
-
-    (alpha mode, alpha, repeats of the base colour's map a metre, `vertex_cutoff` or 0); for each map (row of u,
-    layer or -1), (row of v, set of coordinates), (wraps, across + 3 down; columns and rows of an unfiltered texture,
-    else 0; strength).
-    """
-    table = np.zeros((len(materials), 4 + 12 * count), np.float32)
-    table[:, 7::12] = -1
-    for row, material, repeats in zip(table, materials, repeats_per_m, strict=True):
-        row[:4] = material.alpha_mode, material.alpha, repeats, material.vertex_cutoff or 0.0
-        for place, each in enumerate(material.maps[:count]):
-            if each is not None:
-                row[4 + 12 * place :][:12] = _map_entry(each, layer_of(each))
-    return table
-
-
-def _map_entry(each: TextureMap, layer: int) -> tuple[float, ...]:
-    height, width = each.texels.shape[:2] if each.is_nearest else (0, 0)
-    wraps = float(each.wraps[0] + 3 * each.wraps[1])
-    return (*each.from_uv[0], layer, *each.from_uv[1], each.uv_set, wraps, width, height, each.strength)
