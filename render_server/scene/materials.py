@@ -241,8 +241,7 @@ class Material:
         """
         pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
         color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
-        factors, maps = _gltf_factors(description), _gltf_maps(description, textures)
-        material = cls(base_color=color[:3], **factors, **maps)
+        material = cls._with_gltf_factors(description, color[:3])._with_gltf_maps(description, textures)
         mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
         base_map = textures.color(pbr.get("baseColorTexture"), with_alpha=mode != AlphaMode.OPAQUE)
         material = replace(material, base_color_map=base_map)
@@ -254,6 +253,59 @@ class Material:
         if "KHR_materials_unlit" in extensions:
             return material._unlit()
         return material if material.is_coated else material._without_coating()
+
+    @classmethod
+    def _with_gltf_factors(cls, description: dict[str, Any], base_color: Float32[np.ndarray, "3"]) -> Self:
+        """Makes a material without textures; alpha follows."""
+        pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
+        strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        transmission = extensions.get("KHR_materials_transmission", {})
+        volume = extensions.get("KHR_materials_volume", {})
+        coat = extensions.get("KHR_materials_clearcoat", {})
+        sheen = extensions.get("KHR_materials_sheen", {})
+        is_double_sided = bool(description.get("doubleSided", False))
+        return cls(
+            base_color=base_color,
+            metallic=float(pbr.get("metallicFactor", 1.0)),
+            roughness=float(pbr.get("roughnessFactor", 1.0)),
+            ior=extensions.get("KHR_materials_ior", {}).get("ior"),
+            f0_tint=_f0_tint(extensions.get("KHR_materials_specular", {})),
+            emission=np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
+            transmission=float(transmission.get("transmissionFactor", 0.0)),
+            is_thin=not volume.get("thicknessFactor", 0.0),
+            attenuation_color=np.array(volume.get("attenuationColor", [1, 1, 1]), np.float32),
+            attenuation_distance_m=float(volume.get("attenuationDistance", math.inf)),
+            coat=float(coat.get("clearcoatFactor", 0.0)),
+            coat_roughness=float(coat.get("clearcoatRoughnessFactor", 0.0)),
+            sheen=np.array(sheen.get("sheenColorFactor", [0, 0, 0]), np.float32),
+            sheen_roughness=float(sheen.get("sheenRoughnessFactor", 0.0)),
+            double_sided=is_double_sided,
+            hides_back=not is_double_sided,
+            name=str(description.get("name", "")),
+        )
+
+    def _with_gltf_maps(self, description: dict[str, Any], textures: TextureReader) -> Self:
+        """Returns the material with its textures, but for that of the base colour."""
+        pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
+        specular = extensions.get("KHR_materials_specular", {})
+        transmission = extensions.get("KHR_materials_transmission", {})
+        coat = extensions.get("KHR_materials_clearcoat", {})
+        sheen = extensions.get("KHR_materials_sheen", {})
+        return replace(
+            self,
+            metallic_roughness_map=textures.data(pbr.get("metallicRoughnessTexture")),
+            normal_map=textures.data(description.get("normalTexture"), "scale"),
+            occlusion_map=textures.data(description.get("occlusionTexture"), "strength"),
+            emissive_map=textures.color(description.get("emissiveTexture")),
+            coat_map=textures.data(coat.get("clearcoatTexture")),
+            coat_roughness_map=textures.data(coat.get("clearcoatRoughnessTexture")),
+            coat_normal_map=textures.data(coat.get("clearcoatNormalTexture"), "scale"),
+            sheen_map=textures.color(sheen.get("sheenColorTexture"), with_alpha=True),
+            sheen_roughness_map=textures.color(sheen.get("sheenRoughnessTexture"), with_alpha=True),
+            specular_map=textures.color(specular.get("specularTexture"), with_alpha=True),
+            specular_color_map=textures.color(specular.get("specularColorTexture"), with_alpha=True),
+            transmission_map=textures.data(transmission.get("transmissionTexture")),
+        )
 
     def _masked_by_vertices(self, factor: float, cutoff: float) -> Self:
         """Returns the material with a mask that vertices' alpha multiplies, so that shaders compare; all passes 0."""
@@ -355,62 +407,6 @@ class Material:
             sheen_roughness=min(self.sheen_roughness, 1.0),
             attenuation_color=np.minimum(self.attenuation_color, 1.0),
         )
-
-
-def _gltf_factors(description: dict[str, Any]) -> dict[str, Any]:
-    """Returns a glTF material's fields that are no textures, but for its base colour and alpha."""
-    pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
-    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-    transmission = extensions.get("KHR_materials_transmission", {})
-    volume = extensions.get("KHR_materials_volume", {})
-    coat = extensions.get("KHR_materials_clearcoat", {})
-    sheen = extensions.get("KHR_materials_sheen", {})
-    is_double_sided = bool(description.get("doubleSided", False))
-    return {
-        "metallic": float(pbr.get("metallicFactor", 1.0)),
-        "roughness": float(pbr.get("roughnessFactor", 1.0)),
-        "ior": extensions.get("KHR_materials_ior", {}).get("ior"),
-        "f0_tint": _f0_tint(extensions.get("KHR_materials_specular", {})),
-        "emission": np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
-        "transmission": float(transmission.get("transmissionFactor", 0.0)),
-        "is_thin": not volume.get("thicknessFactor", 0.0),
-        "attenuation_color": np.array(volume.get("attenuationColor", [1, 1, 1]), np.float32),
-        "attenuation_distance_m": float(volume.get("attenuationDistance", math.inf)),
-        "coat": float(coat.get("clearcoatFactor", 0.0)),
-        "coat_roughness": float(coat.get("clearcoatRoughnessFactor", 0.0)),
-        "sheen": np.array(sheen.get("sheenColorFactor", [0, 0, 0]), np.float32),
-        "sheen_roughness": float(sheen.get("sheenRoughnessFactor", 0.0)),
-        "double_sided": is_double_sided,
-        "hides_back": not is_double_sided,
-        "name": str(description.get("name", "")),
-    }
-
-
-def _gltf_maps(description: dict[str, Any], textures: TextureReader) -> dict[str, TextureMap | None]:
-    """Returns a glTF material's textures, but for that of its base colour.
-
-    Raises:
-        GltfFaultError: a texture cannot be used.
-    """
-    pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
-    specular = extensions.get("KHR_materials_specular", {})
-    transmission = extensions.get("KHR_materials_transmission", {})
-    coat = extensions.get("KHR_materials_clearcoat", {})
-    sheen = extensions.get("KHR_materials_sheen", {})
-    return {
-        "metallic_roughness_map": textures.data(pbr.get("metallicRoughnessTexture")),
-        "normal_map": textures.data(description.get("normalTexture"), "scale"),
-        "occlusion_map": textures.data(description.get("occlusionTexture"), "strength"),
-        "emissive_map": textures.color(description.get("emissiveTexture")),
-        "coat_map": textures.data(coat.get("clearcoatTexture")),
-        "coat_roughness_map": textures.data(coat.get("clearcoatRoughnessTexture")),
-        "coat_normal_map": textures.data(coat.get("clearcoatNormalTexture"), "scale"),
-        "sheen_map": textures.color(sheen.get("sheenColorTexture"), with_alpha=True),
-        "sheen_roughness_map": textures.color(sheen.get("sheenRoughnessTexture"), with_alpha=True),
-        "specular_map": textures.color(specular.get("specularTexture"), with_alpha=True),
-        "specular_color_map": textures.color(specular.get("specularColorTexture"), with_alpha=True),
-        "transmission_map": textures.data(transmission.get("transmissionTexture")),
-    }
 
 
 def _f0_tint(specular: dict[str, Any]) -> Float32[np.ndarray, "3"]:

@@ -34,12 +34,7 @@ from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.render_server.frame_budget import HeldLevels
-from deltalight.render_server.gpu.context import (
-    CompileWatcher,
-    GpuContext,
-    count_gl_objects,
-    create_context,
-)
+from deltalight.render_server.gpu.context import CompileWatcher, GpuContext, count_gl_objects, create_context
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter

@@ -33,11 +33,10 @@ from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.gpu.context import is_software_renderer
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.cameras import RoomCameras, Taken
-from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceOrder
-from deltalight.render_server.server.orders import PickOrder, WatchOrder
+from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceRequest
 from deltalight.render_server.server.renderer import Pending, Renderer
-from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
-from deltalight.services.rooms.placer import RoomOrder
+from deltalight.render_server.server.requests import PickRequest, RoomMeshRequest, WatchRequest
+from deltalight.render_server.server.snapshot import SnapshotRequest, take_snapshot
 
 RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
@@ -294,7 +293,7 @@ class RenderSession:
 
     def _watch(self, request: ControlRequest) -> dict[str, object]:
         """Renders frames in these views too from now on, and in those of other senders."""
-        views = validate(WatchOrder, request.payload, "the command watch").views
+        views = validate(WatchRequest, request.payload, "the command watch").views
         self._watchers[request.node] = (self._clock_ns(), views)
         return {"views": list(self.watched)}
 
@@ -310,16 +309,16 @@ class RenderSession:
         return {}
 
     def _pick(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(PickOrder, request.payload, "the command pick")
-        return self._renderer.pick(order.x, order.y, order.ignore, order.camera).as_dict()
+        wanted = validate(PickRequest, request.payload, "the command pick")
+        return self._renderer.pick(wanted.x, wanted.y, wanted.ignore, wanted.camera).as_dict()
 
     def _room(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(RoomOrder, request.payload, "the command room")
+        order = validate(RoomMeshRequest, request.payload, "the command room")
         self._renderer.room().write(order.file)
         return {}
 
     def _snapshot(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(SnapshotOrder, request.payload, "the command snapshot")
+        order = validate(SnapshotRequest, request.payload, "the command snapshot")
         wanted = self._newest[:1] if order.camera is None else self._newest
         frame = next((each.frame for each in wanted if order.camera in (None, each.camera)), None)
         if frame is None:
@@ -335,7 +334,7 @@ class RenderSession:
         }
 
     def _set_source(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(SourceOrder, request.payload, "the command set_source")
+        order = validate(SourceRequest, request.payload, "the command set_source")
         self._finish_started()
         source = self._use_source(order.endpoints)
         if source.is_another:

@@ -1,17 +1,15 @@
-"""Arguments of commands that a render session executes."""
+"""Arguments of control requests that a render session executes."""
 
 from pathlib import Path
 
 from pydantic import ConfigDict, Field
 
 from deltalight.protocol.documents import StrictModel
-from deltalight.protocol.messages import (
-    MAX_OTHERS,
-)
+from deltalight.protocol.messages import MAX_OTHERS
 from deltalight.protocol.scene_fields import ShownView
 
 
-class PickOrder(StrictModel):
+class PickRequest(StrictModel):
     """A pixel of the composite (centres are at integers), and an object to look through.
 
     `camera`: whose picture; None = the first one's.
@@ -25,13 +23,13 @@ class PickOrder(StrictModel):
     camera: str | None = None
 
 
-class WatchOrder(StrictModel):
+class WatchRequest(StrictModel):
     """The views that somebody looks at."""
 
     views: tuple[ShownView, ...] = Field(max_length=MAX_OTHERS + 1)
 
 
-class RoomOrder(StrictModel):
+class RoomMeshRequest(StrictModel):
     """The GLB file to write the real scene to, on the render server's host."""
 
     file: Path
