@@ -1,4 +1,4 @@
-"""What a frame graph tells of its sources and stages, for who reads it."""
+"""Reports on the sources and stages of a frame graph, for people and programs."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
 
 @dataclass(frozen=True)
 class SourceReport:
-    """One source as the frame left it. `changed`: whether it did in this frame."""
+    """A source after a frame; `changed`: in this frame."""
 
     name: str
     clock: Clock
@@ -24,11 +24,16 @@ class SourceReport:
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage as the frame left it.
+    """A stage after a frame.
 
-    `size_bytes` is the GPU memory of what it writes, as far as no other stage or source has it by itself; `time_ms`
-    what it took when it last ran. `is_value`: it only puts values together. `summary` and `file` tell what its
-    function does, and where it stands.
+    Attributes:
+        size_bytes: GPU memory of its outputs, without what counts as another stage's or source's.
+        time_ms: how long its last run took.
+        ran: in this frame.
+        section: part of the frame that it belongs to.
+        is_value: it only combines values.
+        summary: first sentence of its function's docstring.
+        file: where that function is.
     """
 
     name: str
@@ -50,10 +55,10 @@ def summary(function: Callable[..., Any]) -> str:
     return text.split(". ")[0].rstrip(".")
 
 
-def links(circle: "Sequence[Stage]") -> str:
-    """Returns what each stage of a circle reads of the next."""
+def links(cycle: "Sequence[Stage]") -> str:
+    """Returns which resource each stage of a cycle reads from the next one."""
     links = []
-    for stage, writer in zip(circle, [*circle[1:], circle[0]], strict=True):
+    for stage, writer in zip(cycle, [*cycle[1:], cycle[0]], strict=True):
         item = next(item for item in stage.inputs if item.stage is writer)
         links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
     return ", ".join(links)
