@@ -1,12 +1,9 @@
 """Reports on the sources and stages of a frame graph, for people and programs."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
-
-if TYPE_CHECKING:
-    from deltalight.render_server.stages import Stage
+from typing import Any, Final, Literal, get_args
 
 Clock = Literal["scene", "lights", "world", "objects", "view"]
 CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
@@ -53,12 +50,3 @@ def summary(function: Callable[..., Any]) -> str:
     """Returns the first sentence of a function's documentation, without its full stop."""
     text = " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
     return text.split(". ")[0].rstrip(".")
-
-
-def links(cycle: "Sequence[Stage]") -> str:
-    """Returns which resource each stage of a cycle reads from the next one."""
-    links = []
-    for stage, writer in zip(cycle, [*cycle[1:], cycle[0]], strict=True):
-        item = next(item for item in stage.inputs if item.stage is writer)
-        links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
-    return ", ".join(links)

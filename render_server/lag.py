@@ -22,7 +22,7 @@ class Lag:
     _held_before: dict[tuple[object, ...], Sequence[int]] = field(default_factory=dict)
 
     def begin_frame(self) -> None:
-        """Lets the stages wait in this frame if they ran or waited in the last, `turns` - 1 times in a row at most."""
+        """Lets the stages wait if they ran or waited in the last frame, `turns` - 1 times in a row at most."""
         self._waited = self._waited + 1 if self.is_waiting else 0
         self._may_wait = (self.has_run or self.is_waiting) and self._waited < self.turns - 1
         self.has_run = self.is_waiting = False

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from deltalight.protocol.plugins import Plugin
-from deltalight.render_server.graph_report import Clock, links
+from deltalight.render_server.graph_report import Clock
 from deltalight.render_server.lag import Lag
 
 T = TypeVar("T")
@@ -95,11 +95,20 @@ def _place(stage: Stage, order: list[Stage], waiting: list[Stage]) -> None:
     if stage in order:
         return
     if stage in waiting:
-        raise GraphError(f"Stages read each other in a circle: {links(waiting[waiting.index(stage) :])}.")
+        raise GraphError(f"Stages read each other in a circle: {_links(waiting[waiting.index(stage) :])}.")
     for item in stage.inputs:
         if item.stage is not None:
             _place(item.stage, order, [*waiting, stage])
     order.append(stage)
+
+
+def _links(cycle: Sequence[Stage]) -> str:
+    """Returns which resource each stage of a cycle reads from the next one."""
+    links = []
+    for stage, writer in zip(cycle, [*cycle[1:], cycle[0]], strict=True):
+        item = next(item for item in stage.inputs if item.stage is writer)
+        links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
+    return ", ".join(links)
 
 
 def complete_clocks(order: Sequence[Stage]) -> None:

@@ -395,9 +395,10 @@ def shading_stages(
     kept: list[Resource[Any]] = []
     if shading.reuses_light:
         states = _light_states(g, s, lit, volume, shown, marching, beams)
-        reused = scene, grid, states, s.view
         outputs = "reusing scene", "kept light"
-        scene, *kept = g.stages("light reuse", shading.reuse_light, *reused, outputs=outputs)
+        scene, *kept = g.stages(
+            "light reuse", shading.reuse_light, scene, grid, states, s.view, outputs=outputs
+        )
     own_light = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
