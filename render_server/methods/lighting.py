@@ -1,4 +1,4 @@
-"""Stages that methods share: volumes around the objects, and shading of the visible surfaces (docs/method.md 3)."""
+"""Stages that methods share: direct light and shading of the visible surfaces (docs/method.md 3)."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -42,11 +42,11 @@ DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees 
 
 
 def no_voxels(_: object) -> None:
-    """Of a method whose volume holds none."""
+    """Returns None, for methods whose volume holds no voxels."""
 
 
 def no_bindings(_: object) -> dict[str, Binding]:
-    """What cones march through, of a method that marches none."""
+    """Returns no bindings, for methods that march no cones."""
     return {}
 
 
@@ -81,9 +81,14 @@ def mirrors_objects(objects: GeometryState) -> bool:
 class ShadingOptions:
     """Options of the shared shading.
 
-    `mirror_gather` names the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
-    surfaces. `march` are defines of march.glsl, with which smooth objects look up in voxels what the picture does not
-    show.
+    Attributes:
+        tier: the quality.
+        caustics: smooth objects cast beams.
+        screen_space: smooth objects reflect the picture.
+        mirror_gather: suffix of the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
+            surfaces.
+        march: defines of march.glsl, with which smooth objects look up in voxels what the picture does not show;
+            None: they do not.
     """
 
     tier: QualityTier = BEST
@@ -95,10 +100,17 @@ class ShadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers that a method hands to composition; `voxels`, `volume`, `lights` and `error` are for debug views.
+    """The layers that a method hands to composition.
 
-    `direct_mu` and `cones_mu` are the same at real surfaces without the objects, where that takes less. `transmit`
-    declares the stage that adds to the objects' own `radiance` what transparent ones let through.
+    Attributes:
+        direct, cones, grid: light at visible surfaces, and the grid that `cones` are on.
+        change: where light at real surfaces changes, and by which ratio.
+        radiance: the objects', on the picture's grid.
+        reflection: of objects in smooth real surfaces; None if there are none, or `cones` have them.
+        voxels, volume, lights, error: for debug views.
+        direct_mu, cones_mu: light at real surfaces without the objects, where that is cheaper than `direct` and
+            `cones`.
+        transmit: declares the stage that adds light through transparent objects to their `radiance`.
     """
 
     direct: Resource[DirectLight]
@@ -119,7 +131,7 @@ class Layers:
 class Shading:
     """Shades the visible surfaces: cones at reduced resolution, direct light and objects at full resolution.
 
-    The method fills `cones` by its own stages; `marching` holds the bindings that its cones march with.
+    The method's own stages fill `cones`. Arguments `marching` are the bindings that its cones march with.
     """
 
     def __init__(
@@ -197,7 +209,7 @@ class Shading:
     def reuse_light(
         self, scene: Bindings, _grid: LowResGrid, light: LightState, view: CameraView
     ) -> tuple[Bindings, DirectLight]:
-        """Fills in the last frame's light where it serves, and lists where light must be computed."""
+        """Reuses the last frame's light where it is still right, and lists where light must be computed."""
         assert self._history is not None
         is_diffuse = not scene["specular_surfaces"]
         return {**scene, **self._history.run(scene, light if is_diffuse else None, view)}, self._direct
@@ -223,13 +235,13 @@ class Shading:
         voxels: VoxelMipmap | None,
         *_kept: DirectLight,
     ) -> DirectLight:
-        """Computes the direct light on the real surfaces, but for what is kept of the last frame's."""
+        """Computes the direct light on the real surfaces, except where the last frame's is reused."""
         joint = None if voxels is None else voxels.texture
         self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
 
     def light_unchanged(self, scene: Bindings, grid: LowResGrid) -> DirectLight:
-        """Computes the direct light on the real surfaces without the objects, which estimates of light read."""
+        """Computes the direct light on the real surfaces without the objects, for estimates of light."""
         if self._unchanged is None:
             self._unchanged = DirectLight(self._gpu, self.size, objects_shadow=False)
         self._unchanged.run(grid, scene)
@@ -238,7 +250,7 @@ class Shading:
     def reflect_objects(
         self, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
     ) -> moderngl.Texture | None:
-        """Traces the objects in smooth real surfaces; returns None if none is declared, and cones do."""
+        """Traces the objects that smooth real surfaces reflect; returns None if none is declared, or cones do it."""
         wanted = self._options.mirror_gather
         if wanted is None or not scene["specular_surfaces"]:
             if self._rays is not None:
@@ -253,7 +265,7 @@ class Shading:
     def mirror_objects(
         self, objects: GeometryState, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
     ) -> moderngl.Texture | None:
-        """Traces the objects in smooth objects; returns None if none is smooth enough, or cones do."""
+        """Traces the objects that smooth objects reflect; returns None if none is smooth enough, or cones do it."""
         wanted = self._options.mirror_gather
         is_quick = self.tier.reflection_step > 1
         if wanted is None or self._screen is None or is_quick or not mirrors_objects(objects):
@@ -274,7 +286,7 @@ class Shading:
         reflection: moderngl.Texture | None,
         distant: moderngl.Texture | None = None,
     ) -> ChangeRatio:
-        """Finds where light changes, and by which ratio."""
+        """Computes where light changes, and by which ratio."""
         self._change.run(grid, direct, cones, reflection, distant)
         return self._change
 
@@ -353,8 +365,8 @@ class Shading:
                 item.release()
 
 
-class Behind(NamedTuple):
-    """What rays that leave the objects may meet, in the order in which stages take it."""
+class RayInputs(NamedTuple):
+    """Inputs of stages that trace rays from the objects, in the order of their arguments."""
 
     objects: Resource[GeometryState]
     scene: Resource[Bindings]
@@ -378,9 +390,10 @@ def shading_stages(
     light_directly: Callable[..., DirectLight] | None = None,
     find_distant: Callable[..., moderngl.Texture] | None = None,
 ) -> Layers:
-    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects.
+    """Declares grid, cones (by `trace`), caustics, direct light, reflections, change of light, and objects.
 
-    `voxels`: what the `volume` holds, if anything; `marching`: bindings of what rays march through, if they do.
+    `voxels`: those of the `volume`, if the method has any; `marching`: bindings of what rays march through, if they
+    do. `light_directly` replaces that of `shading`. `find_distant` finds the change of light beyond the volumes.
     """
     shown: Resource[Any] = voxels or g.value("voxels", no_voxels, volume)
     marching = marching or g.value("marching", no_bindings, volume)
@@ -409,11 +422,11 @@ def shading_stages(
     if find_distant is not None:
         distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
-    behind = Behind(s.objects, scene, direct, cones, bvh, s.observation, marching)
-    radiance = _surface_stages(g, shading, grid, caustics, behind)
+    rays = RayInputs(s.objects, scene, direct, cones, bvh, s.observation, marching)
+    radiance = _surface_stages(g, shading, grid, caustics, rays)
 
     def transmit(own: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
-        return g.stage("transmitted light", shading.add_transmitted, own, *behind)
+        return g.stage("transmitted light", shading.add_transmitted, own, *rays)
 
     layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
     return replace(layers, direct_mu=own_light, transmit=transmit)
@@ -424,19 +437,19 @@ def _surface_stages(
     shading: Shading,
     grid: Resource[LowResGrid],
     caustics: Resource[Caustics | None],
-    behind: Behind,
+    rays: RayInputs,
 ) -> Resource[moderngl.Texture]:
-    """Declares what smooth objects reflect, and the light that objects send."""
-    objects, scene, _, cones, bvh, _, marching = behind
+    """Declares what smooth objects reflect, and the objects' radiance."""
+    objects, scene, _, cones, bvh, _, marching = rays
     mirrored = g.stage("mirrored objects", shading.mirror_objects, objects, scene, grid, bvh, marching)
-    screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
+    screen = g.stage("screen cones", shading.trace_screen, *rays, mirrored)
     return g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
 
 
 def _light_states(
     g: Graph, s: FrameResources, lit: LitScene, *bounces: Resource[Any]
 ) -> Resource[LightState]:
-    """What light at real surfaces depends on, besides the camera: another value whenever any of it changes."""
+    """Declares what light at real surfaces depends on besides the camera: a new value whenever any of it changes."""
     shared: tuple[Resource[Any], ...] = (s.surfaces, s.lit_area, s.lights, lit.environment)
     unblocked = g.value("unblocked light state", _new_object, *shared, lit.real_maps, *lit.mirrored)
     bounced = g.value("bounced light state", _new_object, *shared, *bounces)
