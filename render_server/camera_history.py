@@ -10,7 +10,7 @@ from deltalight.render_server.frame import Measurement, Scan
 from deltalight.render_server.gpu.kernel import Binding
 from deltalight.render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
 from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
-from deltalight.render_server.scene.threads import begun
+from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.view import PosedFrame
 
 # A voxel's surface cuts the corner where two surfaces meet at a right angle, by up to sqrt(2) / 4 of its edge.
@@ -142,7 +142,7 @@ class CameraHistory:
         depth, fitted = taken.frame.depth if self._has_depth else None, partial(self.surface_of, taken)
         if depth is None:
             return Scan(None, fitted, lambda: None, 0.0, lambda: 1.0, None)
-        median, sigma, tolerance = begun(partial(_median_depth, depth)).result, noise_sigma(depth), None
+        median, sigma, tolerance = submit(partial(_median_depth, depth)).result, noise_sigma(depth), None
         if self.voxel_m is not None:
             sigma = max(sigma, ROUNDED_VOXELS * self.voxel_m / (3 * median() ** 2))
             # The fused surface agrees with depth up to half a voxel, and three standard deviations of its noise.
