@@ -412,24 +412,36 @@ def shading_stages(
         scene, *kept = g.stages(
             "light reuse", shading.reuse_light, scene, grid, states, s.view, outputs=outputs
         )
-    own_light = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
+    direct_mu = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     light = light_directly or shading.light_directly
     direct = g.stage("direct light", light, scene, grid, caustics, shown, *kept)
-    reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
-    distant: list[Resource[moderngl.Texture]] = []
-    if find_distant is not None:
-        distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
-    change = g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
     rays = RayInputs(s.objects, scene, direct, cones, bvh, s.observation, marching)
+    reflection, change = _change_stages(g, shading, grid, rays, find_distant)
     radiance = _surface_stages(g, shading, grid, caustics, rays)
 
     def transmit(own: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
         return g.stage("transmitted light", shading.add_transmitted, own, *rays)
 
     layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
-    return replace(layers, direct_mu=own_light, transmit=transmit)
+    return replace(layers, direct_mu=direct_mu, transmit=transmit)
+
+
+def _change_stages(
+    g: Graph,
+    shading: Shading,
+    grid: Resource[LowResGrid],
+    rays: RayInputs,
+    find_distant: Callable[..., moderngl.Texture] | None,
+) -> tuple[Resource[moderngl.Texture | None], Resource[ChangeRatio]]:
+    """Declares what smooth real surfaces reflect, and the change of light."""
+    _, scene, direct, cones, bvh, _, marching = rays
+    reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
+    distant: list[Resource[moderngl.Texture]] = []
+    if find_distant is not None:
+        distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
+    return reflection, g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
 
 
 def _surface_stages(
