@@ -279,10 +279,10 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
         screen_space=settings.screen_space,
         mirror_gather="gather" if settings.reflections == "rays" else None,
         march=march_defines(settings),
+        is_everywhere=True,
+        texel_m=lights.rho.real_texel_m,
     )
     shading = Shading(g.gpu, size, resolved, lights.rho, direct.pair, options)
-    shading.normal_offset = lights.rho.real_texel_m
-    shading.is_everywhere = True
     cones = SolutionCones(g.gpu, settings, voxels, shading.cones)
     marching = g.value("marching", cones.marching, lit_voxels)
 

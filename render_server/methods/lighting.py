@@ -89,6 +89,9 @@ class ShadingOptions:
             surfaces.
         march: defines of march.glsl, with which smooth objects look up in voxels what the picture does not show;
             None: they do not.
+        is_everywhere: shades all pixels, whether or not objects seem to reach them.
+        texel_m: size of a shadow map's texel at a point (m), by which objects are lifted against self-shadowing;
+            None: that of the objects' maps.
     """
 
     tier: QualityTier = BEST
@@ -96,6 +99,8 @@ class ShadingOptions:
     screen_space: bool = False
     mirror_gather: str | None = None
     march: Mapping[str, int] | None = None
+    is_everywhere: bool = False
+    texel_m: Callable[[Points], float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +170,7 @@ class Shading:
         self._unchanged: DirectLight | None = None
         self._rays: MirrorRays | None = None
         self._object_rays: MirrorRays | None = None
-        self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
-        self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
+        self._texel_m = options.texel_m or lights.virtual_texel_m
 
     def scene(
         self,
@@ -190,7 +194,7 @@ class Shading:
             "normal_offset": self._normal_offset(objects),
             "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
-            "lit_area": (0, 0, *self.size) if self.is_everywhere else area,
+            "lit_area": (0, 0, *self.size) if self._options.is_everywhere else area,
             "has_caustics": has_caustics,
             "beam_alpha": GREATEST_ALPHA if has_caustics else 0.0,
             "hidden_too": objects.materials.transmits
@@ -199,7 +203,7 @@ class Shading:
 
     def _normal_offset(self, objects: GeometryState) -> float:
         low, high = objects.bounds
-        return SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2)
+        return SELF_SHADOW_TEXELS * self._texel_m((low + high) / 2)
 
     def choose_pixels(self, scene: Bindings) -> LowResGrid:
         """Selects the pixel that represents each block of the picture."""
