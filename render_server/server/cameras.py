@@ -74,7 +74,7 @@ class _Place:
         return max(SILENT_NS, SILENT_PERIODS * self.period_ns)
 
     def entry(self) -> CameraEntry:
-        """Returns what receivers of pictures are told of it."""
+        """Returns its entry in the message for receivers of pictures."""
         header = self.newest.color
         return CameraEntry(
             node=self.name,
@@ -312,7 +312,7 @@ def _captured_ns(place: _Place) -> int:
 
 
 def _is_of_the_time_of(place: _Place, newest: _Place) -> bool:
-    """Whether a frame was taken about when the other one was; also where clocks were never compared."""
+    """Whether two frames were taken at about the same time; true too where clocks were never compared."""
     one, two = place.newest.color, newest.newest.color
     if one.clock_bound_ns is None or two.clock_bound_ns is None:
         return True

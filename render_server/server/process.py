@@ -208,7 +208,7 @@ class BuiltAhead(Protocol):
     def take(
         self, settings: ServerSettings, scene: SceneDocument
     ) -> tuple[GpuContext | None, SceneRenderer | None]:
-        """Returns what serves these settings and this scene; None for what has to be made."""
+        """Returns the context and renderer if they fit these settings and this scene, else None."""
 
 
 def _topic(item: Sendable) -> str:

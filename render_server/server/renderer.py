@@ -1,4 +1,4 @@
-"""What a session asks of the renderer: `SceneRenderer` answers it, and so do the stand-ins of tests."""
+"""The interface between session and renderer: `SceneRenderer` implements it, and so do fakes in tests."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
