@@ -1,4 +1,4 @@
-"""The cameras of a room: each node's streams are paired for themselves, their newest frames are rendered together.
+"""The cameras of a room: streams are paired for each node, and the cameras' newest frames are rendered together.
 
 A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: it is
 silent, sees another board than the first one, or its frames are of another time. What one that is silent or late saw
