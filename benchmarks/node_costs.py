@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.table import Table
 
 from deltalight import __version__
+from deltalight.benchmarks.report_output import put_report
 from deltalight.benchmarks.soak.station import write_take
 from deltalight.benchmarks.speed.motions import STANDING
 from deltalight.protocol.documents import StrictModel
-from deltalight.protocol.files import write_bytes
 from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.sensor_node.board_tracker import BoardTracker
 from deltalight.sensor_node.depth import clean_depth, estimate_noise_sigma
@@ -104,13 +104,9 @@ def _measured(source: RecordingReader, frames: Sequence[int], rounds: int) -> di
 def run_node_costs(size: tuple[int, int], rounds: int, *, out: Path | None, as_json: bool) -> None:
     """Measure, write the report to `out` if given, and print it."""
     report = measure_node(size, rounds, lambda text: Console(stderr=True).print(text))
-    text = report.model_dump_json(indent=2)
-    if out is not None:
-        write_bytes(out, text.encode())
-    if as_json:
-        print(text)
-    else:
-        Console().print(_table(report))
+    put_report(
+        report.model_dump_json(indent=2), lambda: Console().print(_table(report)), out=out, as_json=as_json
+    )
 
 
 def _table(report: NodeReport) -> Table:

@@ -15,10 +15,10 @@ from rich.progress import Progress
 from rich.table import Table
 
 from deltalight import __version__
+from deltalight.benchmarks.report_output import put_report
 from deltalight.benchmarks.speed.measure import opened, rendering
 from deltalight.benchmarks.variants import Variant
 from deltalight.protocol.documents import StrictModel
-from deltalight.protocol.files import write_bytes
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.renderer import SceneRenderer
@@ -196,13 +196,9 @@ def run_views(job: ViewsJob, *, out: Path | None, as_json: bool) -> None:
     """Measure, write the report to `out` if given, and print it."""
     with Progress(console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
         report = measure_views(job, progress)
-    text = report.model_dump_json(indent=2)
-    if out is not None:
-        write_bytes(out, text.encode())
-    if as_json:
-        print(text)
-    else:
-        Console().print(_table(report))
+    put_report(
+        report.model_dump_json(indent=2), lambda: Console().print(_table(report)), out=out, as_json=as_json
+    )
 
 
 def _table(report: ViewsReport) -> Table:

@@ -1,4 +1,4 @@
-"""What one camera saw of the real scene: when something last moved, and when the scene was built from it."""
+"""History of one camera's frames: when something last moved, and which frame the real scene was built from."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,14 +10,14 @@ from deltalight.render_server.frame import Measurement, Scan
 from deltalight.render_server.gpu.kernel import Binding
 from deltalight.render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
 from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
-from deltalight.render_server.scene.threads import begun
+from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.view import PosedFrame
 
 # A voxel's surface cuts the corner where two surfaces meet at a right angle, by up to sqrt(2) / 4 of its edge.
 ROUNDED_VOXELS = 0.35
-# A kept world that explains the picture no longer is renewed no more often than this,
+# Least time between two rebuilds of a kept world that no longer explains the picture.
 RENEWAL_NS = 400_000_000
-# one that does once all has been at rest for so long: a camera that only pauses must not wait for it.
+# One that explains it is rebuilt after so long at rest, because a camera that only pauses must not wait for it.
 SETTLING_NS = 1_500_000_000
 # Of a depth image's pixels, every so many give a first estimate of its median, within these shares of them.
 SAMPLE_STEP = 61
@@ -27,11 +27,11 @@ FittedOnGpu = Callable[[DepthImage], dict[str, Binding] | None]
 
 
 class CameraHistory:
-    """Frames of one camera, as far as the real scene depends on them.
+    """Decides from one camera's frames when the real scene must be rebuilt, and from which frame.
 
-    With `keeps_world`, the real scene is built only when it no longer explains what the camera sees (KeptWorld), and
-    once more from the frame in which everything comes to rest. `has_depth`: it is built from depth, not given as a
-    model. `on_gpu` returns what the GPU has fitted to a depth image already (DepthFit); None if it has not.
+    With `keeps_world`, that is only when the scene no longer explains what the camera sees (`KeptWorld`), and once
+    more from the frame in which everything comes to rest. `has_depth`: the scene is built from depth, not given as a
+    model. `on_gpu` returns what the GPU has fitted to a depth image already (`DepthFit`); None if it has not.
     """
 
     def __init__(self, *, keeps_world: bool, has_depth: bool, on_gpu: FittedOnGpu | None = None) -> None:
@@ -50,13 +50,13 @@ class CameraHistory:
         self.voxel_m: float | None = None  # of the surface that depth is fused to; None: nothing is fused
 
     def expect(self, taken: PosedFrame) -> None:
-        """Begins to look at the frame that is taken next, while the camera stands still: else poses tell enough."""
+        """Begins to sample the next frame in the background, unless the camera moves: then poses suffice."""
         self._expected = None if self.moved else FrameSamples(taken.frame)
         if self._expected is not None:
             self._motion.expect(self._expected)
 
     def update(self, taken: PosedFrame, *, is_unknown: bool) -> bool:
-        """Takes a frame; returns whether anything moved in it. `is_unknown`: there is no real scene yet."""
+        """Adds a frame; returns whether anything moved in it. `is_unknown`: there is no real scene yet."""
         expected, self._expected = self._expected, None
         if expected is None or expected.frame is not taken.frame:
             expected = FrameSamples(taken.frame)
@@ -70,9 +70,9 @@ class CameraHistory:
         return self.moved
 
     def is_due(self, *, is_unknown: bool) -> bool:
-        """Returns whether the real scene must be built.
+        """Returns whether the real scene must be rebuilt.
 
-        That is: it is not kept, it explains the frame no longer, or everything came to rest.
+        It must if it is not kept, if it no longer explains the frame, or if everything came to rest.
         """
         if self._kept is None:
             return True
@@ -90,7 +90,7 @@ class CameraHistory:
         return samples.frame.timestamp_ns - last.frame.timestamp_ns >= wait_ns
 
     def _explains(self, kept: KeptWorld, samples: FrameSamples) -> bool:
-        """Returns whether a kept world explains what moves: on a GPU, of the frame before, so that none waits."""
+        """Returns whether a kept world explains what moves; on a GPU, in the frame before, so that nothing waits."""
         return kept.explains(samples) if self._on_gpu is None else kept.explained_before(samples)
 
     def renew(self, taken: PosedFrame) -> PosedFrame:
@@ -101,7 +101,7 @@ class CameraHistory:
         return taken
 
     def set_built(self) -> None:
-        """Notes that the real scene was built from what was seen."""
+        """Records that the real scene was built from the frame `seen`."""
         self._built_from = self.seen
         self._scans.clear()
         self._measurements.clear()
@@ -142,7 +142,7 @@ class CameraHistory:
         depth, fitted = taken.frame.depth if self._has_depth else None, partial(self.surface_of, taken)
         if depth is None:
             return Scan(None, fitted, lambda: None, 0.0, lambda: 1.0, None)
-        median, sigma, tolerance = begun(partial(_median_depth, depth)).result, noise_sigma(depth), None
+        median, sigma, tolerance = submit(partial(_median_depth, depth)).result, noise_sigma(depth), None
         if self.voxel_m is not None:
             sigma = max(sigma, ROUNDED_VOXELS * self.voxel_m / (3 * median() ** 2))
             # The fused surface agrees with depth up to half a voxel, and three standard deviations of its noise.

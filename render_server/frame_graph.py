@@ -36,7 +36,7 @@ from deltalight.render_server.passes.gbuffer import GeometryBuffer
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.precomputed import Precomputed
+from deltalight.render_server.precomputation.precomputed import Precomputed
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.view import NOWHERE, CameraView, Rectangle
 
@@ -83,9 +83,9 @@ class CompositeOptions:
 
 @dataclass(frozen=True, eq=False)
 class FrameInputs:
-    """Everything that one frame is rendered from. Passing the same object again is not a change.
+    """Everything that one frame is rendered from; setting the same objects again changes nothing.
 
-    `measurement`: what `real` was built from; only a graph that keeps the world reads it.
+    `measurement` is what `real` was built from; only a graph that keeps the world reads it.
     """
 
     frame: ViewFrame
@@ -129,7 +129,7 @@ class RelitPicture:
 
 
 class Composition:
-    """Composes the picture, and overwrites it with a debug view on request."""
+    """Composes the picture, or overwrites it with a debug view on request."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._composite = Composite(gpu, size)
@@ -181,10 +181,10 @@ class Composition:
 
 
 class FrameGraph:
-    """The frame graph of one method and picture size: declared once, then run for every frame.
+    """The stages of one camera's frames for one method and picture size: declared once, then run for every frame.
 
-    Of several cameras in one room each has one (`frame_graphs`); they share the `graph`, in which what does not
-    depend on the camera runs once.
+    Each camera in a room has one (`frame_graphs`). They share one `graph`, in which stages that do not depend on the
+    camera run once.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class FrameGraph:
         return self.buffers.key == (view.size, view.raster[1])
 
     def upload(self, frame: ViewFrame) -> None:
-        """Begins a frame by uploading its picture, which is composed anew whatever it shows."""
+        """Begins a frame by uploading its picture."""
         if self is self._all[0]:
             self.graph.begin_frame()
         self.buffers.image.upload(frame)
@@ -276,7 +276,7 @@ class FrameGraph:
         return self._inputs
 
     def kept(self, make: Callable[..., T], *of: Resource[Any], **constants: int) -> T:
-        """Returns what `make` makes of resources, brought up to date, and constants; kept until any changes."""
+        """Returns `make(*values of the resources, **constants)`, computed again only if any of them changed."""
         self._run(*of)
         seen = *(item.version for item in of), constants
         if make not in self._kept or self._kept[make][0] != seen:
@@ -311,8 +311,7 @@ class FrameGraph:
     def evaluate(self, lights: LightSet) -> Fields:
         """Evaluates the light without objects under other lights, at every pixel and not only near the objects.
 
-        Of what is returned, only mu is sure to be that of these lights, which the sources keep until they are set
-        again.
+        Only mu of the result is sure to follow these lights. They stay set until `set_lights` or `set_inputs`.
         """
         cones, layers = self.gather(lights, (0, 0, *self.resources.view.value.size)), self.layers
         direct = layers.direct_mu or layers.direct
@@ -329,7 +328,7 @@ class FrameGraph:
         return cones.value
 
     def advance(self, options: CompositeOptions, until_s: float) -> bool:
-        """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""
+        """Runs stages of the frame until then (time.monotonic()); returns whether all have run."""
         self._options.write(options, eq)
         return self._run(self._composite, until_s=until_s)
 
@@ -340,9 +339,9 @@ class FrameGraph:
         return self._composite.value
 
     def render_view(self, options: CompositeOptions) -> Composite:
-        """Composes the frame once more, with other options; what `render` composed stays as it is.
+        """Composes the frame once more with other options, into textures of its own.
 
-        So the next frame at rest is composed by the kept ratio all the same.
+        What `render` composed stays, so that the next frame at rest can still be composed by the kept ratio.
         """
         image, relit = self.buffers.image, self._relit.value
         if not image.is_linear:
@@ -355,9 +354,9 @@ class FrameGraph:
             return self._views.compose_layers(image, relit.scene, options, relit.layers).composite
 
     def _run(self, *targets: Resource[Any], until_s: float | None = None) -> bool:
-        """Runs the graph with the newest pictures in linear radiance; a scene at rest does without.
+        """Brings the targets up to date; before, linearises the newest pictures unless the scene is at rest.
 
-        The GPU makes the real scene's triangles before, unless the targets do without them.
+        The GPU makes the real scene's triangles first, unless the targets do not need them.
         """
         if not {self.resources.geometry, self.resources.observation}.issuperset(targets):
             self.inputs.real.fill()
@@ -367,13 +366,13 @@ class FrameGraph:
         return self.graph.run(*targets, until_s=until_s)
 
     def _versions(self) -> tuple[int, ...]:
-        """Returns those of all sources except picture and output."""
+        """Returns the versions of all sources except picture and output."""
         s = self.resources
         sources = s.view, s.scan, s.measurement, s.real, s.objects, s.surfaces, s.lights, s.lit_area, s.albedo
         return tuple(item.version for item in sources if item is not None)
 
     def _linearize(self, others: tuple[int, ...]) -> None:
-        """Computes the newest picture's linear radiance, unless versions of the `others` say that all is at rest."""
+        """Computes the newest picture's linear radiance, unless the versions of the `others` show a scene at rest."""
         image = self.buffers.image
         options = self._options.value if self._options.version else None
         is_specular = self.resources.surfaces.value.is_specular
@@ -400,7 +399,7 @@ def frame_graphs(
 ) -> list[FrameGraph]:
     """Returns the frame graph of each camera's view of one room.
 
-    `timers` outlive the graphs and are passed in. `checks` is `Graph`'s.
+    `timers` outlive the graphs, so the caller passes them in. `checks` is as for `Graph`.
     """
     graph = Graph(gpu, timers, checks=checks)
     buffers: list[PictureBuffers] = []

@@ -1,4 +1,4 @@
-"""Memory that nothing uses any more goes back to the kernel: what a method's passes, or many viewers, have left."""
+"""Returns unused memory to the operating system, after a method's passes or many viewers are gone."""
 
 import ctypes
 import gc
@@ -6,10 +6,10 @@ import sys
 
 
 def give_back_freed_memory() -> None:
-    """Have glibc give back all pages that nothing uses, wherever they lie; other C libraries decide themselves.
+    """Has glibc release all unused pages of the heap; other C libraries decide themselves.
 
-    By itself it gives back what is free at the heap's end only. A software renderer's textures lie in the heap, and
-    each change of method left it with other holes: some 100 MB at 96x72 pixels.
+    By itself glibc releases only what is free at the heap's end. A software renderer's textures are in the heap, and
+    each change of method left other holes in it: some 100 MB at 96x72 pixels.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform.startswith("linux") else None
     if trim is not None:
@@ -17,7 +17,7 @@ def give_back_freed_memory() -> None:
 
 
 def give_back_garbage() -> None:
-    """Collects what only refers to itself, as graphs do, and has its memory given back too.
+    """Collects reference cycles, such as graphs, and releases their memory too.
 
     Python's next full collection may be hours away; until then, new arrays and textures would be placed around it.
     """

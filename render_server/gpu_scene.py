@@ -1,4 +1,4 @@
-"""Triangles on the GPU as stages receive them: those of the real scene and of the virtual objects."""
+"""Geometry as stages receive it: triangles of the real scene, and of the virtual objects, in GPU buffers."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,10 +24,13 @@ TURN_CLEARANCE = 1.15
 
 @dataclass(frozen=True, eq=False)
 class ObjectExtent:
-    """Where virtual objects are throughout their animations.
+    """Bounds of virtual objects over all of their animations.
 
-    `points` enclose them (world, m). `upright` holds the least and greatest coordinates as if every object was turned
-    back about its own middle: what is placed by them stands still while objects turn. `parts`: each object alone.
+    Attributes:
+        points: enclose the objects (world, m).
+        upright: least and greatest coordinates, as if each object were turned back about its own middle. What is
+            placed by these stands still while objects turn.
+        parts: the extent of each object alone.
     """
 
     points: Float64[np.ndarray, "n 3"]
@@ -54,9 +57,9 @@ class ObjectExtent:
 
     @property
     def volume_edge(self) -> float:
-        """Edge of a volume around, m: twice the longest edge of `upright` ([P1] 3.2).
+        """Edge of a volume around the objects, m: twice the longest edge of `upright` ([P1] 3.2).
 
-        More only where several objects, turned, would come nearer to its border than one alone can.
+        It is larger only where several objects that turn come nearer to the border than a single one can.
         """
         reach = float(np.abs(self.points - self.upright.mean(axis=0)).max())
         return 2.0 * max(float(np.ptp(self.upright, axis=0).max()), TURN_CLEARANCE * reach)
@@ -79,10 +82,10 @@ class PlacedObject:
 
 @dataclass(frozen=True, eq=False)
 class DrawnMesh:
-    """Triangles in buffers, until others are written there.
+    """A mesh on the GPU, and the same on the CPU; either may be made only when it is needed.
 
-    `filled` are the buffers, or has the GPU fill them. `made` is what was uploaded or, for triangles that the GPU
-    made of depth, makes the same on the CPU.
+    `filled` are its buffers, or a function that has the GPU fill them; they hold it until another mesh is written
+    there. `made` is the mesh that was uploaded, or a function that makes on the CPU what the GPU made of depth.
     """
 
     filled: MeshBuffers | Callable[[], MeshBuffers]
@@ -105,31 +108,41 @@ class DrawnMesh:
 
 
 ChooseBacks = Callable[[DrawnMesh, float], Chosen]
-"""Returns which triangles of a mesh have backs in voxels of an edge (m)."""
+"""Returns which triangles of a mesh get back faces, for voxels of that edge (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class GeometryState:
-    """One set of triangles in the world; another set is another object.
+    """An immutable set of triangles in the world: a new object whenever they change.
 
-    `points` enclose the set.
-    `swept_points` enclose it at all times of its animations: what is fitted around them stands still while it moves.
+    Attributes:
+        drawn: the triangles.
+        points: enclose the set (world, m).
+        materials: what the triangles' material indices refer to.
+        coarse: makes a mesh of fewer triangles, for distant voxels; None: `drawn` serves.
+        objects: the virtual objects that the triangles belong to; none for the real scene.
+        swept_points: enclose the set at all times of its animations, so that what is fitted around them stands still
+            while it moves; None: nothing is animated.
+        extents: of each virtual object.
+        lamps: lights that come with virtual objects (world, camera units).
+        is_open: solid things whose backs no camera saw, so that the mesh lacks them.
+        choose_backs: excludes back faces where another camera sees empty space; None: all are used.
     """
 
     drawn: DrawnMesh
     points: Float64[np.ndarray, "n 3"]
     materials: MaterialTable
-    coarse: Callable[[], DrawnMesh] | None = None  # makes fewer triangles for what lies far; None: all serve
-    objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
-    swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
-    extents: tuple[ObjectExtent, ...] = ()  # of each virtual object
-    lamps: tuple[Light, ...] = ()  # that come with virtual objects; world, camera units
-    is_open: bool = False  # what is solid as cameras see it: backs are not in it
-    choose_backs: ChooseBacks | None = None  # by several cameras, which tell where backs cannot be
+    coarse: Callable[[], DrawnMesh] | None = None
+    objects: tuple[PlacedObject, ...] = ()
+    swept_points: Float64[np.ndarray, "k 3"] | None = None
+    extents: tuple[ObjectExtent, ...] = ()
+    lamps: tuple[Light, ...] = ()
+    is_open: bool = False
+    choose_backs: ChooseBacks | None = None
 
     @property
     def is_measured(self) -> bool:
-        """Whether cameras saw it, so that there are many small triangles, and others with every frame."""
+        """Whether it comes from depth cameras: many small triangles, which change with every frame."""
         return self.coarse is not None
 
     @property
@@ -138,7 +151,7 @@ class GeometryState:
         return self.drawn.buffers
 
     def fill(self) -> None:
-        """Has the GPU make the triangles, once, if it makes them."""
+        """Has the GPU make the triangles if they are made there and are not made yet."""
         assert self.buffers is not None
 
     @property
@@ -153,18 +166,18 @@ class GeometryState:
 
     @cached_property
     def coarse_mesh(self) -> DrawnMesh:
-        """Fewer triangles; made when first asked for."""
+        """The same with fewer triangles; made on first use."""
         return self.drawn if self.coarse is None else self.coarse()
 
     @property
     def coarse_parts(self) -> tuple[VoxelizedMesh, ...]:
-        """Fewer triangles, for what lies far."""
+        """Fewer triangles, for distant voxels."""
         return (VoxelizedMesh(self.coarse_mesh.buffers),)
 
     def solid_parts(self, voxel_edge: float) -> tuple[VoxelizedMesh, ...]:
-        """Returns `parts` for voxels of that edge (m), with coarse backs if cameras saw the fronts alone.
+        """Returns `parts` for voxels of that edge (m), with coarse back faces if cameras saw only the fronts.
 
-        What is thinner than two voxels has none where another camera sees that nothing is there.
+        There is none where another camera sees empty space behind a thing thinner than two voxels.
         """
         if not self.is_open:
             return self.parts
@@ -195,7 +208,7 @@ class GeometryState:
 
     @property
     def extent(self) -> ObjectExtent:
-        """Where the set is throughout its animations, and as its objects turn."""
+        """Bounds of the set over all of its animations."""
         if self.extents:
             return ObjectExtent.around(self.extents)
         return ObjectExtent(self.lasting_points, np.stack(short_axis.bounds(self.lasting_points)))

@@ -37,8 +37,8 @@ _Polled = tuple[Resource[Any], Callable[[], Any], Same]
 class Graph:
     """Stages in the order in which they run, and the resources between them.
 
-    The graph owns what its stages are methods of: it releases them with itself. With `checks`, no kernel may write
-    what belongs to another stage than the running one (slow; for tests).
+    The graph owns the objects whose methods its stages call, and releases them. With `checks`, it is an error if a
+    stage's kernel writes what belongs to another stage (slow; for tests).
     """
 
     def __init__(self, gpu: GpuContext, timers: PassTimers | None = None, *, checks: bool = False) -> None:
@@ -67,7 +67,7 @@ class Graph:
     def source(self, name: str, clock: Clock, *, of_each_view: bool | None = None) -> Resource[Any]:
         """Declares a resource that is set from outside (`Resource.write`).
 
-        `of_each_view`: every view has its own; None: if it follows the clock `view`. The others are of all views.
+        `of_each_view`: each view declares its own, instead of one for all; default: if its clock is `view`.
         """
         own = clock == "view" if of_each_view is None else of_each_view
         if self._view and not own and name in self._resources:
@@ -77,7 +77,7 @@ class Graph:
         return made
 
     def polled(self, name: str, clock: Clock, ask: Callable[[], Any], same: Same) -> Resource[Any]:
-        """Declares a source that is asked for before every run that needs it."""
+        """Declares a source whose value `ask` returns before every run that needs it."""
         resource = self.source(name, clock, of_each_view=True)
         self._polled.append((resource, ask, same))
         return resource
@@ -99,8 +99,9 @@ class Graph:
     def value(
         self, name: str, function: Callable[..., Any], *inputs: Resource[Any] | str, same: Same | None = None
     ) -> Resource[Any]:
-        """Declares a stage that only puts values together: it runs no kernel and is not timed, and pictures of the
-        graph show it with the stage that it serves.
+        """Declares a stage that only combines values.
+
+        It runs no kernel and is not timed, and pictures of the graph show it with the stage that it serves.
         """
         resource = self.stage(name, function, *inputs, same=same)
         assert resource.stage is not None
@@ -108,12 +109,12 @@ class Graph:
         return resource
 
     def section(self, name: str) -> None:
-        """Begins a section of the frame, for who reads the graph: what is declared from here on belongs to it."""
+        """Begins a named section, for readers of the graph: it contains all stages declared from here on."""
         self._sections.append((len(self._stages), name))
 
     @contextmanager
     def of_plugin(self, plugin: Plugin | None) -> Iterator[None]:
-        """What is declared in here is a plugin's, which is named when a stage fails."""
+        """Context whose stages are a plugin's: when one of them fails, the plugin is named."""
         self._plugin = plugin
         try:
             yield
@@ -122,10 +123,11 @@ class Graph:
 
     @contextmanager
     def of_view(self, number: int) -> Iterator[None]:
-        """What is declared in here is of one of several views of one world, counted from 0.
+        """Context whose stages belong to one of several views of one world, counted from 0.
 
-        The same stage (function and inputs) as the first view's is not declared again: it runs once for all views.
-        The others are told apart by the view's number, and names mean those of the view where it has them.
+        A stage with the function and the inputs of one of the first view is not declared again: that one runs once
+        for all views. Other stages and resources carry the view's number in their names, and an input that is given
+        by name is the view's own resource if it has one.
         """
         self._view = number
         try:
@@ -134,7 +136,7 @@ class Graph:
             self._view = 0
 
     def shared(self, name: str, make: Callable[[], T]) -> T:
-        """Returns what `make` made for the first view: what stages are methods of that serve all views."""
+        """Returns the object that `make` made for the first view, so that all views share its stages."""
         if not self._view:
             self._shared[name] = make()
         made: T = self._shared[name]
@@ -142,7 +144,7 @@ class Graph:
 
     @contextmanager
     def lagging(self, turns: int, *behind: Resource[Any]) -> Iterator[None]:
-        """What is declared in here follows changes of `behind` in one of `turns` frames (`Lag`); 1: in each."""
+        """Context whose stages follow changes of `behind` only in one of `turns` frames (`Lag`)."""
         if turns == 1:
             yield
             return
@@ -155,7 +157,7 @@ class Graph:
 
     @property
     def is_lagging(self) -> bool:
-        """Whether a stage waits, so that the next frame may show something else though nothing changes."""
+        """Whether a stage lags, so that the next frame may differ from this one although nothing changes."""
         return any(lag.is_waiting for lag in self._lags)
 
     def stages(
@@ -199,7 +201,7 @@ class Graph:
     def _same_stage(
         self, name: str, function: Callable[..., Any], inputs: Sequence[Resource[Any] | str]
     ) -> Stage | None:
-        """Returns the first view's stage that computes the same as one that another view is about to declare."""
+        """Returns the first view's stage that computes the same; None if this view needs one of its own."""
         if not self._view:
             return None
         named = [
@@ -298,7 +300,7 @@ class Graph:
         return self._resources[name]
 
     def _needed_for(self, targets: Iterable[Resource[Any]]) -> tuple[list[Stage], list[_Polled]]:
-        """Returns the stages that the targets are made by, in order, and the polled sources."""
+        """Returns the stages that make the targets, in order, and the polled sources that they depend on."""
         order = self._sorted()
         needed = needed_for(targets)
         stages = [stage for stage in order if not needed.isdisjoint(stage.outputs)]
@@ -336,7 +338,7 @@ class Graph:
         return results
 
     def _around(self, stage: Stage, dispatches: list[Dispatch]) -> AbstractContextManager[object]:
-        """Returns what times a stage, blames its plugin, and lists its `dispatches` if they are checked."""
+        """Returns a context that times a stage, blames its plugin, and lists its `dispatches` if they are checked."""
         timers = None if stage.name in self._values else self.timers
         timed = nullcontext() if timers is None else timers.measure(stage.name)
         if stage.plugin is None and not self._checks:
@@ -350,7 +352,7 @@ class Graph:
         return around
 
     def _require_declared(self, stage: Stage, results: Sequence[Any], dispatches: Sequence[Dispatch]) -> None:
-        """Refuses that a kernel wrote what another stage made and this one does not hand on."""
+        """Raises if a kernel wrote what another stage made, unless this stage returns it."""
         own = {id(item) for value in results for item in gpu_objects(value)} if dispatches else set()
         written = [
             (run.kernel, name, item)
@@ -372,16 +374,16 @@ class Graph:
                     )
 
     def begin_frame(self) -> None:
-        """Begins a frame: reports tell what ran and changed since, and stages that waited take their turn."""
+        """Begins a frame. Reports describe what ran and changed since then; lagging stages take their turn."""
         for lag in self._lags:
             lag.begin_frame()
         self._first_run = self._runs + 1
         self._begun = {item: item.version for item in self._sources}
 
     def reused_times_ms(self, ran: Container[str]) -> dict[str, float]:
-        """Times of the stages whose values a frame uses again, when they last ran; `ran` names the others.
+        """Returns the last times of stages whose results the frame reuses, ms; `ran` names the stages that ran.
 
-        What no stage reads was made for estimates of light.
+        Stages whose results no stage reads are left out: they serve estimates of light.
         """
         last_ms = {} if self.timers is None else self.timers.last_ms
         read = {item for stage in self._stages for item in stage.inputs}
@@ -445,5 +447,5 @@ class Graph:
 
 
 def _of_view(name: str, view: int) -> str:
-    """Returns the name of a stage or resource of a view; that of the first is plain."""
+    """Returns a stage's or resource's name in a view; in the first view it is the plain name."""
     return f"{name} (view {view + 1})" if view else name

@@ -1,12 +1,9 @@
-"""What a frame graph tells of its sources and stages, for who reads it."""
+"""Reports on the sources and stages of a frame graph, for people and programs."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
-
-if TYPE_CHECKING:
-    from deltalight.render_server.stages import Stage
+from typing import Any, Final, Literal, get_args
 
 Clock = Literal["scene", "lights", "world", "objects", "view"]
 CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
@@ -14,7 +11,7 @@ CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
 
 @dataclass(frozen=True)
 class SourceReport:
-    """One source as the frame left it. `changed`: whether it did in this frame."""
+    """A source after a frame; `changed`: in this frame."""
 
     name: str
     clock: Clock
@@ -24,11 +21,16 @@ class SourceReport:
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage as the frame left it.
+    """A stage after a frame.
 
-    `size_bytes` is the GPU memory of what it writes, as far as no other stage or source has it by itself; `time_ms`
-    what it took when it last ran. `is_value`: it only puts values together. `summary` and `file` tell what its
-    function does, and where it stands.
+    Attributes:
+        size_bytes: GPU memory of its outputs, without what counts as another stage's or source's.
+        time_ms: how long its last run took.
+        ran: in this frame.
+        section: part of the frame that it belongs to.
+        is_value: it only combines values.
+        summary: first sentence of its function's docstring.
+        file: where that function is.
     """
 
     name: str
@@ -48,12 +50,3 @@ def summary(function: Callable[..., Any]) -> str:
     """Returns the first sentence of a function's documentation, without its full stop."""
     text = " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
     return text.split(". ")[0].rstrip(".")
-
-
-def links(circle: "Sequence[Stage]") -> str:
-    """Returns what each stage of a circle reads of the next."""
-    links = []
-    for stage, writer in zip(circle, [*circle[1:], circle[0]], strict=True):
-        item = next(item for item in stage.inputs if item.stage is writer)
-        links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
-    return ", ".join(links)

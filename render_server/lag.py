@@ -1,4 +1,4 @@
-"""Stages of a frame graph that may show what moves as it was some frames before."""
+"""Stages of a frame graph that may lag some frames behind what moves."""
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 @dataclass(eq=False)
 class Lag:
-    """Stages that follow changes of the inputs `behind` in one of `turns` frames, as long as these keep changing.
+    """Lets stages follow changes of the inputs `behind` only in one of `turns` frames, while these keep changing.
 
-    Their first change, a change of any other input, and a frame without change run the stages at once.
+    The stages run at once on the first change, when any other input changes, and in the first frame without a change.
     """
 
     behind: Container[object]
@@ -22,14 +22,14 @@ class Lag:
     _held_before: dict[tuple[object, ...], Sequence[int]] = field(default_factory=dict)
 
     def begin_frame(self) -> None:
-        """Decides whether the stages may wait in this frame: if they ran in the last, or have not waited long."""
+        """Lets the stages wait if they ran or waited in the last frame, `turns` - 1 times in a row at most."""
         self._waited = self._waited + 1 if self.is_waiting else 0
         self._may_wait = (self.has_run or self.is_waiting) and self._waited < self.turns - 1
         self.has_run = self.is_waiting = False
         self._held_before, self._held = self._held, {}
 
     def holds(self, inputs: Sequence[object], seen: Sequence[int] | None, versions: Sequence[int]) -> bool:
-        """Whether a stage waits; its inputs had the versions `seen` when it last ran (None: never). Notes it."""
+        """Decides whether a stage waits; its inputs had the versions `seen` when it last ran (None: never)."""
         if seen is None:
             return False
         changed = (item for item, old, new in zip(inputs, seen, versions, strict=True) if old != new)

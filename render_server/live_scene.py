@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
-from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
-from deltalight.protocol.scene_fields import View
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
@@ -23,84 +21,27 @@ from deltalight.render_server.frame_graph import (
     CompositeOptions,
     FrameGraph,
     FrameInputs,
-    ShownBuffers,
-    frame_graphs,
 )
-from deltalight.render_server.freed_memory import give_back_garbage
+from deltalight.render_server.frame_graph_pool import FrameGraphPool
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.methods.registry import MethodChoice, MethodChooser
-from deltalight.render_server.passes.composite import Composite, Crossfade, Enlarge, Picture
+from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.shadow_maps import most_maps_bytes
 from deltalight.render_server.passes.voxels import MEGABYTE
-from deltalight.render_server.precomputed import Precomputed
+from deltalight.render_server.precomputation.precomputed import Precomputed
 from deltalight.render_server.real_geometry import RealGeometry
+from deltalight.render_server.relit_frame import Fade, RelitFrame
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
-from deltalight.render_server.view import CameraView, PosedFrame, scaled_size
+from deltalight.render_server.view import PosedFrame, scaled_size
 from deltalight.render_server.virtual_objects import VirtualObjects
 
-# Work on a frame at rest, until its picture has the best quality; a stage that was begun is finished.
-REFINE_S = 0.05
+REFINE_S = 0.05  # of work on each frame at rest, until its picture has the best quality
 REST_NS = 300_000_000  # without any change, after which a picture is refined
-FADE_NS = 400_000_000  # in which the refined picture takes the place of the one before
-
-
-@dataclass(frozen=True, eq=False)
-class Fade:
-    """How much (`share`, 0..1) of a refined picture shows, and the frame that it takes the place of."""
-
-    before: "RelitFrame"
-    share: float
-    crossfade: Crossfade
-
-
-@dataclass(frozen=True, eq=False)
-class RelitFrame:
-    """A frame that `graph` can compose, at `level`; `enlarge` brings it to the camera's size.
-
-    `moves`: something in it does. `fade`: its picture is not shown whole yet.
-    """
-
-    frame: ViewFrame
-    graph: FrameGraph
-    options: CompositeOptions
-    level: Level
-    moves: bool
-    enlarge: Enlarge | None
-    fade: Fade | None = None
-
-    def compose(self, *, with_linear: bool) -> Picture:
-        """Renders the picture (its `code`), and its linear radiance if `with_linear`, unless it is enlarged."""
-        options = self.options
-        composite = self.graph.render(
-            CompositeOptions(options.output, options.additive, options.relights_real, with_linear)
-        )
-        if self.enlarge is not None:
-            coverage = self.shown().object_coverage
-            self.enlarge.run(self.frame.color, self.graph.buffers.image, composite, coverage)
-            return self.enlarge
-        if self.fade is None or with_linear:
-            return composite
-        before = self.fade.before.compose(with_linear=False)
-        self.fade.crossfade.run(before.code, composite.code, self.fade.share)
-        return self.fade.crossfade
-
-    def compose_view(self, view: View) -> Composite:
-        """Renders the frame in another view, at the size of its graph."""
-        output = self.options.output.replaced(view=view)
-        with_linear = view == "composite" and output.has_bloom
-        return self.graph.render_view(replace(self.options, output=output, with_linear=with_linear))
-
-    def shown(self) -> ShownBuffers:
-        """Returns the geometry buffers."""
-        return self.graph.shown()
-
-    def radiance(self) -> Float64[np.ndarray, "h w 3"]:
-        """Returns the radiance of the virtual objects, camera units."""
-        return self.graph.radiance()
+FADE_NS = 400_000_000  # in which the refined picture replaces the one before
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +54,16 @@ class _Plan:
 
 
 class LiveScene:
-    """Holds everything that lives longer than a frame. `checks` is `Graph`'s.
+    """Holds everything that outlives a frame: real scene, objects, lights, estimates and frame graphs.
 
-    `is_paced`: frames in which something moves heed the document's budget (FrameBudget), from the `held` level on.
+    Args:
+        gpu: the context to render with.
+        scene: the scene document.
+        notices: receives sentences that a user should read, each once.
+        waits: as for `SceneRenderer`.
+        is_paced: frames in which something moves keep to the document's budget (`FrameBudget`).
+        checks: as for `Graph`.
+        held: quality levels that held the budget before; rendering begins at them.
     """
 
     def __init__(
@@ -131,35 +79,32 @@ class LiveScene:
     ) -> None:
         self._gpu = gpu
         self._is_paced, self._held = is_paced, held
-        self._checks, self._notices = checks, notices
+        self._notices = notices
         self.timers = PassTimers(gpu)
         self._objects = VirtualObjects(gpu)
         self._real: RealGeometry | None = None
         self._surfaces = SurfaceTables()
         self._albedo = AlbedoEstimator(gpu)
-        self._graphs: list[FrameGraph] = []  # of each camera
-        self._best: list[FrameGraph] = []
-        self._spare: list[FrameGraph] = []  # of the picture size before, which a budget may choose again
         self._chooser = MethodChooser(software=gpu.is_software)
-        self._refused: tuple[tuple[MethodChoice, list[tuple[int, int]]], str] | None = None
         self._enlarge: Enlarge | None = None
         self._crossfade: Crossfade | None = None
-        self._refined_ns: int | None = None  # the refined picture has shown since
-        # What the newest picture was made from, camera and room left out, and when that or anything else changed.
+        self._refined_ns: int | None = None  # when the refined picture began to fade in
+        # Objects, lights and document of the newest picture, and when any of them or the real scene changed.
         self._changing: tuple[object, ...] = ()
         self._changed_ns = 0
         self._precomputed = Precomputed(self._notify, waits=waits)
+        self._graphs = FrameGraphPool(gpu, self._precomputed, self.timers, checks=checks)
         self._waits = waits
         self._unobserved = False  # the real scene moved while its lights were provisional
         self._accumulated: tuple[ViewFrame, ...] = ()  # last frames already accumulated
         self._budget = self._new_budget(scene)
         self._plan = self._planned(scene)
-        self._waits = True  # from now on, what is shown already would change twice
+        self._waits = True  # from now on; otherwise a picture that is shown already would change twice
         self.lighting = self._plan.lighting
         self._apply(self._plan)
 
     def _planned(self, scene: SceneDocument, before: LightEstimator | None = None) -> _Plan:
-        """Checks everything that can fail before anything is replaced. `before`: the lights so far, of this room."""
+        """Checks all that can fail before anything is replaced. `before`: lights estimated in this room so far."""
         method = self._chooser.choose(scene.method, scene.shading, self._budget.level.quality)
         if method.remark is not None:
             self._notify(method.remark)
@@ -172,7 +117,7 @@ class LiveScene:
         return _Plan(scene, method, LightEstimator(scene.lights, self._notify, known, waits=self._waits))
 
     def _state_lamps(self, objects: Sequence[SceneObject], method: MethodChoice) -> None:
-        """Says how much memory the shadow maps of the objects' lamps may take."""
+        """Notifies the user how much memory the shadow maps of the objects' lamps may take."""
         lamps = self._objects.lamps_of(objects)
         if lamps:
             maps_mb = math.ceil(most_maps_bytes(lamps, method.resolved.rsm_size) / MEGABYTE)
@@ -200,7 +145,7 @@ class LiveScene:
         return FrameBudget(scene.output.frame_budget_ms if self._is_paced else None, scene.method.quality)
 
     def account(self, relit: RelitFrame, frame_ms: float) -> None:
-        """Takes how long a frame took; the next ones may be rendered at another level."""
+        """Accounts a frame's time; the budget may choose another level for the next ones."""
         if not relit.moves or relit.level != self._budget.level:
             return
         self._budget.add(frame_ms)
@@ -221,23 +166,11 @@ class LiveScene:
             self._albedo.reset(plan.scene.real.unseen_albedo)
             self._surfaces, self._accumulated = SurfaceTables(), ()
         if plan.method != old.method:
-            self._drop_graph()
+            self._graphs.clear()
         if plan.scene.lights != old.scene.lights:
             self.lighting = plan.lighting
             self._accumulated = ()
         self._plan = plan
-
-    def _drop_graph(self) -> None:
-        self._free(self._graphs, self._best, self._spare)
-
-    def _free(self, *graphs: list[FrameGraph]) -> None:
-        """Empties the lists, and frees their graphs: of each room's cameras, the first one owns what they share."""
-        is_any = any(graphs)
-        release_all(*(each for room in graphs for each in room[:1]))
-        for room in graphs:
-            room.clear()
-        if self._gpu.is_software and is_any:
-            give_back_garbage()
 
     def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""
@@ -245,14 +178,14 @@ class LiveScene:
         if self._real is not None:
             self._real.release()
         self._real = None
-        self._drop_graph()
+        self._graphs.clear()
         self.lighting = plan.lighting
         self._apply(plan)
 
     @property
     def graph(self) -> FrameGraph | None:
         """The first camera's graph of the newest frame; None before the first."""
-        return self._graphs[0] if self._graphs else None
+        return self._graphs.newest[0] if self._graphs.newest else None
 
     @property
     def model(self) -> Sequence[TriangleMesh]:
@@ -266,13 +199,11 @@ class LiveScene:
         return None if state is None else state.corners
 
     def relight(self, taken: Sequence[PosedFrame], *, whole: bool = False) -> list[RelitFrame]:
-        """Prepares a frame of each camera in the room for composition; returns none if there is nothing to compose.
+        """Prepares a frame of each camera in the room for composition.
 
-        That is: no object is visible, or there is no light yet. `whole`: at the camera's size, whatever the budget.
-        Boards on objects, and the lights, are those of the first camera.
-
-        Relighting the same frames again, in another view or by another method, adds nothing to averages over
-        frames.
+        Returns none if there is nothing to compose, because no object is visible or no light is known yet. `whole`:
+        at the camera's size, whatever the budget. Boards on objects, and the lights, are those of the first camera.
+        Relighting the same frames again, in another view or by another method, adds nothing to averages over frames.
         """
         if self._plan.method.document.quality != self._budget.level.quality:
             self._apply(self._planned(self._plan.scene))
@@ -286,9 +217,9 @@ class LiveScene:
             return []
         level = self._level(whole=whole)
         sized = [each.at(scaled_size(each.view.size, level.scale)) for each in taken]
-        self._fit_graphs([each.view for each in sized])
+        graphs = self._graphs.fit([each.view for each in sized], self._plan.method)
         with self.timers.measure("upload"):
-            for graph, each in zip(self._graphs, sized, strict=True):
+            for graph, each in zip(graphs, sized, strict=True):
                 graph.upload(each.frame)
         moved = not again and self._real.update(taken)
         if self._real.state is None:
@@ -298,7 +229,7 @@ class LiveScene:
             return []
         declared = self._plan.scene.real.surfaces
         surfaces = self._surfaces.update(declared, taken[0], self._real.material_names, moved=moved)
-        self._set_inputs(self._graphs, self._real, sized, objects, surfaces)
+        self._set_inputs(graphs, self._real, sized, objects, surfaces)
         changed = self._note_change(objects, first, moved=moved)
         self._estimate_lights(self._real, first, moved=moved)
         self._accumulated = frames
@@ -322,12 +253,12 @@ class LiveScene:
                 changed,
                 self._enlarged_to(each.view.size, level.scale),
             )
-            for graph, each in zip(self._graphs, taken, strict=True)
+            for graph, each in zip(self._graphs.newest, taken, strict=True)
         ]
 
     def _estimate_lights(self, real: RealGeometry, frame: ViewFrame, *, moved: bool) -> None:
-        """Estimates light, and the albedo of what may go out of sight, by the first camera's graph."""
-        graph = self._graphs[0]
+        """Estimates light, and the albedo of surfaces that may go out of view, with the first camera's graph."""
+        graph = self._graphs.newest[0]
         graph.set_lights(self.lighting.estimate(graph, moved=moved, is_at_rest=self._is_at_rest(frame)))
         self._unobserved |= moved
         is_due = self._unobserved and not self.lighting.is_provisional
@@ -335,12 +266,11 @@ class LiveScene:
         assert self.lighting.lights is not None
         if is_due and real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
             graph.set_lights(self.lighting.lights)
-            for graphs in (self._graphs, self._best, self._spare):
-                if graphs:
-                    graphs[0].renew_albedo()
+            for each in self._graphs.of_first_camera():
+                each.renew_albedo()
 
     def _note_change(self, objects: GeometryState, frame: ViewFrame, *, moved: bool) -> bool:
-        """Returns whether anything differs from what the newest picture was made from, and notes when it did."""
+        """Returns whether anything changed since the newest picture; remembers when it did."""
         changing = (objects, self.lighting.lights, self._plan)
         changed = moved or not _same_objects(changing, self._changing)
         if changed:
@@ -352,7 +282,7 @@ class LiveScene:
         return self._real.is_settled and frame.timestamp_ns - self._changed_ns >= REST_NS
 
     def _level(self, *, whole: bool) -> Level:
-        """Returns what the next frame is rendered at; views of the inside are never enlarged."""
+        """Returns the level of the next frame; debug views are never enlarged."""
         level = self._budget.level
         whole = whole or self._plan.scene.output.view != "composite"
         return replace(level, scale=1.0) if whole else level
@@ -365,7 +295,7 @@ class LiveScene:
         objects: GeometryState,
         surfaces: SurfaceTable,
     ) -> None:
-        """Sets what graphs of these frames' sizes render them from."""
+        """Sets the inputs of graphs whose sizes are those of the frames."""
         assert real.state is not None
         assert self.lighting.lights is not None
         output = self._plan.scene.output
@@ -395,32 +325,31 @@ class LiveScene:
         objects: GeometryState,
         surfaces: SurfaceTable,
     ) -> list[FrameGraph]:
-        """Works on the frames in the best quality for REFINE_S; returns their graphs once all are ready."""
+        """Refines the frames for REFINE_S; returns their graphs once all have pictures of the best quality."""
         method = self._plan.method.in_best_quality(software=self._gpu.is_software)
-        before, self._best = self._best, []
-        self._best = self._fitting(before, [each.view for each in taken], method)
-        for graph, each in zip(self._best, taken, strict=True):
+        best = self._graphs.fit_best([each.view for each in taken], method)
+        for graph, each in zip(best, taken, strict=True):
             graph.upload(each.frame)
-        self._set_inputs(self._best, real, taken, objects, surfaces)
+        self._set_inputs(best, real, taken, objects, surfaces)
         options, until_s = self._options(self._plan.scene.output), time.monotonic() + REFINE_S
-        return self._best if all(graph.advance(options, until_s) for graph in self._best) else []
+        return best if all(graph.advance(options, until_s) for graph in best) else []
 
     def _fading(self, before: RelitFrame, best: FrameGraph, *, is_whole: bool) -> RelitFrame:
-        """Returns the refined frame, which takes the place of the one before within FADE_NS unless `is_whole`."""
+        """Returns the refined frame, faded in within FADE_NS unless `is_whole`."""
         if self._refined_ns is None:
             self._refined_ns = before.frame.timestamp_ns - FADE_NS * is_whole
-        share = (before.frame.timestamp_ns - self._refined_ns) / FADE_NS
+        fraction = (before.frame.timestamp_ns - self._refined_ns) / FADE_NS
         refined = replace(before, graph=best, level=Level("best"), moves=False, enlarge=None)
-        if is_whole or not 0 <= share < 1 or before.options.output.view != "composite":
+        if is_whole or not 0 <= fraction < 1 or before.options.output.view != "composite":
             return refined
         size = before.frame.color.shape[1::-1]
         if self._crossfade is None or self._crossfade.size != size:
             release_all(self._crossfade)
             self._crossfade = Crossfade(self._gpu, size)
-        return replace(refined, level=before.level, fade=Fade(before, share, self._crossfade))
+        return replace(refined, level=before.level, fade=Fade(before, fraction, self._crossfade))
 
     def _enlarged_to(self, size: tuple[int, int], scale: float) -> Enlarge | None:
-        """Returns what brings pictures of that scale to the size; None if they have it."""
+        """Returns the pass that enlarges pictures of that scale to the size; None if they have it."""
         if scaled_size(size, scale) == size:
             return None
         if self._enlarge is None or self._enlarge.size != size:
@@ -434,38 +363,6 @@ class LiveScene:
             output, method.composition == "additive", method.relights_real, with_linear=False
         )
 
-    def _fit_graphs(self, views: Sequence[CameraView]) -> None:
-        """Provides the graphs for these pictures' sizes; new ones if lens or size changed.
-
-        In software those of another size are kept: a GPU builds what it holds in no time, and its memory is scarcer.
-        """
-        if len(views) != len(self._graphs):
-            self._free(self._spare)
-        elif self._gpu.is_software and not _fit(self._graphs, views):
-            self._graphs, self._spare = self._spare, self._graphs
-        before, self._graphs = self._graphs, []
-        self._graphs = self._fitting(before, views, self._plan.method)
-
-    def _fitting(
-        self, graphs: list[FrameGraph], views: Sequence[CameraView], method: MethodChoice
-    ) -> list[FrameGraph]:
-        """Returns these graphs if they fit, else new ones in their place.
-
-        Raises:
-            DeltalightError: something is larger than this GPU allows; it is not tried again for every frame.
-        """
-        if _fit(graphs, views):
-            return graphs
-        self._free(graphs)
-        wanted = method, [view.size for view in views]
-        if self._refused is not None and self._refused[0] == wanted:
-            raise DeltalightError(self._refused[1])
-        try:
-            return frame_graphs(self._gpu, views, method, self._precomputed, self.timers, checks=self._checks)
-        except DeltalightError as refusal:
-            self._refused = wanted, str(refusal)
-            raise
-
     def describe_lights(self) -> list[dict[str, Any]]:
         """Returns the lights as plain values, registration included."""
         return [] if self.lighting.lights is None else self.lighting.lights.describe()
@@ -476,21 +373,12 @@ class LiveScene:
             self.timers,
             self._objects,
             self._real,
-            *self._graphs[:1],
-            *self._best[:1],
-            *self._spare[:1],
+            self._graphs,
             self._enlarge,
             self._crossfade,
             self._albedo,
             self._precomputed,
         )
-
-
-def _fit(graphs: Sequence[FrameGraph], views: Sequence[CameraView]) -> bool:
-    """Returns whether there is a graph for each view's pictures."""
-    return len(graphs) == len(views) and all(
-        graph.fits(view) for graph, view in zip(graphs, views, strict=True)
-    )
 
 
 def _same_objects(some: Sequence[object], others: Sequence[object]) -> bool:

@@ -20,7 +20,7 @@ from deltalight.render_server.scene.depth_surface import noise_sigma
 from deltalight.render_server.scene.depth_views import PosedSurface
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.seen_depth import Grazing, SeenDepth
-from deltalight.render_server.scene.threads import begun
+from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
 from deltalight.render_server.scene.tsdf_mesh import TsdfScene
 from deltalight.render_server.view import CameraView, PosedFrame
@@ -222,7 +222,7 @@ class RealGeometry:
 
     def _begun_coarse(self, make: Callable[[], GpuMesh]) -> Callable[[], DrawnMesh]:
         """Returns what makes coarse triangles when asked; begun now if the last ones were asked for too."""
-        meanwhile = begun(make) if self._used_coarse else None
+        meanwhile = submit(make) if self._used_coarse else None
         self._used_coarse = False
 
         def coarse() -> DrawnMesh:

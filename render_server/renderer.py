@@ -1,6 +1,7 @@
-"""SceneRenderer: (frame, scene) -> composite. GPU only.
+"""SceneRenderer renders camera frames of a scene document to pictures: the entry to the renderer.
 
-No sockets, no files except the scene's assets.
+It opens no sockets, and no files but the scene's assets. A frame goes through `submit_cameras`: `LiveScene.relight`
+prepares it, and `PictureReadback` composes it and reads its picture back.
 """
 
 import time
@@ -9,7 +10,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
@@ -17,33 +17,25 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
-from deltalight.protocol.scene_fields import ShownView, View
+from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.camera_frames import CameraFrame, CameraState, FrameSource, PassTimes
 from deltalight.render_server.frame_budget import HeldLevels, Level
 from deltalight.render_server.gpu.context import GpuContext, GpuMemoryError
-from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.graph import Graph
-from deltalight.render_server.live_scene import LiveScene, RelitFrame
-from deltalight.render_server.passes.composite import Composite, Picture
+from deltalight.render_server.live_scene import LiveScene
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, raster_texels
-from deltalight.render_server.post_effects.bloom import bloomed
-from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
+from deltalight.render_server.picture_readback import PictureReadback, StartedView
 from deltalight.render_server.room_mesh import RoomMesh, room_mesh
 from deltalight.render_server.scene.depth_mesh import depth_mesh
-from deltalight.render_server.started_frame import (
-    CameraFrame,
-    CameraState,
-    FrameSource,
-    PassTimes,
-    StartedView,
-)
 from deltalight.render_server.view import CameraView, PosedFrame, output_size, resized_frame
 
-MEMORY_RETRY_S = 10.0  # after which a scene is built anew that the GPU had no memory for
+MEMORY_RETRY_S = 10.0  # until a scene is rebuilt that the GPU had no memory for
 
 
 @dataclass(frozen=True, eq=False)
 class OtherView:
-    """A frame in another view, at the composite's size; a pose of None: it is not the camera's picture."""
+    """A frame in another view, at the composite's size. Without a pose it is not the camera's picture."""
 
     view: ShownView
     color: UInt8[np.ndarray, "h w 3"]
@@ -54,11 +46,18 @@ class OtherView:
 class CompositeFrame:
     """The finished picture of one frame.
 
-    `color` is camera-coded, `linear` the same in camera units (before the response). `lights` are plain
-    values. `camera` and `world_from_camera` are those that the picture was rendered with: while nothing
-    moves, the pose stays that of the frame that the real scene was built from. It is None if the frame has
-    none, or if the picture is not the camera's. `reused_pass_times_ms` are those of passes whose results it uses
-    again, when they last ran. `others` is the frame in the other views that were requested.
+    Attributes:
+        color: the picture as the camera codes it.
+        linear: the same in camera units, before the camera's response; None unless it was requested.
+        status: `ok`, or `no_pose` if the frame has none.
+        camera, world_from_camera: what the picture was rendered with. While nothing moves, the pose stays that of the
+            frame that the real scene was built from. It is None if the frame has none, or if the picture is not the
+            camera's.
+        pass_times_ms: times of the passes that ran.
+        reused_pass_times_ms: times of the passes whose results were used again, when they last ran.
+        lights: plain values.
+        level: quality and scale that it was rendered at; None if it is the camera's own picture.
+        others: the frame in the other views that were requested.
     """
 
     frame_id: int
@@ -79,9 +78,9 @@ class CompositeFrame:
 class PictureLayers:
     """What a picture is composed of.
 
-    `coverage` (0..1) is the share of a pixel that virtual objects cover, `radiance` theirs (camera units), not yet
-    times the coverage. `depth_m` is along the optical axis: of the object where it covers half of the pixel or more,
-    else of the real surface; 0 where it is unknown.
+    `coverage` (0..1) is the fraction of a pixel that virtual objects cover; `radiance` (camera units) is theirs, not
+    premultiplied by it. `depth_m`, along the optical axis, is the object's where it covers half of the pixel or more,
+    else the real surface's; 0 where it is unknown.
     """
 
     coverage: Float32[np.ndarray, "h w"]
@@ -91,9 +90,9 @@ class PictureLayers:
 
 @dataclass(frozen=True)
 class PendingComposite:
-    """A frame in flight on the GPU. Frames finish in the order in which they were started.
+    """A frame in flight on the GPU. Frames must be finished in the order in which they were started.
 
-    `immediate`: starting another frame first gains nothing (software renders synchronously).
+    `immediate`: it is ready, so starting another frame first gains nothing (software renders synchronously).
     """
 
     finish: Callable[[], CompositeFrame]
@@ -103,12 +102,21 @@ class PendingComposite:
 class SceneRenderer:
     """Renders frames of one scene on one GPU context.
 
-    `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
-    should read (registration, memory, errors of OpenGL), each once. `waits`: the first picture waits for what a
-    method precomputes of objects (pictures after `set_scene` never do), and for the search for light out of
-    sight. `checks` is `Graph`'s. `with_linear` leaves the document's budget aside; others begin at the `held`
-    level. Where the GPU's memory is full, frames are refused; what the scene holds is made anew from time to
-    time, and with the next scene.
+    Where the GPU's memory is full, frames are refused; every `MEMORY_RETRY_S`, and with the next scene, the renderer
+    builds what the scene needs once more.
+
+    Attributes:
+        scene: the scene document.
+        notices: sentences that a user should read (registration, memory, errors of OpenGL), each once.
+
+    Args:
+        gpu: the context to render with.
+        scene: the first scene document.
+        with_linear: composites carry the linear picture too (for files), and the document's frame budget is ignored.
+        waits: the first picture waits until precomputation of objects and the search for unseen light are finished.
+            Pictures after `set_scene` never wait for precomputation.
+        checks: as for `Graph`.
+        held: quality levels that held the frame budget before; rendering begins at them.
     """
 
     def __init__(
@@ -128,8 +136,8 @@ class SceneRenderer:
             LiveScene, gpu, notices=self.notices, is_paced=not with_linear, checks=checks, held=held
         )
         self._live = self._build(scene, waits=waits)
-        self._full: tuple[GpuMemoryError, float] | None = None  # and when to try again
-        self._readback = AsyncReadback(gpu)
+        self._out_of_memory: tuple[GpuMemoryError, float] | None = None  # and when to try again
+        self._readback = PictureReadback(gpu)
         self._cameras: dict[str, CameraState] = {}
         self._newest: tuple[CameraState, ...] = ()  # the cameras of the newest pictures, in their order
         self.scene = scene
@@ -142,8 +150,8 @@ class SceneRenderer:
         """
         self._live.set_scene(scene)
         self.scene = scene
-        if self._full is not None:
-            self._full = self._full[0], 0.0
+        if self._out_of_memory is not None:
+            self._out_of_memory = self._out_of_memory[0], 0.0
 
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
@@ -207,12 +215,12 @@ class SceneRenderer:
     ) -> list[PendingComposite]:
         """Starts the pictures of frames that cameras in one room took at one moment; otherwise as `submit`.
 
-        The cameras share one real scene and its light, so what one of them sees lights what the others show. Where a
-        camera has lost its pose, its picture stays as it is, and the room holds what it saw before; of one that is
-        left out, it holds nothing. The first camera counts for animations, boards on objects, and estimates of light.
-        Times are those of all pictures together.
+        The cameras share one real scene and its light, so what one of them sees lights what the others show. A camera
+        without a pose shows its picture unchanged, and the real scene keeps what it saw before. A camera that is left
+        out contributes nothing. Animations, boards on objects, and estimates of light follow the first camera. Times
+        are those of all pictures together.
         """
-        self._find_faults()
+        self._check_device()
         started_s = time.perf_counter()
         with_linear = with_linear or self._with_linear
         self._begin(taken)
@@ -229,8 +237,8 @@ class SceneRenderer:
             main, *rest = views
             if accounts and main.composed is not None:
                 self._live.account(main.composed, max(submitted_ms, sum(times.ran.values())))
-            done = self._finished(source, main, rest, times, with_linear=with_linear)
-            self._find_faults()
+            done = self._finished(source, main, rest, times)
+            self._check_device()
             return done
 
         is_immediate = all(each.composed is None for views in started for each in views)
@@ -243,7 +251,7 @@ class SceneRenderer:
         ]
 
     def _begin(self, taken: Sequence[CameraFrame]) -> None:
-        """Provides for these cameras; the others keep their places, and nothing that they saw."""
+        """Makes these cameras the newest. Others keep their artifacts, but what they saw is forgotten."""
         self._newest = tuple(self._cameras.setdefault(each.camera, CameraState()) for each in taken)
         for camera in self._cameras.values():
             if camera not in self._newest:
@@ -253,8 +261,9 @@ class SceneRenderer:
         self, source: FrameSource, others: Sequence[ShownView], *, with_linear: bool
     ) -> list[StartedView]:
         """Starts a frame in the document's view and the others."""
-        main = self._start(source, self.scene.output.view, with_linear=with_linear)
-        return [main, *(self._start_other(source, view) for view in others)]
+        output, readback = self.scene.output, self._readback
+        main = readback.start(source, output, self._live, with_linear=with_linear)
+        return [main, *(readback.start_other(source, view, output, self._live) for view in others)]
 
     def _end_frame(self, sources: Sequence[FrameSource]) -> PassTimes:
         if self.graph is None or all(source.relit is None for source in sources):
@@ -262,8 +271,8 @@ class SceneRenderer:
         ran = dict(self._live.timers.end_frame())
         return PassTimes(ran, self.graph.reused_times_ms(ran))
 
-    def _find_faults(self) -> None:
-        """Finds faults of the device since the last call; builds the scene anew where its memory was full.
+    def _check_device(self) -> None:
+        """Reports errors of OpenGL since the last call; rebuilds the scene after the GPU's memory was full.
 
         Raises:
             GpuResetError: the context is lost.
@@ -273,11 +282,11 @@ class SceneRenderer:
         try:
             self._gpu.check()
         except GpuMemoryError as fault:
-            self._full = fault, time.monotonic() + MEMORY_RETRY_S
+            self._out_of_memory = fault, time.monotonic() + MEMORY_RETRY_S
             for camera in self._cameras.values():
                 camera.forget_picture()
-        if self._full is not None:
-            self._rebuild(*self._full)
+        if self._out_of_memory is not None:
+            self._rebuild(*self._out_of_memory)
         if sum(self._gpu.errors.values()) > known:
             sentence = (
                 f"OpenGL reports {', '.join(self._gpu.errors)}, so pictures may be wrong: please report it."
@@ -290,10 +299,10 @@ class SceneRenderer:
             raise fault
         self._live.release()
         self._live = self._build(self.scene, waits=False)
-        self._full = None
+        self._out_of_memory = None
 
     def _sources(self, frames: Sequence[ViewFrame], *, whole: bool) -> list[FrameSource]:
-        """Relights the frames together; without a pose there is nothing but a camera's picture."""
+        """Relights the frames together. Without a pose, all there is to show is the camera's picture."""
         for camera in self._cameras.values():
             camera.forget_picture()
         for camera, frame in zip(self._newest, frames, strict=True):
@@ -393,74 +402,12 @@ class SceneRenderer:
         depth_m = np.where(coverage >= SHOWN_FRACTION, of_objects, np.maximum(real, 0))
         return PictureLayers(*(values.astype(np.float32) for values in (coverage, radiance, depth_m)))
 
-    def _start(self, source: FrameSource, view: View, *, with_linear: bool) -> StartedView:
-        """Starts the picture of the document's own view, and its linear radiance if `with_linear`."""
-        relit = source.relit
-        if relit is None or (view == "lights" and source.is_lit):
-            return self._start_other(source, view)
-        composite = relit.compose(with_linear=with_linear or self.scene.output.has_bloom)
-        with self._live.timers.measure("readback"):
-            take = self._begin_reading(source, relit, view, composite)
-            if isinstance(composite, Composite) and with_linear:
-                self._readback.push(composite.linear, "f2")
-        return StartedView(view, source.seen_in(view), take, relit)
-
-    def _start_other(self, source: FrameSource, view: ShownView) -> StartedView:
-        """Starts the frame in a view that was asked for beside the document's own."""
-        frame, relit, seen = source.frame, source.relit, source.seen_in(view)
-        if view == "lights" and source.is_lit:
-            lights = self._live.lighting.picture(frame)
-            return StartedView(view, seen, lambda: lights, None)
-        if view == "camera" or relit is None:
-            return StartedView(view, seen, lambda: frame.color, None)
-        composite = relit.compose_view(view)
-        with self._live.timers.measure("readback"):
-            take = self._begin_reading(source, relit, view, composite)
-        return StartedView(view, seen, take, relit)
-
-    def _begin_reading(
-        self, source: FrameSource, relit: RelitFrame, view: ShownView, composite: Picture
-    ) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
-        """Begins to read a picture, and what the camera's artifacts on it need; returns what takes both."""
-        frame, output = source.frame, self.scene.output
-        artifacts = self._artifacts_of(source, relit, view)
-        self._readback.push(composite.code, "u1")
-        linear = None
-        if output.has_bloom and view == "composite" and isinstance(composite, Composite):
-            linear = composite.linear
-            self._readback.push(linear, "f2")
-        if artifacts is None and linear is None:
-            return lambda: self._read(frame)
-        shown, texels = relit.shown(), None
-        self._readback.push(shown.object_coverage, shown.object_coverage.dtype)
-        if artifacts is not None and artifacts.distance_blur is not None:
-            self._readback.push(shown.object_buffer.position, "f4")
-            texels = raster_texels(shown.view)[::-1]
-
-        def take() -> UInt8[np.ndarray, "h w 3"]:
-            color = self._read(frame)
-            radiance = None if linear is None else self._readback.pop()[..., :3].astype(np.float32)
-            coverage = self._readback.pop()[..., 0].astype(np.float32)
-            depth_m = None if texels is None else self._readback.pop()[..., 3][texels]
-            if radiance is not None:
-                color = bloomed(color, radiance, coverage, frame, output.bloom, tone=output.tone)
-            return color if artifacts is None else artifacts.applied(color, coverage, depth_m)
-
-        return take
-
     def _finished(
-        self,
-        source: FrameSource,
-        main: StartedView,
-        rest: Sequence[StartedView],
-        times: PassTimes,
-        *,
-        with_linear: bool,
+        self, source: FrameSource, main: StartedView, rest: Sequence[StartedView], times: PassTimes
     ) -> CompositeFrame:
         """Takes the pictures in the order in which they were started."""
-        frame, color, linear = source.frame, main.take(), None
-        if with_linear and main.composed is not None:
-            linear = self._readback.pop()[..., :3].astype(np.float32)
+        frame, color = source.frame, main.take()
+        linear = None if main.take_linear is None else main.take_linear()
         return CompositeFrame(
             frame.frame_id,
             frame.timestamp_ns,
@@ -475,24 +422,6 @@ class SceneRenderer:
             None if main.composed is None else main.composed.level,
             tuple(OtherView(each.view, each.take(), each.world_from_camera) for each in rest),
         )
-
-    def _read(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
-        """Returns the oldest picture in flight, at the frame's size."""
-        color = cv2.cvtColor(self._readback.pop(), cv2.COLOR_RGBA2RGB)
-        size = frame.camera.width, frame.camera.height
-        return np.asarray(color if color.shape[1::-1] == size else cv2.resize(color, size))
-
-    def _artifacts_of(self, source: FrameSource, relit: RelitFrame, view: ShownView) -> FrameArtifacts | None:
-        """Learns from the camera's frame; returns what it puts on the objects if the scene asks for that."""
-        frame, output = source.frame, self.scene.output
-        if not output.camera_artifacts or view != "composite":
-            return None
-        shown = relit.shown()
-        if shown.object_coverage.size != frame.color.shape[1::-1]:
-            return None
-        low, high = shown.objects.bounds
-        found = source.camera.artifacts.observe(frame, shown.view.world_from_camera, (low + high) / 2)
-        return found.under(output.tone)
 
     def release(self) -> None:
         """Frees all GL objects."""

@@ -37,7 +37,7 @@ class RoomMesh:
     picture: UInt8[np.ndarray, "h w 3"]
 
     def write(self, path: Path) -> None:
-        """Write it as a GLB file, y up.
+        """Writes it as a GLB file, y up.
 
         Raises:
             DeltalightError: the disk refuses.
@@ -52,7 +52,7 @@ class RoomMesh:
         write_bytes(path, scene.export(file_type="glb", tree_postprocessor=_unlit))
 
     def _part(self, name: str, chosen: Bool[np.ndarray, " m"]) -> "trimesh.Trimesh":
-        """Return the chosen triangles with the picture, or grey."""
+        """Returns the chosen triangles with the picture, or grey."""
         import trimesh
         from PIL import Image
         from trimesh.visual import TextureVisuals
@@ -74,7 +74,7 @@ class RoomMesh:
 
 
 def room_mesh(corners: Corners, frame: ViewFrame, view: CameraView) -> RoomMesh:
-    """Lay a frame's picture on triangles of the world.
+    """Lays a frame's picture on triangles of the world.
 
     A triangle is seen if the picture shows its three corners, and no measured surface is before them.
     """
@@ -97,7 +97,7 @@ def room_mesh(corners: Corners, frame: ViewFrame, view: CameraView) -> RoomMesh:
 
 
 def _divided(corners: Corners) -> Corners:
-    """Divide triangles of a model that are large for a room of its size."""
+    """Divides triangles of a model that are large for a room of its size."""
     from trimesh.remesh import subdivide_to_size
 
     longest_m = max(EDGE_M, EDGE_SHARE * float(np.ptp(corners.reshape(-1, 3), axis=0).max()))

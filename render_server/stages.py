@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from deltalight.protocol.plugins import Plugin
-from deltalight.render_server.graph_report import Clock, links
+from deltalight.render_server.graph_report import Clock
 from deltalight.render_server.lag import Lag
 
 T = TypeVar("T")
@@ -18,10 +18,10 @@ class GraphError(RuntimeError):
 
 @dataclass(eq=False)
 class Resource(Generic[T]):
-    """A named texture, buffer or plain value, and a number that counts its changes; 0: never written.
+    """A named texture, buffer or plain value, and its `version`, which counts its changes; 0: never written.
 
-    `clocks` are what makes it change: those of its source, or of everything that its stage reads (known from the
-    graph's first run or report on).
+    `clocks` are what makes it change: its own if it is a source, else those of all that its stage reads (known once
+    the graph has run or reported).
     """
 
     name: str
@@ -52,8 +52,13 @@ class Resource(Generic[T]):
 class Stage:
     """A function of resources.
 
-    `plugin`: whose stage it is; `lag`: what it may wait for; `view`: which of the views declared it; `seen`: versions
-    of its inputs when it last ran, in the graph's run number `ran_in`.
+    Attributes:
+        same: compares an output's old and new value; if it holds, readers do not rerun.
+        plugin: the plugin that declared the stage, if any.
+        lag: decides in which frames it may wait, if any.
+        view: number of the view that declared it.
+        seen: versions of the inputs when it last ran; None: it never ran, or must run again.
+        ran_in: number of the graph's run in which it last ran.
     """
 
     name: str
@@ -90,15 +95,24 @@ def _place(stage: Stage, order: list[Stage], waiting: list[Stage]) -> None:
     if stage in order:
         return
     if stage in waiting:
-        raise GraphError(f"Stages read each other in a circle: {links(waiting[waiting.index(stage) :])}.")
+        raise GraphError(f"Stages read each other in a circle: {_links(waiting[waiting.index(stage) :])}.")
     for item in stage.inputs:
         if item.stage is not None:
             _place(item.stage, order, [*waiting, stage])
     order.append(stage)
 
 
+def _links(cycle: Sequence[Stage]) -> str:
+    """Returns which resource each stage of a cycle reads from the next one."""
+    links = []
+    for stage, writer in zip(cycle, [*cycle[1:], cycle[0]], strict=True):
+        item = next(item for item in stage.inputs if item.stage is writer)
+        links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
+    return ", ".join(links)
+
+
 def complete_clocks(order: Sequence[Stage]) -> None:
-    """Gives what each of the stages, in order, writes the clocks of all that it reads."""
+    """Passes clocks on along the stages, which are in order: outputs follow the clocks of all inputs."""
     for stage in order:
         clocks = frozenset(clock for item in stage.inputs for clock in item.clocks)
         for output in stage.outputs:
@@ -106,7 +120,7 @@ def complete_clocks(order: Sequence[Stage]) -> None:
 
 
 def needed_for(targets: Iterable[Resource[Any]]) -> set[Resource[Any]]:
-    """Returns the targets and all that they are made from."""
+    """Returns the targets and all resources that they depend on."""
     needed: set[Resource[Any]] = set()
     open_ = list(targets)
     while open_:

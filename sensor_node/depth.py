@@ -102,12 +102,7 @@ def clean_depth(
         guide_contrast=settings.guide_contrast,
     )
     filled = _fillable(valid, smoothed, noise, settings)
-    known = valid | filled
-    taken = filled
-    if settings.filter_radius_px:
-        smooth = smoothed.explains(inverse, SMOOTH_CONFIDENCE, settings.edge_sigmas)
-        taken = filled | (smooth & (smoothed.inverse_depth > 0))
-    cleaned = np.asarray(cv2.copyTo(smoothed.inverse_depth, taken.view(np.uint8), inverse))
+    cleaned, known = _replaced(inverse, smoothed, filled, settings), valid | filled
     if settings.edge_reach_px:
         cleaned, known = assign_edges(
             cleaned,
@@ -119,6 +114,20 @@ def clean_depth(
             reach_px=settings.edge_reach_px,
         )
     return DepthImage(_inverse(cleaned, known), known, depth.camera, sigma_m)
+
+
+def _replaced(
+    inverse: Float32[np.ndarray, "h w"],
+    smoothed: SmoothedDepth,
+    filled: Bool[np.ndarray, "h w"],
+    settings: DepthSettings,
+) -> Float32[np.ndarray, "h w"]:
+    """Return inverse depth, smoothed in `filled` holes and where a smooth surface explains what was measured."""
+    taken = filled
+    if settings.filter_radius_px:
+        smooth = smoothed.explains(inverse, SMOOTH_CONFIDENCE, settings.edge_sigmas)
+        taken = filled | (smooth & (smoothed.inverse_depth > 0))
+    return np.asarray(cv2.copyTo(smoothed.inverse_depth, taken.view(np.uint8), inverse))
 
 
 def estimate_noise_sigma(depth: DepthImage) -> float:

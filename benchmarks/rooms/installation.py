@@ -109,11 +109,6 @@ class Installation:
         """Return all that it runs, on its hosts too."""
         return [child for host in {self.process, *self.hosts} for child in children_of(host)]
 
-    def count_of(self, command: str) -> int:
-        """Return how many processes of its own run this command; all of them for an empty one."""
-        children = self.process.children(recursive=True)
-        return sum(not command or command in child.cmdline() for child in children)
-
     def spares(self) -> list[psutil.Process]:
         """Return the render servers that are no room's."""
         running = [room.name for room in self.directory.rooms().rooms if room.endpoints is not None]

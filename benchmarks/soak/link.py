@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
 
+from deltalight.services.coroutines import run_until_first_ends
 from deltalight.services.ports import LOOPBACK
 
 SEGMENT_BYTES = 1448  # of TCP over Ethernet
@@ -116,7 +117,7 @@ class Link:
             with suppress(OSError):  # the node is not there; ZeroMQ connects again
                 from_node, to_node = await self._connect()
                 try:
-                    await _first_of(self._carry(from_node, writer), self._carry(reader, to_node))
+                    await run_until_first_ends(self._carry(from_node, writer), self._carry(reader, to_node))
                 finally:
                     to_node.close()
         finally:
@@ -136,7 +137,7 @@ class Link:
 
     async def _carry(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         waiting: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(WAITING_CHUNKS)
-        await _first_of(self._take(reader, waiting), self._give(waiting, writer))
+        await run_until_first_ends(self._take(reader, waiting), self._give(waiting, writer))
 
     async def _take(self, reader: asyncio.StreamReader, waiting: asyncio.Queue[tuple[float, bytes]]) -> None:
         schedule = Schedule(self._dice)
@@ -151,17 +152,6 @@ class Link:
             await self._uncut.wait()
             writer.write(chunk)
             await writer.drain()
-
-
-async def _first_of(*ways: Coroutine[Any, Any, None]) -> None:
-    """Run coroutines until one of them ends, by a broken connection too; then end the others."""
-    tasks = [asyncio.ensure_future(each) for each in ways]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 class LoopThread:

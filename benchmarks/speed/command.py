@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
+from deltalight.benchmarks.report_output import put_report
 from deltalight.benchmarks.speed.compare import compare_reports, print_comparison
 from deltalight.benchmarks.speed.counts import count_frames, print_counts
 from deltalight.benchmarks.speed.measure import SpeedJob, measure_speed
@@ -51,13 +52,9 @@ def run_counts(job: SpeedJob, *, gpu_paths: bool, out: Path | None, as_json: boo
     """Count, write the report to `out` if given, and print it."""
     with _progress() as progress:
         report = count_frames(job, progress, gpu_paths=gpu_paths)
-    text = report.model_dump_json(indent=2)
-    if out is not None:
-        write_bytes(out, text.encode())
-    if as_json:
-        print(text)
-    else:
-        print_counts(report, Console())
+    put_report(
+        report.model_dump_json(indent=2), lambda: print_counts(report, Console()), out=out, as_json=as_json
+    )
 
 
 def run_sweeps(
@@ -72,13 +69,12 @@ def run_sweeps(
     """Measure the dissertation's sweeps, write them to `out` if given, and print them."""
     with _progress() as progress:
         measured = measure_sweeps(frames, size, device, progress, full=full)
-    text = dumps(as_data(measured), indent=2)
-    if out is not None:
-        write_bytes(out, text.encode())
-    if as_json:
-        print(text)
-    else:
-        print_sweeps(measured, Console())
+    put_report(
+        dumps(as_data(measured), indent=2),
+        lambda: print_sweeps(measured, Console()),
+        out=out,
+        as_json=as_json,
+    )
 
 
 def run_comparison(before: Path, after: Path, *, as_json: bool) -> None:

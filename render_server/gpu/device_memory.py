@@ -30,7 +30,7 @@ class FoundDevice:
 
 
 def find_device(device: int | None = None) -> FoundDevice:
-    """Create a context on an EGL device (None = the driver's first) and ask it; the process has no other context.
+    """Creates a context on an EGL device (None = the driver's first) and asks it; the process has no other context.
 
     Raises:
         DeltalightError: there is no such device, or no OpenGL.
@@ -46,7 +46,7 @@ def find_device(device: int | None = None) -> FoundDevice:
 def device_memory(
     extensions: Collection[str], integers: Integers, *, is_software: bool
 ) -> tuple[int | None, int | None]:
-    """Return all memory and what is free of it, bytes, None where the driver does not tell.
+    """Returns all memory and what is free of it, bytes, None where the driver does not tell.
 
     ATI_meminfo tells what is free alone, which stands for all.
     """
@@ -61,7 +61,7 @@ def device_memory(
 
 
 def host_memory() -> int:
-    """Return the memory of this host, or of the control group (a container's limit) where that is less, bytes."""
+    """Returns the memory of this host, or of the control group (a container's limit) where that is less, bytes."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         return min(memory, int(_CONTROL_GROUP.read_text()))
@@ -70,7 +70,7 @@ def host_memory() -> int:
 
 
 def free_host_memory() -> int:
-    """Return what is free of `host_memory`, bytes; 0 where that is unknown."""
+    """Returns what is free of `host_memory`, bytes; 0 where that is unknown."""
     try:
         lines = dict(line.split(":") for line in _MEMORY.read_text().splitlines())
         free = int(lines["MemAvailable"].split()[0]) * 1024
@@ -83,7 +83,7 @@ def free_host_memory() -> int:
 
 
 def gl_integers() -> Integers:
-    """Return glGetIntegerv of the current context."""
+    """Returns glGetIntegerv of the current context."""
     egl = ctypes.CDLL("libEGL.so.1")
     egl.eglGetProcAddress.restype = ctypes.c_void_p
     address = egl.eglGetProcAddress(b"glGetIntegerv")

@@ -41,16 +41,16 @@ class GlContext(Protocol):
     """A context as moderngl uses one (`glcontext`)."""
 
     def load(self, name: str, /) -> int:
-        """Return the address of a function of OpenGL, 0 if there is none."""
+        """Returns the address of a function of OpenGL, 0 if there is none."""
 
     def release(self) -> None:
-        """Destroy it."""
+        """Destroys it."""
 
     def __enter__(self) -> object:
-        """Make it current."""
+        """Makes it current."""
 
     def __exit__(self, *fault: object) -> object:
-        """Make none current."""
+        """Makes none current."""
 
 
 class ReportingContext:
@@ -75,11 +75,11 @@ class ReportingContext:
         replaced.release()
 
     def load(self, name: str, /) -> int:
-        """Return the address of a function, which is the same for all contexts of a driver; 0 if there is none."""
+        """Returns the address of a function, which is the same for all contexts of a driver; 0 if there is none."""
         return self._replaced.load(name)
 
     def release(self) -> None:
-        """Destroy the context."""
+        """Destroys the context."""
         self._egl.eglDestroyContext(self._display, self._context)
 
     def __enter__(self) -> None:
@@ -90,7 +90,7 @@ class ReportingContext:
 
 
 def _config_of(egl: ctypes.CDLL, display: c_void_p, context: c_void_p) -> c_void_p:
-    """Return the configuration that a context was made with."""
+    """Returns the configuration that a context was made with."""
     number, found, config = c_int(), c_int(), c_void_p()
     egl.eglQueryContext(display, context, EGL_CONFIG_ID, byref(number))
     wanted = (c_int * 3)(EGL_CONFIG_ID, number.value, EGL_NONE)
@@ -99,7 +99,7 @@ def _config_of(egl: ctypes.CDLL, display: c_void_p, context: c_void_p) -> c_void
 
 
 def reporting(context: GlContext) -> GlContext:
-    """Return a context that reports resets in place of the current one, or that if the driver makes none."""
+    """Returns a context that reports resets in place of the current one, or that if the driver makes none."""
     try:
         return ReportingContext(context)
     except OSError:
@@ -107,7 +107,7 @@ def reporting(context: GlContext) -> GlContext:
 
 
 def reset_status(ctx: moderngl.Context, load: Callable[[str], int]) -> Callable[[], int]:
-    """Return what asks the driver whether the context was lost (not 0): a call of some 0.2 us, without waiting."""
+    """Returns what asks the driver whether the context was lost (not 0): a call of some 0.2 us, without waiting."""
     core = ctx.version_code >= 450 or "GL_KHR_robustness" in ctx.extensions
     if not core and "GL_ARB_robustness" not in ctx.extensions:
         return lambda: 0
@@ -117,7 +117,7 @@ def reset_status(ctx: moderngl.Context, load: Callable[[str], int]) -> Callable[
 
 
 def check_reset(status: int) -> None:
-    """Refuse to go on with a lost context.
+    """Refuses to go on with a lost context.
 
     Raises:
         GpuResetError: `status` (of glGetGraphicsResetStatus) tells of a reset.

@@ -116,8 +116,8 @@ def declarations(source: str) -> Declarations:
     """
     whole = _declaring(without_comments(source))
     names = {name for _, _, _, name in _variables(whole)} | {name for _, _, name in _BLOCK.findall(whole)}
-    kept, macros = live(source)
-    text = _expanded(_declaring(kept), macros)
+    kept, macros = preprocessed(source)
+    text = expand_macros(_declaring(kept), macros)
     switches = tuple(dict.fromkeys(_SWITCH.findall(kept)))
     names |= set(switches)
     formats: dict[str, frozenset[str]] = {}
@@ -138,8 +138,11 @@ def without_comments(source: str) -> str:
 
 
 @lru_cache(maxsize=512)
-def live(source: str) -> tuple[str, Mapping[str, str]]:
-    """Returns what conditions leave of a shader's text, without comments, and its macros without parameters."""
+def preprocessed(source: str) -> tuple[str, Mapping[str, str]]:
+    """Returns what `#ifdef` and `#ifndef` leave of a shader's text, without comments, and macros without parameters.
+
+    Conditions of `#if` and `#elif` are not evaluated: the text below them stays.
+    """
     return _kept(without_comments(source))
 
 
@@ -154,7 +157,7 @@ def _local_size(text: str) -> tuple[int, int, int]:
 
 
 def _declaring(text: str) -> str:
-    """Returns the statements that may declare a uniform, a block or a size: few of a shader's, which saves time."""
+    """Returns the statements that may declare a uniform, a block or a size; parsing only these saves time."""
     return ";".join([part for part in text.split(";") if _DECLARES.search(part)]) + ";"
 
 
@@ -163,14 +166,6 @@ def _variables(text: str) -> Iterator[tuple[str, str, str, str]]:
     for layout, access, kind, declared in _VARIABLE.findall(text):
         for part in declared.split(","):
             yield layout, access, kind, part.split("[")[0].strip()
-
-
-def preprocessed(text: str) -> str:
-    """What `#ifdef` and `#ifndef` leave of a text without comments, macros without parameters expanded.
-
-    Conditions of `#if` and `#elif` are not computed: what hangs on them stays.
-    """
-    return _expanded(*_kept(text))
 
 
 def _kept(text: str) -> tuple[str, dict[str, str]]:
@@ -184,14 +179,14 @@ def _kept(text: str) -> tuple[str, dict[str, str]]:
         at = directive.end()
         kind, name, value = directive.groups()
         if kind != "define":
-            _follow(kind, name in macros, branches)
+            _update_branches(kind, name in macros, branches)
         elif False not in branches:
             macros[name] = value or ""
     return "".join([*kept, text[at:]]), macros
 
 
-def _follow(kind: str, is_defined: bool, branches: list[bool | None]) -> None:
-    """Opens, turns or closes a branch."""
+def _update_branches(kind: str, is_defined: bool, branches: list[bool | None]) -> None:
+    """Enters, switches or leaves a branch of conditions."""
     if kind in ("ifdef", "ifndef"):
         branches.append(is_defined == (kind == "ifdef"))
     elif kind == "if":
@@ -204,6 +199,6 @@ def _follow(kind: str, is_defined: bool, branches: list[bool | None]) -> None:
         branches.pop()
 
 
-def _expanded(text: str, macros: Mapping[str, str]) -> str:
+def expand_macros(text: str, macros: Mapping[str, str]) -> str:
     """Returns a text with macros in place of their names."""
     return _WORD.sub(lambda word: macros.get(word[0], word[0]), text) if macros else text

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
-from deltalight.render_server.gpu.shader_source import live, without_comments
+from deltalight.render_server.gpu.shader_source import preprocessed, without_comments
 
 _PRAGMA = re.compile(r"#pragma texels (\w+) (.+)")
 _IMAGES = re.compile(r"image(?:2D|3D|2DArray) \w")
@@ -175,7 +175,7 @@ class _Array:
 
 def _arrays(source: str) -> Iterator[_Array]:
     """Arrays of read-only storage buffers whose elements are vectors of one kind."""
-    kept, macros = live(source)
+    kept, macros = preprocessed(source)
     structs = dict(_STRUCT.findall(kept))
     for access, block, before, element, name in _BLOCK.findall(kept):
         header = [words.split() for words in before.split(";") if words.strip()]

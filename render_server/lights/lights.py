@@ -26,7 +26,7 @@ Axis = Float32[np.ndarray, "3"] | tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class LightRecord:
-    """A light as `Light` of shaders/common/lights.glsl holds it, whose kinds `kind` counts."""
+    """A light as `Light` of shaders/common/light_shapes.glsl holds it, whose kinds `kind` counts."""
 
     kind: int
     place: Float32[np.ndarray, "3"]
@@ -44,19 +44,19 @@ class LightModel(ABC):
     @classmethod
     @abstractmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        """Builds the light from the keys of its scene document, or from what `describe` made of it."""
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
 
     @abstractmethod
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> Self:
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
 
     @abstractmethod
     def record(self) -> LightRecord:
-        """Return the light as shaders read it."""
+        """Returns the light as shaders read it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class DirectionalLight(LightModel):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        """Builds the light from the keys of its scene document, or from what `describe` made of it."""
         radius = float(np.radians(values["angular_radius_deg"]))
         return cls(_vector(values["direction"]), _strength(values, "irradiance"), radius)
 
@@ -88,7 +88,7 @@ class DirectionalLight(LightModel):
         return replace(self, irradiance=self.irradiance * factor)
 
     def record(self) -> LightRecord:
-        """Return the light as shaders read it."""
+        """Returns the light as shaders read it."""
         return LightRecord(0, self.direction, self.irradiance, (math.tan(self.angular_radius_rad), 1.0, 0.0))
 
 
@@ -112,7 +112,7 @@ class Lamp(LightModel):
     def arriving(
         self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
     ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
-        """Return the irradiance on a surface that faces the lamp, and its angular radius.
+        """Returns the irradiance on a surface that faces the lamp, and its angular radius.
 
         `to_light` are the unit directions towards it, `distance` is in metres.
         """
@@ -121,7 +121,7 @@ class Lamp(LightModel):
     def image(
         self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
     ) -> Self:
-        """Return the mirror image at `position`: directions go through `reflection`, extents grow by the blur."""
+        """Returns the mirror image at `position`: directions go through `reflection`, extents grow by the blur."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class SphereLight(Lamp):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        """Builds the light from the keys of its scene document, or from what `describe` made of it."""
         return cls(_vector(values["position_m"]), _strength(values, "intensity"), float(values["radius_m"]))
 
     def describe(self) -> dict[str, Any]:
@@ -151,20 +151,20 @@ class SphereLight(Lamp):
         return replace(self, intensity=self.intensity * factor)
 
     def record(self) -> LightRecord:
-        """Return the light as shaders read it."""
+        """Returns the light as shaders read it."""
         return LightRecord(1, self.position, self.intensity, (self.radius_m, 1.0, 0.0))
 
     def arriving(
         self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
     ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
-        """Return the irradiance and the angular radius."""
+        """Returns the irradiance and the angular radius."""
         del to_light
         return _inverse_square(self.intensity, distance), _angular_radius(self.radius_m, distance)
 
     def image(
         self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
     ) -> Self:
-        """Return the mirror image at `position`."""
+        """Returns the mirror image at `position`."""
         del reflection
         return replace(self, position=position, radius_m=float(np.hypot(self.radius_m, blur_m)))
 
@@ -195,7 +195,7 @@ class SpotLight(Lamp):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        """Builds the light from the keys of its scene document, or from what `describe` made of it."""
         return cls(
             _vector(values["position_m"]),
             _vector(values["direction"]),
@@ -222,7 +222,7 @@ class SpotLight(Lamp):
         return replace(self, intensity=self.intensity * factor)
 
     def record(self) -> LightRecord:
-        """Return the light as shaders read it."""
+        """Returns the light as shaders read it."""
         blend = max(self.half_angle_rad - self.full_angle_rad, NARROWEST_BLEND_RAD)
         shape = (self.radius_m, self.half_angle_rad / blend, 1.0 / blend)
         return LightRecord(2, self.position, self.intensity, shape, self.direction)
@@ -230,12 +230,12 @@ class SpotLight(Lamp):
     def arriving(
         self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
     ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
-        """Return the irradiance and the angular radius."""
+        """Returns the irradiance and the angular radius."""
         irradiance = _inverse_square(self.intensity, distance) * self._emitted(to_light)[..., None]
         return irradiance, _angular_radius(self.radius_m, distance)
 
     def _emitted(self, to_light: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n"]:
-        """Return the fraction of the intensity that goes against `to_light`."""
+        """Returns the fraction of the intensity that goes against `to_light`."""
         angle = np.arccos(np.clip(-to_light @ self.direction, -1, 1))
         soft = max(self.half_angle_rad - self.full_angle_rad, 1e-9)
         return np.asarray(np.clip((self.half_angle_rad - angle) / soft, 0, 1))
@@ -243,7 +243,7 @@ class SpotLight(Lamp):
     def image(
         self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
     ) -> Self:
-        """Return the mirror image at `position`."""
+        """Returns the mirror image at `position`."""
         radius = float(np.hypot(self.radius_m, blur_m))
         return replace(
             self, position=position, direction=_vector(reflection @ self.direction), radius_m=radius
@@ -276,7 +276,7 @@ class RectangleLight(Lamp):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        """Builds the light from the keys of its scene document, or from what `describe` made of it."""
         axes = _vector(values["axis_u_m"]), _vector(values["axis_v_m"])
         return cls(_vector(values["position_m"]), *axes, _strength(values, "radiance"))
 
@@ -295,14 +295,14 @@ class RectangleLight(Lamp):
         return replace(self, radiance=self.radiance * factor)
 
     def record(self) -> LightRecord:
-        """Return the light as shaders read it."""
+        """Returns the light as shaders read it."""
         shape = (0.0, 1.0, 0.0)
         return LightRecord(3, self.position, self.radiance, shape, self.axis_u / 2, self.axis_v / 2)
 
     def arriving(
         self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
     ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
-        """Return the irradiance and the angular radius."""
+        """Returns the irradiance and the angular radius."""
         edges = np.cross(self.axis_u.astype(np.float64), self.axis_v.astype(np.float64))
         shown = np.maximum(-to_light @ edges, 0.0)  # area across the line of sight, m^2
         irradiance = self.radiance.astype(np.float64) * (shown / distance**2)[..., None]
@@ -311,7 +311,7 @@ class RectangleLight(Lamp):
     def image(
         self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
     ) -> Self:
-        """Return the mirror image at `position`: the axes change places to keep the orientation, and blur widens it
+        """Returns the mirror image at `position`: the axes change places to keep the orientation, and blur widens it
         at the same flux.
         """
         u, v = (float(np.linalg.norm(axis)) for axis in (self.axis_u, self.axis_v))

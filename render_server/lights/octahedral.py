@@ -59,7 +59,7 @@ def prefilter(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
 
 @cache
 def _black(size: int) -> PrefilteredMap:
-    """Estimates of what surfaces send each other ask for it with every frame whose lights change."""
+    """Returns a black map; cached, because estimates of bounced light ask for it whenever lights change."""
     return _prefiltered(np.zeros((size, size, 3), np.float32))
 
 

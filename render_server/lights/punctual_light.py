@@ -32,7 +32,7 @@ class PunctualLight(Lamp):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Build the light from what `describe` made of it."""
+        """Builds the light from what `describe` made of it."""
         position, direction, intensity = (
             np.asarray(values[key], np.float32) for key in ("position_m", "direction", "intensity")
         )
@@ -61,7 +61,7 @@ class PunctualLight(Lamp):
         return replace(self, intensity=self.intensity * factor)
 
     def record(self) -> LightRecord:
-        """Return the light as shaders read it."""
+        """Returns the light as shaders read it."""
         shape = (self.radius_m, *self._falloff)
         return LightRecord(
             4, self.position, self.intensity, shape, self.direction, (1 / self.range_m**2, 0.0, 0.0)
@@ -78,7 +78,7 @@ class PunctualLight(Lamp):
     def arriving(
         self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
     ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
-        """Return the irradiance and the angular radius."""
+        """Returns the irradiance and the angular radius."""
         offset, factor = self._falloff
         root = np.clip(offset - factor * (to_light @ self.direction.astype(float)), 0, 1)
         window = np.clip(1 - (distance / self.range_m) ** 4, 0, 1)
@@ -88,7 +88,7 @@ class PunctualLight(Lamp):
     def image(
         self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
     ) -> Self:
-        """Return the mirror image at `position`."""
+        """Returns the mirror image at `position`."""
         direction = np.asarray(reflection @ self.direction, np.float32)
         return replace(
             self, position=position, direction=direction, radius_m=float(np.hypot(self.radius_m, blur_m))

@@ -18,7 +18,6 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import light_stages
 from deltalight.render_server.methods.lighting import Layers, Shading, ShadingOptions, shading_stages
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
-from deltalight.render_server.occlusion_fields import OcclusionFields, field_settings, require_rigid
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.occlusion_fields import (
     FieldTextures,
@@ -35,6 +34,11 @@ from deltalight.render_server.passes.occlusion_fields import (
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
 from deltalight.render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.precomputation.occlusion_fields import (
+    OcclusionFields,
+    field_settings,
+    require_rigid,
+)
 from deltalight.render_server.scene.occlusion_field import FieldSettings, OcclusionField
 
 SHOWN_CELLS = 64  # for view `volume` alone; the method has no volume

@@ -43,13 +43,8 @@ from deltalight.render_server.methods.method import (
     resolve_joint_maps,
 )
 from deltalight.render_server.methods.volume_placement import Placements, only_one, volume_placements
-from deltalight.render_server.methods.voxel_volumes import (
-    FAR_SIZE,
-    DirectionalVoxels,
-    VoxelSet,
-    joint_voxels,
-    placed_volume,
-)
+from deltalight.render_server.methods.voxel_sets import FAR_SIZE, VoxelSet
+from deltalight.render_server.methods.voxel_volumes import DirectionalVoxels, joint_voxels, placed_volume
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones
 from deltalight.render_server.passes.lights import LightBuffers
@@ -284,10 +279,10 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
         screen_space=settings.screen_space,
         mirror_gather="gather" if settings.reflections == "rays" else None,
         march=march_defines(settings),
+        is_everywhere=True,
+        texel_m=lights.rho.real_texel_m,
     )
     shading = Shading(g.gpu, size, resolved, lights.rho, direct.pair, options)
-    shading.normal_offset = lights.rho.real_texel_m
-    shading.is_everywhere = True
     cones = SolutionCones(g.gpu, settings, voxels, shading.cones)
     marching = g.value("marching", cones.marching, lit_voxels)
 

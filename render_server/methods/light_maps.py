@@ -38,10 +38,10 @@ objects that block light."""
 
 @dataclass(frozen=True, eq=False)
 class LitScene:
-    """The lights' buffers and the resources that follow them.
+    """The lights' buffers, and the resources whose stages fill parts of them.
 
-    `real_maps` and `object_maps`: depth maps of the real scene and of the objects; `mirrored`: where smooth planes
-    mirror the lights, if the method heeds that. All of them fill a part of `buffers`.
+    `real_maps` and `object_maps` are depth maps of the real scene and of the objects; `mirrored`, where smooth planes
+    show mirror images of the lights, is empty if the method ignores these.
     """
 
     buffers: LightBuffers
@@ -95,9 +95,9 @@ class LightStages:
     ) -> tuple[bytes, bytes]:
         """Fits the views: of real shadows around the objects, and closely around the objects.
 
-        If an `area` of the picture is to be lit too, or lamps of objects shine everywhere, real shadows are those of
-        the whole scene. `blocking`: all objects, if the `extent` is that of some. Returns the records of both, which
-        tell whether their maps are still those of the views.
+        If an `area` of the picture is to be lit too, or lamps of objects shine everywhere, the views of real shadows
+        enclose the whole scene. `blocking` are all objects, if the `extent` is that of some. Returns the packed views
+        of both: their maps are redrawn only if these change.
         """
         is_around_objects = area == NOWHERE and not lamps
         fitted = lights.lights, lamps, real, extent, surfaces, is_around_objects, blocking or extent
@@ -135,7 +135,7 @@ class LightStages:
         )
 
     def _receivers_of(self, real: GeometryState, extent: ObjectExtent) -> Points:
-        """Returns the real points on which shadows of the objects fall; the same while neither changes its place."""
+        """Returns the real points on which objects may cast shadows: the same array while neither moves."""
         around = _snapped(extent.upright) if self._keeps_views else extent.upright
         known = self._receivers
         if known is None or known[0] is not real or not np.array_equal(known[1], around):
@@ -176,13 +176,13 @@ class LightStages:
 
 
 class TracedObjects:
-    """What rays of all views meet: the objects, in one hierarchy."""
+    """The objects in one bounding volume hierarchy, for the rays of all views."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._bvh = ObjectBvh(gpu)
 
     def set_objects(self, objects: GeometryState) -> ObjectBvh:
-        """Sets the objects' triangles; their hierarchy is made beside the frame, or when rays are first traced."""
+        """Sets the objects' triangles; their hierarchy is built in the background, or when rays are first traced."""
         self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
         return self._bvh
 
@@ -227,7 +227,7 @@ def light_stages(
 def bounced_later(
     g: Graph, s: FrameResources, lit: LitScene, tier: QualityTier, *also: Resource[Any]
 ) -> AbstractContextManager[None]:
-    """What is declared in here may show objects that move as they were a frame before (`QualityTier.bounce_turns`).
+    """Context whose stages may lag behind moving objects (`QualityTier.bounce_turns`).
 
     `also`: other resources that follow the objects.
     """
@@ -240,7 +240,7 @@ def _both_none(old: object, new: object) -> bool:
 
 
 def object_bvh(g: Graph, s: FrameResources) -> Resource[ObjectBvh]:
-    """Declares what rays meet; early in the frame, for the hierarchy is made while the GPU is given other work."""
+    """Declares the objects' hierarchy: early in the frame, so that it is built while the GPU has other work."""
     if "object bvh" in g:
         return g.resource("object bvh")
     traced = g.shared("traced objects", lambda: TracedObjects(g.gpu))
@@ -248,7 +248,7 @@ def object_bvh(g: Graph, s: FrameResources) -> Resource[ObjectBvh]:
 
 
 def object_extent(g: Graph, s: FrameResources) -> Resource[ObjectExtent]:
-    """Declares where the objects are throughout their animations, for fitting volumes and views."""
+    """Declares the bounds that volumes and light views are fitted to."""
     if "object extent" in g:
         return g.resource("object extent")
     return g.value("object extent", _extent_of, s.objects, same=ObjectExtent.equals)
@@ -271,7 +271,7 @@ def _same_lights(old: tuple[Light, ...], new: tuple[Light, ...]) -> bool:
 
 
 def _extent_of(objects: GeometryState) -> ObjectExtent:
-    """Where the objects are at all times of their animations, and as they turn."""
+    """Returns the bounds of the objects over all of their animations."""
     return objects.extent
 
 
@@ -286,8 +286,8 @@ def _snapped(extent: Points) -> Points:
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:
     """Returns the real points around the objects, or all of them if none is near.
 
-    These are the vertices within reach and, for a model's triangles too large to have a vertex there, their part of
-    that cube. What was measured is meshed finely, but at a grazing angle, where its vertices alone count.
+    These are the vertices within reach, and the parts within reach of a model's triangles that are too large to have
+    a vertex there. Of measured surfaces, which are meshed finely except at grazing angles, only vertices count.
     """
     low, high = short_axis.bounds(extent)
     centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))

@@ -1,4 +1,4 @@
-"""Stages that methods share: volumes around the objects, and shading of the visible surfaces (docs/method.md 3)."""
+"""Stages that methods share: direct light and shading of the visible surfaces (docs/method.md 3)."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -42,11 +42,11 @@ DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees 
 
 
 def no_voxels(_: object) -> None:
-    """Of a method whose volume holds none."""
+    """Returns None, for methods whose volume holds no voxels."""
 
 
 def no_bindings(_: object) -> dict[str, Binding]:
-    """What cones march through, of a method that marches none."""
+    """Returns no bindings, for methods that march no cones."""
     return {}
 
 
@@ -81,9 +81,17 @@ def mirrors_objects(objects: GeometryState) -> bool:
 class ShadingOptions:
     """Options of the shared shading.
 
-    `mirror_gather` names the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
-    surfaces. `march` are defines of march.glsl, with which smooth objects look up in voxels what the picture does not
-    show.
+    Attributes:
+        tier: the quality.
+        caustics: smooth objects cast beams.
+        screen_space: smooth objects reflect the picture.
+        mirror_gather: suffix of the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
+            surfaces.
+        march: defines of march.glsl, with which smooth objects look up in voxels what the picture does not show;
+            None: they do not.
+        is_everywhere: shades all pixels, whether or not objects seem to reach them.
+        texel_m: size of a shadow map's texel at a point (m), by which objects are lifted against self-shadowing;
+            None: that of the objects' maps.
     """
 
     tier: QualityTier = BEST
@@ -91,14 +99,23 @@ class ShadingOptions:
     screen_space: bool = False
     mirror_gather: str | None = None
     march: Mapping[str, int] | None = None
+    is_everywhere: bool = False
+    texel_m: Callable[[Points], float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers that a method hands to composition; `voxels`, `volume`, `lights` and `error` are for debug views.
+    """The layers that a method hands to composition.
 
-    `direct_mu` and `cones_mu` are the same at real surfaces without the objects, where that takes less. `transmit`
-    declares the stage that adds to the objects' own `radiance` what transparent ones let through.
+    Attributes:
+        direct, cones, grid: light at visible surfaces, and the grid that `cones` are on.
+        change: where light at real surfaces changes, and by which ratio.
+        radiance: the objects', on the picture's grid.
+        reflection: of objects in smooth real surfaces; None if there are none, or `cones` have them.
+        voxels, volume, lights, error: for debug views.
+        direct_mu, cones_mu: light at real surfaces without the objects, where that is cheaper than `direct` and
+            `cones`.
+        transmit: declares the stage that adds light through transparent objects to their `radiance`.
     """
 
     direct: Resource[DirectLight]
@@ -119,7 +136,7 @@ class Layers:
 class Shading:
     """Shades the visible surfaces: cones at reduced resolution, direct light and objects at full resolution.
 
-    The method fills `cones` by its own stages; `marching` holds the bindings that its cones march with.
+    The method's own stages fill `cones`. Arguments `marching` are the bindings that its cones march with.
     """
 
     def __init__(
@@ -153,8 +170,7 @@ class Shading:
         self._unchanged: DirectLight | None = None
         self._rays: MirrorRays | None = None
         self._object_rays: MirrorRays | None = None
-        self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
-        self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
+        self._texel_m = options.texel_m or lights.virtual_texel_m
 
     def scene(
         self,
@@ -178,7 +194,7 @@ class Shading:
             "normal_offset": self._normal_offset(objects),
             "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
-            "lit_area": (0, 0, *self.size) if self.is_everywhere else area,
+            "lit_area": (0, 0, *self.size) if self._options.is_everywhere else area,
             "has_caustics": has_caustics,
             "beam_alpha": GREATEST_ALPHA if has_caustics else 0.0,
             "hidden_too": objects.materials.transmits
@@ -187,7 +203,7 @@ class Shading:
 
     def _normal_offset(self, objects: GeometryState) -> float:
         low, high = objects.bounds
-        return SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2)
+        return SELF_SHADOW_TEXELS * self._texel_m((low + high) / 2)
 
     def choose_pixels(self, scene: Bindings) -> LowResGrid:
         """Selects the pixel that represents each block of the picture."""
@@ -197,7 +213,7 @@ class Shading:
     def reuse_light(
         self, scene: Bindings, _grid: LowResGrid, light: LightState, view: CameraView
     ) -> tuple[Bindings, DirectLight]:
-        """Fills in the last frame's light where it serves, and lists where light must be computed."""
+        """Reuses the last frame's light where it is still right, and lists where light must be computed."""
         assert self._history is not None
         is_diffuse = not scene["specular_surfaces"]
         return {**scene, **self._history.run(scene, light if is_diffuse else None, view)}, self._direct
@@ -223,13 +239,13 @@ class Shading:
         voxels: VoxelMipmap | None,
         *_kept: DirectLight,
     ) -> DirectLight:
-        """Computes the direct light on the real surfaces, but for what is kept of the last frame's."""
+        """Computes the direct light on the real surfaces, except where the last frame's is reused."""
         joint = None if voxels is None else voxels.texture
         self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
 
     def light_unchanged(self, scene: Bindings, grid: LowResGrid) -> DirectLight:
-        """Computes the direct light on the real surfaces without the objects, which estimates of light read."""
+        """Computes the direct light on the real surfaces without the objects, for estimates of light."""
         if self._unchanged is None:
             self._unchanged = DirectLight(self._gpu, self.size, objects_shadow=False)
         self._unchanged.run(grid, scene)
@@ -238,7 +254,7 @@ class Shading:
     def reflect_objects(
         self, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
     ) -> moderngl.Texture | None:
-        """Traces the objects in smooth real surfaces; returns None if none is declared, and cones do."""
+        """Traces the objects that smooth real surfaces reflect; returns None if none is declared, or cones do it."""
         wanted = self._options.mirror_gather
         if wanted is None or not scene["specular_surfaces"]:
             if self._rays is not None:
@@ -253,7 +269,7 @@ class Shading:
     def mirror_objects(
         self, objects: GeometryState, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
     ) -> moderngl.Texture | None:
-        """Traces the objects in smooth objects; returns None if none is smooth enough, or cones do."""
+        """Traces the objects that smooth objects reflect; returns None if none is smooth enough, or cones do it."""
         wanted = self._options.mirror_gather
         is_quick = self.tier.reflection_step > 1
         if wanted is None or self._screen is None or is_quick or not mirrors_objects(objects):
@@ -274,7 +290,7 @@ class Shading:
         reflection: moderngl.Texture | None,
         distant: moderngl.Texture | None = None,
     ) -> ChangeRatio:
-        """Finds where light changes, and by which ratio."""
+        """Computes where light changes, and by which ratio."""
         self._change.run(grid, direct, cones, reflection, distant)
         return self._change
 
@@ -353,8 +369,8 @@ class Shading:
                 item.release()
 
 
-class Behind(NamedTuple):
-    """What rays that leave the objects may meet, in the order in which stages take it."""
+class RayInputs(NamedTuple):
+    """Inputs of stages that trace rays from the objects, in the order of their arguments."""
 
     objects: Resource[GeometryState]
     scene: Resource[Bindings]
@@ -378,9 +394,10 @@ def shading_stages(
     light_directly: Callable[..., DirectLight] | None = None,
     find_distant: Callable[..., moderngl.Texture] | None = None,
 ) -> Layers:
-    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects.
+    """Declares grid, cones (by `trace`), caustics, direct light, reflections, change of light, and objects.
 
-    `voxels`: what the `volume` holds, if anything; `marching`: bindings of what rays march through, if they do.
+    `voxels`: those of the `volume`, if the method has any; `marching`: bindings of what rays march through, if they
+    do. `light_directly` replaces that of `shading`. `find_distant` finds the change of light beyond the volumes.
     """
     shown: Resource[Any] = voxels or g.value("voxels", no_voxels, volume)
     marching = marching or g.value("marching", no_bindings, volume)
@@ -395,27 +412,40 @@ def shading_stages(
     kept: list[Resource[Any]] = []
     if shading.reuses_light:
         states = _light_states(g, s, lit, volume, shown, marching, beams)
-        reused = scene, grid, states, s.view
         outputs = "reusing scene", "kept light"
-        scene, *kept = g.stages("light reuse", shading.reuse_light, *reused, outputs=outputs)
-    own_light = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
+        scene, *kept = g.stages(
+            "light reuse", shading.reuse_light, scene, grid, states, s.view, outputs=outputs
+        )
+    direct_mu = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     light = light_directly or shading.light_directly
     direct = g.stage("direct light", light, scene, grid, caustics, shown, *kept)
+    rays = RayInputs(s.objects, scene, direct, cones, bvh, s.observation, marching)
+    reflection, change = _change_stages(g, shading, grid, rays, find_distant)
+    radiance = _surface_stages(g, shading, grid, caustics, rays)
+
+    def transmit(own: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
+        return g.stage("transmitted light", shading.add_transmitted, own, *rays)
+
+    layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
+    return replace(layers, direct_mu=direct_mu, transmit=transmit)
+
+
+def _change_stages(
+    g: Graph,
+    shading: Shading,
+    grid: Resource[LowResGrid],
+    rays: RayInputs,
+    find_distant: Callable[..., moderngl.Texture] | None,
+) -> tuple[Resource[moderngl.Texture | None], Resource[ChangeRatio]]:
+    """Declares what smooth real surfaces reflect, and the change of light."""
+    _, scene, direct, cones, bvh, _, marching = rays
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     distant: list[Resource[moderngl.Texture]] = []
     if find_distant is not None:
         distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
-    change = g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
-    behind = Behind(s.objects, scene, direct, cones, bvh, s.observation, marching)
-    radiance = _surface_stages(g, shading, grid, caustics, behind)
-
-    def transmit(own: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
-        return g.stage("transmitted light", shading.add_transmitted, own, *behind)
-
-    layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
-    return replace(layers, direct_mu=own_light, transmit=transmit)
+    return reflection, g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)
 
 
 def _surface_stages(
@@ -423,19 +453,19 @@ def _surface_stages(
     shading: Shading,
     grid: Resource[LowResGrid],
     caustics: Resource[Caustics | None],
-    behind: Behind,
+    rays: RayInputs,
 ) -> Resource[moderngl.Texture]:
-    """Declares what smooth objects reflect, and the light that objects send."""
-    objects, scene, _, cones, bvh, _, marching = behind
+    """Declares what smooth objects reflect, and the objects' radiance."""
+    objects, scene, _, cones, bvh, _, marching = rays
     mirrored = g.stage("mirrored objects", shading.mirror_objects, objects, scene, grid, bvh, marching)
-    screen = g.stage("screen cones", shading.trace_screen, *behind, mirrored)
+    screen = g.stage("screen cones", shading.trace_screen, *rays, mirrored)
     return g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
 
 
 def _light_states(
     g: Graph, s: FrameResources, lit: LitScene, *bounces: Resource[Any]
 ) -> Resource[LightState]:
-    """What light at real surfaces depends on, besides the camera: another value whenever any of it changes."""
+    """Declares what light at real surfaces depends on besides the camera: a new value whenever any of it changes."""
     shared: tuple[Resource[Any], ...] = (s.surfaces, s.lit_area, s.lights, lit.environment)
     unblocked = g.value("unblocked light state", _new_object, *shared, lit.real_maps, *lit.mirrored)
     bounced = g.value("bounced light state", _new_object, *shared, *bounces)

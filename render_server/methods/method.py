@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from deltalight.render_server.frame import FrameResources
     from deltalight.render_server.graph import Graph
     from deltalight.render_server.methods.lighting import Layers
-    from deltalight.render_server.occlusion_fields import OcclusionFields
+    from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 
 Settings = TypeVar("Settings", bound=MethodSettings)
 LEAST_VOLUME = 32  # voxels an edge
@@ -50,7 +50,7 @@ class Setup(Generic[Settings]):
 
 
 def resolve_voxel_cones(settings: VoxelConeSettings, defaults: ResolvedSettings) -> ResolvedSettings:
-    """Takes the document's values, or the machine's defaults where it says null, within the limits of the quality."""
+    """Fills in the machine's defaults where the document says null, within the limits of the quality."""
     size = settings.volume_size or defaults.volume_size
     return ResolvedSettings(
         max(int(settings.tier.volume_share * size / VOLUME_STEP) * VOLUME_STEP, min(size, LEAST_VOLUME)),
@@ -61,7 +61,7 @@ def resolve_voxel_cones(settings: VoxelConeSettings, defaults: ResolvedSettings)
 
 
 def resolve_joint_maps(settings: VoxelConeSettings, defaults: ResolvedSettings) -> ResolvedSettings:
-    """The same for methods whose shadow maps hold objects and room at once, and so resolve objects less."""
+    """As `resolve_voxel_cones`; joint shadow maps of objects and room need twice the resolution."""
     return resolve_voxel_cones(settings, replace(defaults, rsm_size=2 * defaults.rsm_size))
 
 
@@ -75,18 +75,18 @@ def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
 
 
 def keep_defaults(_settings: object, defaults: ResolvedSettings) -> ResolvedSettings:
-    """Resolves settings that leave everything to the machine."""
+    """Returns the machine's defaults, for settings that override none."""
     return defaults
 
 
 @dataclass(frozen=True)
 class RelightingMethod(Generic[Settings]):
-    """A way to find the change of light.
+    """A method of computing how virtual objects change light.
 
     Attributes:
         settings: model of the scene document's `method`; its `name` is the method's.
         declare: declares the method's stages in a graph and returns what is composed.
-        resolve: fills in what the settings leave open, from the machine's defaults.
+        resolve: fills in the machine's defaults where the settings say null.
         state_memory: a sentence on the memory that it takes; raises DeltalightError beyond the settings' budget.
         require: raises DeltalightError for an object that the method cannot show.
     """

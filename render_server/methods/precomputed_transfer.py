@@ -20,7 +20,7 @@ from deltalight.render_server.methods.image_based import map_light
 from deltalight.render_server.methods.light_maps import object_extent
 from deltalight.render_server.passes.image_based import ImageBasedSurface, SurroundingLight
 from deltalight.render_server.passes.precomputed_transfer import TransferMesh, TransferredLight
-from deltalight.render_server.precomputed_transfers import ObjectTransfers, transfer_settings
+from deltalight.render_server.precomputation.light_transfers import ObjectTransfers, transfer_settings
 from deltalight.render_server.scene.precomputed_transfer import ObjectTransfer
 from deltalight.render_server.scene.triangle_mesh import bounds_of
 from deltalight.render_server.view import CameraView

@@ -27,8 +27,8 @@ from deltalight.render_server.methods.method import (
     Setup,
 )
 from deltalight.render_server.methods.precomputed_transfer import precomputed_radiance
-from deltalight.render_server.occlusion_fields import OcclusionFields
-from deltalight.render_server.precomputed_transfers import ObjectTransfers, require_rigid_transfer
+from deltalight.render_server.precomputation.light_transfers import ObjectTransfers, require_rigid_transfer
+from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 
 BUILT_IN: tuple[RelightingMethod[Any], ...] = (DVCT, DLPV, AROOF, DIFFERENTIAL)
 _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
@@ -38,9 +38,13 @@ _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
 class MethodChoice:
     """A method whose settings and memory were checked.
 
-    `settings` are those of the `document` within the limits of its quality. `shading`: how objects get their light.
-    `remark`: a sentence for the user, or none. `relights_real`: the real scene changes too. `plugin`: what the method
-    comes from, unless it is the project's own.
+    Attributes:
+        document: the settings as the scene document has them.
+        settings: the same within the limits of its quality.
+        shading: how objects get their light.
+        remark: a sentence for the user, if any.
+        relights_real: the real scene changes too.
+        plugin: the plugin that the method comes from, unless it is the project's own.
     """
 
     method: RelightingMethod[Any]
@@ -58,7 +62,7 @@ class MethodChoice:
         return self.settings.tier.refresh_tiles > 0
 
     def in_best_quality(self, *, software: bool) -> "MethodChoice":
-        """Returns the same method as it is when nothing moves."""
+        """Returns the same method in the quality for frames at rest."""
         return choose_method(self.document.replaced(quality="best"), self.shading, software=software)
 
     @property
@@ -79,7 +83,7 @@ class MethodChoice:
                     require(item)
 
     def setup(self, picture_size: tuple[int, int], fields: OcclusionFields) -> Setup[Any]:
-        """Returns what the method's stages are declared with, for pictures of this size."""
+        """Returns the arguments of the method's declaration, for pictures of this size."""
         return Setup(self.settings, self.resolved, picture_size, fields)
 
     def declare(self, graph: Graph, resources: FrameResources, setup: Setup[Any]) -> Layers:
@@ -99,7 +103,7 @@ class MethodChoice:
         size: tuple[int, int],
         transfers: ObjectTransfers,
     ) -> Layers:
-        """Declares a shading that takes the place of the method's own, and what transparent objects let through."""
+        """Declares the shading that replaces the method's own, if any, and the light through transparent objects."""
         radiance = layers.radiance
         if self.shading.is_image_based:
             radiance = image_based_radiance(graph, resources, self.shading, size)
@@ -111,7 +115,7 @@ class MethodChoice:
 def choose_method(
     document: MethodSettings, shading: Shading | None = None, *, software: bool
 ) -> MethodChoice:
-    """Checks what the document asks for; `none` draws the objects as dvct does. `shading` None: as the method does.
+    """Checks the document's settings; `none` draws the objects as dvct does. `shading` None: the method's own.
 
     Raises:
         DeltalightError: more memory than its budget, or a plugin that cannot be used.
@@ -128,7 +132,7 @@ def choose_method(
 
 
 class MethodChooser:
-    """Chooses methods, and keeps the last one: an object that is dragged asks for the same in every frame."""
+    """Chooses methods, and caches the last choice: while an object is dragged, every frame asks for the same."""
 
     def __init__(self, *, software: bool) -> None:
         self._software = software

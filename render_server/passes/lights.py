@@ -30,7 +30,7 @@ from deltalight.render_server.passes.shadow_maps import (
 )
 
 LIGHT_BYTES = 160  # of a std430 Light (shaders/common/light_shapes.glsl)
-TEXEL_BYTES, LIGHT_TEXELS, VIEW_TEXELS = 16, 10, 7  # of a Light and a LightView (shaders/common/lights.glsl)
+TEXEL_BYTES, LIGHT_TEXELS, VIEW_TEXELS = 16, 10, 7  # of a Light and a LightView (shaders/common/)
 BRIGHTEST = float(np.finfo(np.float16).max)
 GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up has to fit, too
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light

@@ -13,9 +13,9 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
-from deltalight.render_server.scene.materials import coating_table, map_table, measured_table
+from deltalight.render_server.scene.material_tables import coating_table, map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
-from deltalight.render_server.scene.threads import begun
+from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 
 # Of the vertices of meshes that have either, in a buffer of their own.
@@ -263,7 +263,7 @@ class ObjectBvh:
             bvh = self._renewed(positions)
             return bvh_rows(bvh.packed()), bvh_rows(bvh.packed_triangles(positions, triangles))
 
-        self._packed = begun(packed)
+        self._packed = submit(packed)
 
     def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
         """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
@@ -392,7 +392,7 @@ def _measured_texture(gpu: GpuContext, mesh: GpuMesh) -> moderngl.Texture | None
 
 
 def _transmittances(mesh: GpuMesh) -> Float32[np.ndarray, "k 4"]:
-    """Returns what each material lets through of light in its shadow, and its alpha (common/lights.glsl)."""
+    """Returns what each material lets through of light in its shadow, and its alpha (common/tinted_shadows.glsl)."""
     rows = np.zeros((len(mesh.materials), 4), np.float32)
     for index, material in enumerate(mesh.materials):
         if material.transmits:

@@ -24,7 +24,7 @@ FAR_MARGIN = 1.02
 WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces of a cube
 NEAREST_M = 1e-3
 CASTER_CELL = 8
-"""Texels an edge of the cells in which distances to casters are known; shaders/common/lights.glsl knows it too."""
+"""Texels an edge of the cells in which distances to casters are known; as in shaders/common/object_shadows.glsl."""
 MOST_VIEWS = 6  # of a light: the faces of a cube
 TEXEL_BYTES = 4 + 8 + 16  # of an atlas: depth, `normal` and `uv`
 EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies

@@ -24,7 +24,7 @@ ROUNDING = 1e-3
 
 
 def scattered(change: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Return light spread around where it was; what leaves the picture is lost."""
+    """Returns light spread around where it was; what leaves the picture is lost."""
     parts = [_spread(change, width * change.shape[1]) for width in WIDTHS]
     return np.asarray(sum(parts) / np.float32(len(parts)), np.float32)
 
@@ -45,7 +45,7 @@ def bloomed(
     *,
     tone: Tone = "camera",
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a relit picture with bloom of its change; where none arrives it is the same to the bit.
+    """Returns a relit picture with bloom of its change; where none arrives it is the same to the bit.
 
     `linear` is the picture in camera units, beyond white where objects are, `coverage` what they cover; `share`
     0..1 is the part of the light that is scattered. `tone` is the curve that `color` was made with.

@@ -61,13 +61,13 @@ class FrameArtifacts:
     sharpening: Sharpening | None = None
 
     def under(self, tone: Tone) -> Self:
-        """Return what a picture gets that was made with a tone curve."""
+        """Returns what a picture gets that was made with a tone curve."""
         return replace(self, frame=in_tone(self.frame, tone))
 
     def applied(
         self, color: Color, coverage: Coverage, depth_m: Float32[np.ndarray, "h w"] | None = None
     ) -> Color:
-        """Return a picture of the frame with all of it on its virtual part; as it is while none is known.
+        """Returns a picture of the frame with all of it on its virtual part; as it is while none is known.
 
         `depth_m` is that of the objects (0: none), and needed where `distance_blur` is known.
         """
@@ -111,7 +111,7 @@ class CameraArtifacts:
         self._motion_px = NO_MOTION
 
     def forget(self) -> None:
-        """Forget everything: other frames come from another camera."""
+        """Forgets everything: other frames come from another camera."""
         self.__init__()  # type: ignore[misc]
 
     def observe(
@@ -120,7 +120,7 @@ class CameraArtifacts:
         world_from_camera: Float64[np.ndarray, "4 4"],
         place_m: Float64[np.ndarray, " 3"],
     ) -> FrameArtifacts:
-        """Learn from a frame, and return what its virtual part gets. The same frame again changes nothing.
+        """Learns from a frame, and returns what its virtual part gets. The same frame again changes nothing.
 
         `world_from_camera` is the pose that it is rendered with, `place_m` where the objects are (world).
         """
@@ -149,7 +149,7 @@ class CameraArtifacts:
         )
 
     def _variance_by_others(self, lens: LensBlur | None) -> float:
-        """Return how much of a measured blur's variance (px^2) is not the lens's, but what objects get separately.
+        """Returns how much of a measured blur's variance (px^2) is not the lens's, but what objects get separately.
 
         Interpolation of a mosaic adds some; sharpening makes it less.
         """
@@ -166,7 +166,7 @@ class CameraArtifacts:
         return DistanceBlur(defocus, lens or LensBlur(0.0), self._motion_px, from_centre_px)
 
     def _lens_blur(self) -> LensBlur | None:
-        """Return the medians of what was measured."""
+        """Returns the medians of what was measured."""
         if not self._lens:
             return None
         sigma, red, blue = np.median([(each.sigma_px, each.red, each.blue) for each in self._lens], axis=0)
@@ -175,7 +175,7 @@ class CameraArtifacts:
     def _follow(
         self, frame: ViewFrame, pose: Float64[np.ndarray, "4 4"], place_m: Float64[np.ndarray, " 3"]
     ) -> None:
-        """Find how far the objects' place moves in the picture; where it hardly does, measure the lens's blur."""
+        """Finds how far the objects' place moves in the picture; where it hardly does, measures the lens's blur."""
         last = self._last
         step_ns = 0 if last is None else frame.timestamp_ns - last.timestamp_ns
         moved = NO_MOTION
@@ -201,6 +201,6 @@ class CameraArtifacts:
 def _pixel(
     frame: ViewFrame, pose: Float64[np.ndarray, "4 4"], place_m: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " 2"]:
-    """Return where a place is in the picture; NaN behind the camera."""
+    """Returns where a place is in the picture; NaN behind the camera."""
     seen = (place_m - pose[:3, 3]) @ pose[:3, :3]
     return np.asarray(frame.camera.project(seen[None])[0] if seen[2] > 0 else np.full(2, np.nan))

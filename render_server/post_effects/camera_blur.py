@@ -35,7 +35,7 @@ Part = tuple[Float64[np.ndarray, "3 k k"], Coverage]
 
 
 def mtf50(sigma_px: float) -> float:
-    """Return the frequency (cycles a pixel) at which a Gaussian blur halves contrast."""
+    """Returns the frequency (cycles a pixel) at which a Gaussian blur halves contrast."""
     return float(np.sqrt(np.log(2) / 2) / (np.pi * sigma_px))
 
 
@@ -48,16 +48,16 @@ class LensBlur:
     blue: float = 0.0
 
     def shifts_px(self, from_centre_px: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "3 2"]:
-        """Return how far R, G and B lie from green at a place, from the principal point."""
+        """Returns how far R, G and B lie from green at a place, from the principal point."""
         return np.outer([self.red, 0.0, self.blue], from_centre_px)
 
     def without(self, variance: float) -> "LensBlur":
-        """Return what is left of the blur without a part of its variance, px^2."""
+        """Returns what is left of the blur without a part of its variance, px^2."""
         return replace(self, sigma_px=float(np.sqrt(max(self.sigma_px**2 - variance, 0.0))))
 
 
 def measure_blur(edges: Sequence[EdgeStep]) -> LensBlur | None:
-    """Return the blur across a frame's edges, and how colours differ in size; None if they are few."""
+    """Returns the blur across a frame's edges, and how colours differ in size; None if they are few."""
     if len(edges) < LEAST_EDGES:
         return None
     radii, red, blue = np.array([(each.across_px, each.red_px, each.blue_px) for each in edges]).T
@@ -66,7 +66,7 @@ def measure_blur(edges: Sequence[EdgeStep]) -> LensBlur | None:
 
 
 def _magnification(radius: Float64[np.ndarray, " n"], shift: Float64[np.ndarray, " n"]) -> float:
-    """Return the slope of shifts over the distance from the principal point; 0 if it is within its own error."""
+    """Returns the slope of shifts over the distance from the principal point; 0 if it is within its own error."""
     power = float(radius @ radius)
     slope = float(radius @ shift) / power
     error = np.sqrt(np.mean((shift - slope * radius) ** 2) / power)
@@ -76,7 +76,7 @@ def _magnification(radius: Float64[np.ndarray, " n"], shift: Float64[np.ndarray,
 def blur_kernels(
     lens: LensBlur | None, motion_px: Float64[np.ndarray, " 2"], from_centre_px: Float64[np.ndarray, " 2"]
 ) -> Float64[np.ndarray, "3 k k"] | None:
-    """Return what rendered objects lack of a camera's blur, R G B; None if that is nothing.
+    """Returns what rendered objects lack of a camera's blur, R G B; None if that is nothing.
 
     `lens` None: unknown. `motion_px` is how far (columns, rows) the picture moves in an exposure, `from_centre_px`
     where the objects are from the principal point.
@@ -100,7 +100,7 @@ def blur_kernels(
 
 
 def _kernel_sigma(variance: float) -> float:
-    """Return the Gaussian (px) to integrate over texels for what rendered objects lack of a blur's variance, px^2.
+    """Returns the Gaussian (px) to integrate over texels for what rendered objects lack of a blur's variance, px^2.
 
     A wide one gets a texel's variance by that. Of a narrow one, texels keep too much contrast, so it is chosen by the
     frequency at which the whole blur halves contrast, or the highest that pixels show.
@@ -120,7 +120,7 @@ def _narrow_kernels() -> Float64[np.ndarray, "n k"]:
 
 
 def _integrals(centres: Float64[np.ndarray, " t"], sigma: float, radius: int) -> Float64[np.ndarray, "t k"]:
-    """Return Gaussians at `centres`, integrated over texels -radius..radius."""
+    """Returns Gaussians at `centres`, integrated over texels -radius..radius."""
     from scipy.special import erf
 
     edges = np.arange(-radius, radius + 2) - 0.5
@@ -133,7 +133,7 @@ def blurred(
     kernels: Float64[np.ndarray, "3 k k"],
     response: Float32[np.ndarray, "256 3"] | None,
 ) -> tuple[Color, Coverage]:
-    """Return a picture whose virtual part went through `kernels`, in linear light, and how much that covers then.
+    """Returns a picture whose virtual part went through `kernels`, in linear light, and how much that covers then.
 
     Objects and what is behind them are told apart by coverage: the picture around them is the camera's and has its
     blur. Behind an object's edges it is as near them. Pixels that the blurred objects do not reach are the same to
@@ -145,7 +145,7 @@ def blurred(
 def blurred_in_parts(
     color: Color, coverage: Coverage, parts: Sequence[Part], response: Float32[np.ndarray, "256 3"] | None
 ) -> tuple[Color, Coverage]:
-    """Return a picture as `blurred` does, with several blurs: kernels, and their weights in what covers a pixel.
+    """Returns a picture as `blurred` does, with several blurs: kernels, and their weights in what covers a pixel.
 
     Weights of a pixel sum to 1.
     """
@@ -178,7 +178,7 @@ def _blurred_part(
     kernels: Float64[np.ndarray, "3 k k"],
     weight: Float32[np.ndarray, "h w"],
 ) -> tuple[Layer, Layer, Layer]:
-    """Return how much a part of the objects covers, blurred, its light times that, and the light behind it."""
+    """Returns how much a part of the objects covers, blurred, its light times that, and the light behind it."""
     objects, behind = (continued(linear, known, kernels.shape[1]) for known in (cover >= SOLID, cover <= 0))
     part = (cover * weight)[..., None]
     return _by_channel(part, kernels), _by_channel(part * objects, kernels), behind
@@ -187,7 +187,7 @@ def _blurred_part(
 def _together(
     parts: Sequence[tuple[Layer, Layer, Layer]], wholes: Sequence[Layer]
 ) -> tuple[Layer, Layer, Layer]:
-    """Return the same of all parts; `wholes`: how much all objects cover in the blur of each part, if there are more.
+    """Returns the same of all parts; `wholes`: how much all objects cover in the blur of each part, if more do.
 
     Where parts meet, their shares do not sum to 1, although nothing shows between them. So light is mixed by shares,
     and what is covered is the blurred whole, by the blurs of the parts there.
@@ -201,7 +201,7 @@ def _together(
 
 
 def _by_channel(picture: Float32[np.ndarray, "h w c"], kernels: Float64[np.ndarray, "3 k k"]) -> Layer:
-    """Return R G B through their kernels; of a picture of one channel, that through each."""
+    """Returns R G B through their kernels; of a picture of one channel, that through each."""
     channels = np.broadcast_to(picture, (*picture.shape[:2], 3))
     return np.stack([_filtered(channels[..., c], kernel) for c, kernel in enumerate(kernels)], axis=-1)
 
@@ -216,7 +216,7 @@ def _filtered(
 def continued(
     picture: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], width: int
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return a picture where `known`, and elsewhere the mean of what is known nearby; far from that, as it is."""
+    """Returns a picture where `known`, and elsewhere the mean of what is known nearby; far from that, as it is."""
     weight = known.astype(np.float32)
     size = (2 * (width // 2) + 1,) * 2
     share = cv2.GaussianBlur(weight, size, 0)[..., None]

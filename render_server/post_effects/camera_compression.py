@@ -55,7 +55,7 @@ class Compression:
 
 
 def find_compression(color: Color) -> Compression | None:
-    """Return how a picture was compressed; None if it was not, or too finely to tell."""
+    """Returns how a picture was compressed; None if it was not, or too finely to tell."""
     middle = tuple(max(length - EXAMINED_PX, 0) // 2 // BLOCK_PX * BLOCK_PX for length in color.shape[:2])
     part = color[middle[0] : middle[0] + EXAMINED_PX, middle[1] : middle[1] + EXAMINED_PX]
     luma = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY)
@@ -79,20 +79,20 @@ def find_compression(color: Color) -> Compression | None:
 
 
 def _by_block(plane: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "n m k"]:
-    """Return the pixels of each block that is transformed, by row and column of blocks."""
+    """Returns the pixels of each block that is transformed, by row and column of blocks."""
     rows, columns = (length // TRANSFORM_PX for length in plane.shape)
     blocks = plane.reshape(rows, TRANSFORM_PX, columns, TRANSFORM_PX).swapaxes(1, 2)
     return blocks.reshape(rows, columns, -1).astype(np.float32)
 
 
 def _change(luma: UInt8[np.ndarray, "h w"], where: Bool[np.ndarray, "n m"], quality: int) -> float:
-    """Return the mean square by which compression changes some blocks of a plane."""
+    """Returns the mean square by which compression changes some blocks of a plane."""
     again = _through_jpeg(luma, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return float(np.mean((_by_block(again)[where] - _by_block(luma)[where]) ** 2))
 
 
 def _was_halved(chroma: Float32[np.ndarray, "h w 2"]) -> bool:
-    """Tell whether chroma was interpolated from half the rows, with the weights 3/4 and 1/4 of libjpeg's decoder.
+    """Tells whether chroma was interpolated from half the rows, with the weights 3/4 and 1/4 of libjpeg's decoder.
 
     Then x[2i-1] - 3 x[2i] + 3 x[2i+1] - x[2i+2] is 0.
     """
@@ -107,7 +107,7 @@ def _through_jpeg(picture: UInt8[np.ndarray, "..."], options: list[int]) -> UInt
 
 
 def compressed(color: Color, coverage: Float32[np.ndarray, "h w"], compression: Compression) -> Color:
-    """Return a picture whose virtual part was compressed with what is around it, on the picture's grid of blocks.
+    """Returns a picture whose virtual part was compressed with what is around it, on the picture's grid of blocks.
 
     Pixels that objects do not cover are the same to the bit: they were compressed by the camera.
     """
@@ -134,7 +134,7 @@ class CameraCompression:
         self._found: list[Compression | None] = []
 
     def observe(self, frame: ViewFrame) -> None:
-        """Look at a frame, until enough were seen."""
+        """Looks at a frame, until enough were seen."""
         if len(self._found) < MOST_EXAMINED:
             self._found.append(find_compression(frame.color))
 

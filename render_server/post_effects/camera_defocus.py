@@ -48,16 +48,16 @@ class Defocus:
     growth: float
 
     def variance(self, inverse_m: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-        """Return the variance of the whole blur at depths of 1 / `inverse_m`, px^2; a pixel's at least."""
+        """Returns the variance of the whole blur at depths of 1 / `inverse_m`, px^2; a pixel's at least."""
         return np.maximum(self.sharpest + (self.growth * (inverse_m - self.focus)) ** 2, PIXEL_VARIANCE)
 
     def without(self, variance: float) -> "Defocus":
-        """Return what is left of the blur without a part of its variance, px^2."""
+        """Returns what is left of the blur without a part of its variance, px^2."""
         return replace(self, sharpest=self.sharpest - variance)
 
 
 def fit_defocus(edges: Sequence[EdgeStep]) -> Defocus | None:
-    """Return the defocus that edges at several depths show; None if it is within its error.
+    """Returns the defocus that edges at several depths show; None if it is within its error.
 
     A lens that is softer towards the picture's corners is no reason for it: the variance may also grow with the
     square of the distance from the principal point.
@@ -81,7 +81,7 @@ def fit_defocus(edges: Sequence[EdgeStep]) -> Defocus | None:
 def _significant_curve(
     columns: Float64[np.ndarray, "n 4"], variance: Float64[np.ndarray, " n"]
 ) -> tuple[float, float, float] | None:
-    """Fit the variance by the columns, without outliers; returns the first three factors if the third is sure.
+    """Fits the variance by the columns, without outliers; returns the first three factors if the third is sure.
 
     A variance is known to a fraction of itself. In every round that is of what the last one fitted.
     """
@@ -111,14 +111,14 @@ class BoardDefocus:
         self.model: Defocus | None = None
 
     def wants(self, frame: ViewFrame) -> bool:
-        """Tell whether a frame shows the board at a new place: edges of the same place all err alike."""
+        """Tells whether a frame shows the board at a new place: edges of the same place all err alike."""
         place = _board_place(frame)
         if place is None or len(self._places) >= MOST_FRAMES:
             return False
         return all(np.linalg.norm(place - each) >= LEAST_STEP for each in self._places)
 
     def observe(self, frame: ViewFrame, edges: Sequence[EdgeStep]) -> None:
-        """Take the edges of a frame that is wanted; one that shows none well is not looked at again."""
+        """Takes the edges of a frame that is wanted; one that shows none well is not looked at again."""
         place = _board_place(frame)
         if place is not None:
             self._places.append(place)
@@ -127,7 +127,7 @@ class BoardDefocus:
 
 
 def _board_place(frame: ViewFrame) -> Float64[np.ndarray, " 3"] | None:
-    """Return where the board's middle is in the picture, in half diagonals, and its depth's logarithm."""
+    """Returns where the board's middle is in the picture, in half diagonals, and its depth's logarithm."""
     if frame.board is None or frame.pose is None:
         return None
     middle = np.mean(list(frame.board.corner_points().values()), axis=(0, 1))
@@ -159,7 +159,7 @@ class DistanceBlur:
         depth_m: Float32[np.ndarray, "h w"],
         response: Float32[np.ndarray, "256 3"] | None,
     ) -> tuple[Color, Coverage]:
-        """Return `blurred` of a picture, each pixel of an object by its own depth (along the optical axis; 0: none).
+        """Returns `blurred` of a picture, each pixel of an object by its own depth (along the optical axis; 0: none).
 
         A pixel's blur is mixed of the two levels around it, by which its variance is met exactly.
         """
@@ -185,7 +185,7 @@ class DistanceBlur:
 def _continued(
     depth_m: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, "h w"]:
-    """Return the depth where `known`, and elsewhere that of the nearest such pixel: an edge's pixel may have none."""
+    """Returns the depth where `known`, and elsewhere that of the nearest such pixel; edges may have none."""
     unknown = (~known).astype(np.uint8)
     _, labels = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     of_label = np.zeros(labels.max() + 1)

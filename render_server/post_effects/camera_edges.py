@@ -65,7 +65,7 @@ class EdgeStep:
 
 
 def edge_steps(frame: ViewFrame) -> list[EdgeStep]:
-    """Return the outer edges of the board's markers (grids and single markers) that are seen well; none without."""
+    """Returns the outer edges of the board's markers (grids and single markers) that are seen well; none without."""
     if frame.board is None or frame.pose is None or frame.board.type == "charuco":
         return []
     return [step for edge in _edges(frame, frame.board) if (step := _edge_step(frame, edge)) is not None]
@@ -86,7 +86,7 @@ class _Edge:
 
 
 def _edges(frame: ViewFrame, board: BoardSpec) -> Iterator[_Edge]:
-    """Yield the outer edges of the markers in view that are long enough."""
+    """Yields the outer edges of the markers in view that are long enough."""
     assert frame.pose is not None
     camera_from_world = np.linalg.inv(frame.pose.world_from_camera)
     cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
@@ -119,7 +119,7 @@ def _across(along: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
 
 
 def _edge_step(frame: ViewFrame, edge: _Edge) -> EdgeStep | None:
-    """Return what is seen of an edge; None if it is clipped, faint or something else."""
+    """Returns what is seen of an edge; None if it is clipped, faint or something else."""
     ends = np.stack([edge.start, edge.start + edge.length * edge.along])
     low = np.floor(ends.min(axis=0) - edge.reach).astype(int)
     high = np.ceil(ends.max(axis=0) + edge.reach).astype(int) + 1
@@ -150,7 +150,7 @@ def _profile(
     codes: UInt8[np.ndarray, " n"],
     across: Float64[np.ndarray, " 2"],
 ) -> EdgeProfile | None:
-    """Return the profile of an edge, put straight: the board's pose may be off by part of a pixel.
+    """Returns the profile of an edge, put straight: the board's pose may be off by part of a pixel.
 
     `along` is -0.5 at one end of the edge and 0.5 at the other.
     """
@@ -176,7 +176,7 @@ def _profile(
 def _fitted_steps(
     distance: Float64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"]
 ) -> list[tuple[float, float]] | None:
-    """Fit each channel with a step blurred by a Gaussian: the best of all SIGMAS_PX and SHIFTS_PX; returns both."""
+    """Fits each channel with a step blurred by a Gaussian: the best of all SIGMAS_PX and SHIFTS_PX; returns both."""
     from scipy.special import erf
 
     bins = np.round(distance / BIN_PX).astype(int)
@@ -200,7 +200,7 @@ def _best_step(
     weight: Float64[np.ndarray, " n"],
     value: Float64[np.ndarray, " n"],
 ) -> tuple[float, float] | None:
-    """Return blur and shift of the step that fits best; None if it is faint, or does not fit."""
+    """Returns blur and shift of the step that fits best; None if it is faint, or does not fit."""
     centred = value - weight @ value
     slope = (steps * centred) @ weight / power
     residual = (centred**2) @ weight - slope**2 * power
@@ -213,7 +213,7 @@ def _best_step(
 
 
 def _vertex(values: Float64[np.ndarray, " n"], least: int) -> float:
-    """Return how far beside the least of the values at SHIFTS_PX a parabola through its neighbours is lowest."""
+    """Returns how far beside the least of the values at SHIFTS_PX a parabola through its neighbours is lowest."""
     if not 0 < least < len(values) - 1:
         return 0.0
     before, here, after = values[least - 1 : least + 2]

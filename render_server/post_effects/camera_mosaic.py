@@ -47,12 +47,12 @@ Coverage = Float32[np.ndarray, "h w"]
 
 @cache
 def _measured(mosaic: Mosaic) -> Bool[np.ndarray, "2 2 3"]:
-    """Return where in a block each of R G B is measured."""
+    """Returns where in a block each of R G B is measured."""
     return np.array([[[name == each for each in "RGB"] for name in row] for row in (mosaic[:2], mosaic[2:])])
 
 
 def demosaicked(picture: Float32[np.ndarray, "h w c"], mosaic: Mosaic) -> Float32[np.ndarray, "h w c"]:
-    """Return R G B as interpolated from what the mosaic measures of them; the first pixel is a block's first."""
+    """Returns R G B as interpolated from what the mosaic measures of them; the first pixel is a block's first."""
     height, width = picture.shape[:2]
     blocks = (height + 1) // 2, (width + 1) // 2, 1
     samples = picture * np.tile(_measured(mosaic), blocks)[:height, :width]
@@ -65,7 +65,7 @@ def demosaicked(picture: Float32[np.ndarray, "h w c"], mosaic: Mosaic) -> Float3
 
 
 def find_mosaic(color: Color, response: Float32[np.ndarray, "256 3"] | None) -> Mosaic | None:
-    """Return the mosaic that a picture was interpolated from; None if that is not sure."""
+    """Returns the mosaic that a picture was interpolated from; None if that is not sure."""
     middle = tuple(max(length - EXAMINED_PX, 0) // 4 * 2 for length in color.shape[:2])
     part = color[middle[0] : middle[0] + EXAMINED_PX, middle[1] : middle[1] + EXAMINED_PX]
     changes = np.stack([_changes(part, each, response) for each in MOSAICS])
@@ -84,7 +84,7 @@ def find_mosaic(color: Color, response: Float32[np.ndarray, "256 3"] | None) -> 
 def _changes(
     color: Color, mosaic: Mosaic, response: Float32[np.ndarray, "256 3"] | None
 ) -> Float64[np.ndarray, " n"]:
-    """Return the mean square, in codes, by which sampling and interpolation change each block of a picture."""
+    """Returns the mean square, in codes, by which sampling and interpolation change each block of a picture."""
     again = _coded(demosaicked(_linear(color, response), mosaic), response)
     square = ((again - color) ** 2).mean(axis=-1)
     rows, columns = (length // BLOCK_PX for length in square.shape)
@@ -99,7 +99,7 @@ def _linear(color: Color, response: Float32[np.ndarray, "256 3"] | None) -> Floa
 def _coded(
     linear: Float32[np.ndarray, "h w 3"], response: Float32[np.ndarray, "256 3"] | None
 ) -> Float64[np.ndarray, "h w 3"]:
-    """Return codes, not yet rounded."""
+    """Returns codes, not yet rounded."""
     lut = decode_lut(response)
     return np.stack([np.interp(linear[..., c], lut[:, c], np.arange(256)) for c in range(3)], axis=-1)
 
@@ -107,7 +107,7 @@ def _coded(
 def mosaicked(
     color: Color, coverage: Coverage, mosaic: Mosaic, response: Float32[np.ndarray, "256 3"] | None
 ) -> tuple[Color, Coverage]:
-    """Return a picture whose virtual part was measured through a mosaic, and how much that covers then.
+    """Returns a picture whose virtual part was measured through a mosaic, and how much that covers then.
 
     Beside objects, colours that are interpolated from pixels of theirs change as well. All others are the same to the
     bit: they were interpolated by the camera.
@@ -133,7 +133,7 @@ class CameraMosaic:
         self._found: list[Mosaic | None] = []
 
     def observe(self, frame: ViewFrame) -> None:
-        """Look at a frame, until enough were seen."""
+        """Looks at a frame, until enough were seen."""
         if len(self._found) < MOST_EXAMINED:
             self._found.append(find_mosaic(frame.color, frame.response))
 

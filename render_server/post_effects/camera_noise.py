@@ -57,23 +57,23 @@ class NoiseModel:
         shot: Float64[np.ndarray, " 3"],
         correlation: tuple[float, float],
     ) -> Self:
-        """Return the noise of variance read + shot I."""
+        """Returns the noise of variance read + shot I."""
         return cls(read + shot * LEVELS[:, None], correlation)
 
     def variance(self, intensity: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """Return the variance at linear intensities, R G B."""
+        """Returns the variance at linear intensities, R G B."""
         curves = [np.interp(intensity[..., c], LEVELS, self.variances[:, c]) for c in range(3)]
         return np.stack(curves, axis=-1)
 
     def before_filter(self, kept: Float64[np.ndarray, " 3"]) -> "NoiseModel":
-        """Return the independent noise that becomes this in a filter that keeps such shares of variance, R G B."""
+        """Returns the independent noise that becomes this in a filter that keeps such shares of variance, R G B."""
         return NoiseModel(self.variances / kept, (0.0, 0.0))
 
 
 def estimate_noise(
     first: Color, second: Color, response: Float32[np.ndarray, "256 3"] | None
 ) -> NoiseModel | None:
-    """Return the noise of two pictures of a still scene; None if too much moves, or too little is exposed well."""
+    """Returns the noise of two pictures of a still scene; None if too much moves, or too little is exposed well."""
     lut = decode_lut(response)
     pair = [lut[each, np.arange(3)].astype(np.float64) for each in (first, second)]
     difference, mean = (pair[0] - pair[1]) / np.sqrt(2), (pair[0] + pair[1]) / 2
@@ -143,7 +143,7 @@ def _block_mean(values: Plane) -> Plane:
 
 
 def _bins(codes: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n 3"]:
-    """Return each mean code's bin, about equally full ones of whole codes.
+    """Returns each mean code's bin, about equally full ones of whole codes.
 
     Pairs whose mean is a whole code differ by an even number of codes, others by an odd one: a bin must hold both.
     """
@@ -160,7 +160,7 @@ def _fit_curve(
     lut: Float64[np.ndarray, " 256"],
     steps: Float64[np.ndarray, " 256"],
 ) -> Float64[np.ndarray, " k"]:
-    """Return variances at LEVELS by those of bins of intensity, without what rounding to codes adds."""
+    """Returns variances at LEVELS by those of bins of intensity, without what rounding to codes adds."""
     rows: list[tuple[float, float, float]] = []
     for number in range(BINS):
         inside = which == number
@@ -180,7 +180,7 @@ def _fit_curve(
 def _smoothed(
     values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
-    """Return means of each value and its neighbours, [1 2 1]: single bins hold few pixels."""
+    """Returns means of each value and its neighbours, [1 2 1]: single bins hold few pixels."""
     kernel = np.array([1.0, 2.0, 1.0])
     inside = slice(1, -1)  # `same` would be as long as the kernel for fewer values
     return np.asarray((np.convolve(values * weights, kernel) / np.convolve(weights, kernel))[inside])
@@ -200,7 +200,7 @@ def _non_negative_line(
 
 
 def _robust_variance(values: Float64[np.ndarray, " n"]) -> float:
-    """Return the mean square of deviations up to 4 robust sigmas: codes are too coarse for the median alone."""
+    """Returns the mean square of deviations up to 4 robust sigmas: codes are too coarse for the median alone."""
     sigma = GAUSSIAN * float(np.median(np.abs(values)))
     kept = values[np.abs(values) <= 4 * sigma] if sigma > 0 else values
     return float(np.mean(kept**2))
@@ -223,7 +223,7 @@ def add_noise(
     frame_id: int,
     response: Float32[np.ndarray, "256 3"] | None,
 ) -> Color:
-    """Return a picture with noise where virtual objects cover it; other pixels are the same to the bit.
+    """Returns a picture with noise where virtual objects cover it; other pixels are the same to the bit.
 
     The real part of an edge's pixel has its own share of noise; what is added completes its variance. Equal frame ids
     give equal noise.
@@ -253,7 +253,7 @@ def _unit_noise(
 
 
 def _kernel(correlation: float) -> Float64[np.ndarray, " 3"]:
-    """Return [k 1 k], scaled so that white noise keeps its variance."""
+    """Returns [k 1 k], scaled so that white noise keeps its variance."""
     k = 0.0 if correlation <= 0 else (1 - np.sqrt(1 - 2 * correlation**2)) / (2 * correlation)
     return np.asarray(np.array([k, 1, k]) / np.sqrt(1 + 2 * k * k))
 
@@ -266,11 +266,11 @@ class CameraNoise:
         self._found: list[NoiseModel] = []
 
     def forget(self) -> None:
-        """Forget everything: other frames come from another camera."""
+        """Forgets everything: other frames come from another camera."""
         self._last, self._found = None, []
 
     def observe(self, frame: ViewFrame) -> None:
-        """Compare a frame with the one before."""
+        """Compares a frame with the one before."""
         last = self._last
         if last is frame or len(self._found) >= MOST_PAIRS:
             return

@@ -60,7 +60,7 @@ class CameraSharpening:
         self.model: Sharpening | None = None
 
     def observe(self, edges: Sequence[EdgeStep], response: Float32[np.ndarray, "256 3"] | None) -> None:
-        """Take the edges of a frame; `response` as that of `decode_lut`."""
+        """Takes the edges of a frame; `response` as that of `decode_lut`."""
         profiles = [each.profile for each in edges if each.profile is not None]
         if len(profiles) >= LEAST_EDGES:
             self._fits += _fits(profiles, decode_lut(response)[:, 1])
@@ -80,7 +80,7 @@ class _Fit:
 
 
 def _best(fits: Sequence[_Fit]) -> Sharpening | None:
-    """Return the sharpening that explains most, each edge having a blur of its own: some may be out of focus.
+    """Returns the sharpening that explains most, each edge having a blur of its own: some may be out of focus.
 
     None if there are few edges, or if the amount is within its error or hardly overshoots.
     """
@@ -109,14 +109,14 @@ def _best(fits: Sequence[_Fit]) -> Sharpening | None:
 
 
 def _overshoot(sharpening: Sharpening) -> float:
-    """Return how far an edge along the pixels exceeds its bright side, as a fraction of its contrast."""
+    """Returns how far an edge along the pixels exceeds its bright side, as a fraction of its contrast."""
     step = _soft_steps(np.array([sharpening.variance - PIXEL_VARIANCE]))
     halo = _halos(step, np.array([1.0, 0.0]), np.array([sharpening.radius_px]))[:, 0]
     return float((step + sharpening.amount * halo).max() - 1)
 
 
 def _fits(profiles: Sequence[EdgeProfile], lut: Float32[np.ndarray, " 256"]) -> list[_Fit]:
-    """Return the fits of edges of about equal contrast, whose lens blurs light and whose camera sharpens codes."""
+    """Returns the fits of edges of about equal contrast, whose lens blurs light and whose camera sharpens codes."""
     dark, bright = np.median([each.levels for each in profiles], axis=0)
     low, high = np.interp([dark, bright], np.arange(256), lut)
     light = low + (high - low) * _soft_steps(VARIANCES + BIN_PX**2 / 12)
@@ -143,7 +143,7 @@ def _fit(profile: EdgeProfile, steps: Float64[np.ndarray, "v g"], halfway: Float
 
 
 def _soft_steps(variances: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, "v g"]:
-    """Return a step blurred by Gaussians and the width of a pixel, at GRID_PX: integrals of erf."""
+    """Returns a step blurred by Gaussians and the width of a pixel, at GRID_PX: integrals of erf."""
     from scipy.special import erf
 
     sigma = np.sqrt(variances)[:, None]
@@ -156,7 +156,7 @@ def _soft_steps(variances: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, "v 
 def _halos(
     steps: Float64[np.ndarray, "v g"], across: Float64[np.ndarray, " 2"], radii_px: Float64[np.ndarray, " r"]
 ) -> Float64[np.ndarray, "v r g"]:
-    """Return what unsharp masks of amount 1 add to steps across a direction in the picture.
+    """Returns what unsharp masks of amount 1 add to steps across a direction in the picture.
 
     Along a line across the edge a kernel that is sampled at pixels has the transform K(f cos) K(f sin).
     """
@@ -170,7 +170,7 @@ def _halos(
 
 
 def _transform(radius_px: float, frequency: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " f"]:
-    """Return the transform of the mask's kernel along rows or columns, as OpenCV samples it."""
+    """Returns the transform of the mask's kernel along rows or columns, as OpenCV samples it."""
     size = _size(radius_px)
     offsets = np.arange(size) - size // 2
     return np.asarray(
@@ -183,7 +183,7 @@ def _size(radius_px: float) -> int:
 
 
 def _at(tables: Float64[np.ndarray, "*v g"], x: Float64[np.ndarray, "*v n"]) -> Float64[np.ndarray, "*v n"]:
-    """Return functions tabulated at GRID_PX elsewhere, linearly."""
+    """Returns functions tabulated at GRID_PX elsewhere, linearly."""
     place = (x - GRID_PX[0]) / (GRID_PX[1] - GRID_PX[0])
     index = np.broadcast_to(place.astype(int), (*tables.shape[:-1], x.shape[-1]))
     below, above = (np.take_along_axis(tables, index + step, axis=-1) for step in (0, 1))
@@ -191,7 +191,7 @@ def _at(tables: Float64[np.ndarray, "*v g"], x: Float64[np.ndarray, "*v n"]) -> 
 
 
 def sharpened(color: Color, coverage: Coverage, sharpening: Sharpening) -> Color:
-    """Return a picture whose virtual part is sharpened, with halos around it; `coverage` is its share of pixels.
+    """Returns a picture whose virtual part is sharpened, with halos around it; `coverage` is its share of pixels.
 
     The camera's own picture is sharpened already, so what it would get without objects is left out: the detail of
     what is behind them, which continues the picture around. Pixels that no halo changes stay as they are, to the bit.

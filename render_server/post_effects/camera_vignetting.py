@@ -39,7 +39,7 @@ class Vignetting:
     mean: float
 
     def factors(self, camera: CameraModel) -> Float32[np.ndarray, "h w"]:
-        """Return the factor at each pixel."""
+        """Returns the factor at each pixel."""
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         r = _radii(camera, np.stack([columns, rows], axis=-1))
         logarithm = _powers(np.minimum(r, self.reach)) @ self.logarithm - self.mean
@@ -64,7 +64,7 @@ class PaperVignetting:
         self.model: Vignetting | None = None
 
     def observe(self, frame: ViewFrame) -> None:
-        """Take a frame, if the paper is elsewhere in it than in the one before."""
+        """Takes a frame, if the paper is elsewhere in it than in the one before."""
         if len(self._frames) >= MOST_FRAMES or frame.exposure_s is None:
             return
         seen = _paper(frame)
@@ -79,7 +79,7 @@ class PaperVignetting:
 
 
 def _fitted(frames: list[_Seen]) -> Vignetting | None:
-    """Fit the falloff, twice because of outliers; None if it is not significant."""
+    """Fits the falloff, twice because of outliers; None if it is not significant."""
     patches, radii, logarithm = (
         np.concatenate([getattr(each, name) for each in frames]) for name in ("patches", "radii", "logarithm")
     )
@@ -105,7 +105,7 @@ def _fitted(frames: list[_Seen]) -> Vignetting | None:
 def _without_patch_means(
     values: Float64[np.ndarray, "n ..."], names: np.ndarray
 ) -> Float64[np.ndarray, "n ..."]:
-    """Return values less the mean over all frames of their patch, whose light is not known."""
+    """Returns values less the mean over all frames of their patch, whose light is not known."""
     table = values.reshape(len(values), -1)
     count = np.maximum(np.bincount(names), 1)
     means = np.stack([np.bincount(names, column) / count for column in table.T], axis=1)
@@ -113,7 +113,7 @@ def _without_patch_means(
 
 
 def _paper(frame: ViewFrame) -> _Seen | None:
-    """Read the patches of the board's paper that a frame shows well; None if it shows none."""
+    """Reads the patches of the board's paper that a frame shows well; None if it shows none."""
     if frame.board is None or frame.pose is None:
         return None
     quads = frame.board.paper_patches()
@@ -145,7 +145,7 @@ def _half_diagonal(camera: CameraModel) -> float:
 
 
 def _radii(camera: CameraModel, pixels: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n"]:
-    """Return distances from the principal point, in half diagonals of the picture."""
+    """Returns distances from the principal point, in half diagonals of the picture."""
     return np.asarray(np.linalg.norm(pixels - camera.matrix[:2, 2], axis=-1) / _half_diagonal(camera))
 
 
@@ -159,7 +159,7 @@ def vignetted(
     factors: Float32[np.ndarray, "h w"],
     frame: ViewFrame,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a picture whose virtual part darkens as the camera's does; other pixels are the same to the bit."""
+    """Returns a picture whose virtual part darkens as the camera's does; other pixels are the same to the bit."""
     covered = coverage > 0
     if not covered.any():
         return color

@@ -43,7 +43,7 @@ class Bvh:
     def packed_triangles(
         self, corners: Float32[np.ndarray, "m 3 3"], vertices: Int32[np.ndarray, "m 3"]
     ) -> bytes:
-        """Pack triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex."""
+        """Packs triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex."""
         rows = np.empty((len(self.order), 3, 4), np.float32)
         first = corners[self.order, 0]
         rows[:, 0, :3] = first

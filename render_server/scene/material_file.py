@@ -81,7 +81,7 @@ def read_material(path: Path) -> PrecomputedMaterial:
 
 
 def _unpacked(content: bytes) -> Mapping[str, object]:
-    """The members of an archive, arrays if it is a material's; none if it is none."""
+    """Returns the arrays of a material's archive by name; empty if the file is no such archive."""
     try:
         with ZipFile(BytesIO(content)) as archive:
             if sum(item.file_size for item in archive.infolist()) > _LARGEST_BYTES:
@@ -93,7 +93,7 @@ def _unpacked(content: bytes) -> Mapping[str, object]:
 
 
 def _made(arrays: Mapping[str, Any]) -> PrecomputedMaterial | None:
-    """The material of these arrays; None if they are none."""
+    """Returns the material that the arrays describe; None if they describe none."""
     # A member that is no array comes as bytes.
     if any(not isinstance(each, np.ndarray) or each.dtype.kind != "f" for each in arrays.values()):
         return None

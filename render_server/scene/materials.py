@@ -1,7 +1,6 @@
 """Surface materials of virtual and modelled real objects, from scenes and asset files."""
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
@@ -13,12 +12,10 @@ from PIL import Image
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Material as MaterialDocument
-from deltalight.render_server.scene.gaussian_brdf import TABLE_TEXELS, GaussianBrdf
+from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.texture_maps import TextureMap, TextureReader, linear_texture
-from deltalight.render_server.scene.texture_stack import TextureStack
 from deltalight.render_server.scene.textures_by_light import TextureByLight
 
-MATERIAL_FLOATS, COATING_FLOATS = 20, 8
 DARKEST_ATTENUATION = 1e-4  # black has no logarithm
 COAT_F0 = 0.04  # reflectance of a clear coat at normal incidence, of index 1.5
 MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
@@ -242,22 +239,37 @@ class Material:
         Raises:
             GltfFaultError: a texture cannot be used.
         """
-        pbr = description.get("pbrMetallicRoughness", {})
-        extensions = description.get("extensions", {})
+        pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
+        color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
+        material = cls._with_gltf_factors(description, color[:3])._with_gltf_maps(description, textures)
+        mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
+        base_map = textures.color(pbr.get("baseColorTexture"), with_alpha=mode != AlphaMode.OPAQUE)
+        material = replace(material, base_color_map=base_map)
+        cutoff = float(description.get("alphaCutoff", 0.5))
+        if mode == AlphaMode.MASK and vertices_have_alpha:
+            material = material._masked_by_vertices(float(color[3]), cutoff)
+        else:
+            material = material._with_alpha(mode, float(color[3]), cutoff)
+        if "KHR_materials_unlit" in extensions:
+            return material._unlit()
+        return material if material.is_coated else material._without_coating()
+
+    @classmethod
+    def _with_gltf_factors(cls, description: dict[str, Any], base_color: Float32[np.ndarray, "3"]) -> Self:
+        """Makes a material without textures; alpha follows."""
+        pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-        specular = extensions.get("KHR_materials_specular", {})
         transmission = extensions.get("KHR_materials_transmission", {})
         volume = extensions.get("KHR_materials_volume", {})
         coat = extensions.get("KHR_materials_clearcoat", {})
         sheen = extensions.get("KHR_materials_sheen", {})
-        color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
         is_double_sided = bool(description.get("doubleSided", False))
-        material = cls(
-            base_color=color[:3],
+        return cls(
+            base_color=base_color,
             metallic=float(pbr.get("metallicFactor", 1.0)),
             roughness=float(pbr.get("roughnessFactor", 1.0)),
             ior=extensions.get("KHR_materials_ior", {}).get("ior"),
-            f0_tint=_f0_tint(specular),
+            f0_tint=_f0_tint(extensions.get("KHR_materials_specular", {})),
             emission=np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
             transmission=float(transmission.get("transmissionFactor", 0.0)),
             is_thin=not volume.get("thicknessFactor", 0.0),
@@ -269,6 +281,18 @@ class Material:
             sheen_roughness=float(sheen.get("sheenRoughnessFactor", 0.0)),
             double_sided=is_double_sided,
             hides_back=not is_double_sided,
+            name=str(description.get("name", "")),
+        )
+
+    def _with_gltf_maps(self, description: dict[str, Any], textures: TextureReader) -> Self:
+        """Returns the material with its textures, but for that of the base colour."""
+        pbr, extensions = description.get("pbrMetallicRoughness", {}), description.get("extensions", {})
+        specular = extensions.get("KHR_materials_specular", {})
+        transmission = extensions.get("KHR_materials_transmission", {})
+        coat = extensions.get("KHR_materials_clearcoat", {})
+        sheen = extensions.get("KHR_materials_sheen", {})
+        return replace(
+            self,
             metallic_roughness_map=textures.data(pbr.get("metallicRoughnessTexture")),
             normal_map=textures.data(description.get("normalTexture"), "scale"),
             occlusion_map=textures.data(description.get("occlusionTexture"), "strength"),
@@ -281,19 +305,7 @@ class Material:
             specular_map=textures.color(specular.get("specularTexture"), with_alpha=True),
             specular_color_map=textures.color(specular.get("specularColorTexture"), with_alpha=True),
             transmission_map=textures.data(transmission.get("transmissionTexture")),
-            name=str(description.get("name", "")),
         )
-        mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
-        base_map = textures.color(pbr.get("baseColorTexture"), with_alpha=mode != AlphaMode.OPAQUE)
-        material = replace(material, base_color_map=base_map)
-        cutoff = float(description.get("alphaCutoff", 0.5))
-        if mode == AlphaMode.MASK and vertices_have_alpha:
-            material = material._masked_by_vertices(float(color[3]), cutoff)
-        else:
-            material = material._with_alpha(mode, float(color[3]), cutoff)
-        if "KHR_materials_unlit" in extensions:
-            return material._unlit()
-        return material if material.is_coated else material._without_coating()
 
     def _masked_by_vertices(self, factor: float, cutoff: float) -> Self:
         """Returns the material with a mask that vertices' alpha multiplies, so that shaders compare; all passes 0."""
@@ -418,71 +430,3 @@ def _mean_red(each: TextureMap | None) -> float:
 
 def _first(value: Any, default: float) -> float:  # noqa: ANN401 - as in the file
     return default if value is None else float(np.atleast_1d(value)[0])
-
-
-def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]:
-    """Packs materials for a shader, five vectors each.
-
-    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (1 double sided, -1 not seen from
-    behind, row + 1 of `measured_table`, 0: not measured, a place that the GPU knows, layers of a stack, -1: unlit),
-    (absorption 1/m, index of refraction; 0: thin).
-    """
-    measured = 0
-    table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
-    for row, material in zip(table, materials, strict=True):
-        row[0:4] = *material.base_color, material.metallic
-        row[4:8] = *material.dielectric_f0, material.roughness
-        row[8:12] = *material.emission, material.transmission
-        row[12] = -1.0 if material.hides_back else material.double_sided
-        if material.measured is not None:
-            measured += 1
-            row[13] = measured
-        if isinstance(material.by_light, TextureStack):
-            row[15] = len(material.by_light.layers)
-        elif material.is_unlit:
-            row[15] = -1
-        row[16:20] = *material.absorption_per_m, 0.0 if material.is_thin else material.refraction_index
-    return table
-
-
-def coating_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 8"]:
-    """Packs what lies over the bases, two vectors each: (coat, its roughness, the sheen's, 0), (sheen R G B, 0)."""
-    table = np.zeros((len(materials), COATING_FLOATS), np.float32)
-    for row, material in zip(table, materials, strict=True):
-        row[:3] = material.coat, material.coat_roughness, material.sheen_roughness
-        row[4:7] = material.sheen
-    return table
-
-
-def measured_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 93 4"]:
-    """Returns the rows of the measured ones among the materials (common/measured.glsl)."""
-    rows = [material.measured.table_row() for material in materials if material.measured is not None]
-    return np.array(rows, np.float32).reshape(-1, TABLE_TEXELS, 4)
-
-
-def map_table(
-    materials: Sequence[Material],
-    repeats_per_m: Float32[np.ndarray, " k"],
-    layer_of: Callable[[TextureMap], int],
-    count: int,
-) -> Float32[np.ndarray, "k _"]:
-    """Packs alpha and the first `count` maps for a shader, 1 + 3 `count` vectors each, behind all other rows.
-
-    (alpha mode, alpha, repeats of the base colour's map a metre, `vertex_cutoff` or 0); for each map (row of u,
-    layer or -1), (row of v, set of coordinates), (wraps, across + 3 down; columns and rows of an unfiltered texture,
-    else 0; strength).
-    """
-    table = np.zeros((len(materials), 4 + 12 * count), np.float32)
-    table[:, 7::12] = -1
-    for row, material, repeats in zip(table, materials, repeats_per_m, strict=True):
-        row[:4] = material.alpha_mode, material.alpha, repeats, material.vertex_cutoff or 0.0
-        for place, each in enumerate(material.maps[:count]):
-            if each is not None:
-                row[4 + 12 * place :][:12] = _map_entry(each, layer_of(each))
-    return table
-
-
-def _map_entry(each: TextureMap, layer: int) -> tuple[float, ...]:
-    height, width = each.texels.shape[:2] if each.is_nearest else (0, 0)
-    wraps = float(each.wraps[0] + 3 * each.wraps[1])
-    return (*each.from_uv[0], layer, *each.from_uv[1], each.uv_set, wraps, width, height, each.strength)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def no_lamps(_world_from_asset: Float64[np.ndarray, "4 4"]) -> tuple[Light, ...]:
-    """Of a file that holds no lights."""
+    """Returns no lights, for files that have none."""
     return ()
 
 

@@ -14,7 +14,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.render_server.scene.depth_surface import MAX_SLOPE, noise_sigma
-from deltalight.render_server.scene.threads import begun
+from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.view import LENSES_KEPT
 
 GRID_STEP_PX = 4
@@ -113,7 +113,7 @@ class MotionDetector:
         """Begins to compare the frame that is taken next, on another thread."""
         if self._reference is not None:
             compare = partial(_has_changed, self._reference, coming, self._thresholds)
-            self._expected = coming, begun(compare)
+            self._expected = coming, submit(compare)
 
     def update(self, current: FrameSamples) -> bool:
         """Returns whether anything moved; if so, the frame becomes the reference."""
@@ -184,7 +184,7 @@ class KeptWorld:
     def explained_before(self, new: FrameSamples) -> bool:
         """Returns whether the scene explained the frame before; compares this one meanwhile, on another thread.
 
-        For who has a frame done in a fraction of the time that the camera takes for one.
+        For renderers that finish a frame in a fraction of the camera's frame time.
         """
         before = self._newest
         self._compare(new)
@@ -193,14 +193,14 @@ class KeptWorld:
     def _compare(self, new: FrameSamples) -> "_Comparison":
         old, newest = self.built_from, self._newest
         if newest is None or newest.old is not old or newest.new is not new:
-            newest = _Comparison(old, new, begun(partial(_explains, old, new, self._thresholds)))
+            newest = _Comparison(old, new, submit(partial(_explains, old, new, self._thresholds)))
             self._newest = newest
         return newest
 
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Whether the scene that was built from a frame, None: none was, explains another one."""
+    """Whether the scene built from one frame explains another; None if no scene was built."""
 
     old: FrameSamples | None
     new: FrameSamples

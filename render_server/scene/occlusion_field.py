@@ -34,7 +34,7 @@ PartKeeper = Callable[[str, Callable[[], np.ndarray]], np.ndarray]
 
 
 def compute_part(_name: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
-    """Keeps nothing (a `PartKeeper`)."""
+    """Computes a part and keeps nothing (a `PartKeeper`)."""
     return compute()
 
 

@@ -1,4 +1,4 @@
-"""What a smooth plane should mirror, by what the same picture shows elsewhere: the mirror images of its points."""
+"""Predicts what a smooth plane should reflect, by mirroring what the same picture shows elsewhere."""
 
 from dataclasses import dataclass
 

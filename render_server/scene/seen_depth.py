@@ -1,4 +1,4 @@
-"""Depth images that all cameras of a room took at one moment: what numpy makes of them, when asked."""
+"""Depth images that all cameras of a room took at one moment, and what NumPy computes from them on demand."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64
 from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, back_faces, bound_points, depth_mesh
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.grazing_depth import grazing_depth_fill
-from deltalight.render_server.scene.threads import begun
+from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import PosedFrame
 
@@ -25,7 +25,7 @@ class SeenDepth:
     def __init__(self, frames: Sequence[PosedFrame], surfaces: Sequence[Callable[[], PosedSurface]]) -> None:
         self.frames = tuple(frames)
         self._surfaces = tuple(surfaces)
-        self.grazing: list[Grazing] = [begun(partial(_grazing_depth, each)).result for each in frames]
+        self.grazing: list[Grazing] = [submit(partial(_grazing_depth, each)).result for each in frames]
 
     @cached_property
     def views(self) -> DepthViews:
@@ -38,7 +38,7 @@ class SeenDepth:
         Those of the first camera are found then: to wait for another thread takes longer.
         """
         most, (first, *others) = BOUND_POINTS // len(self.frames), self.frames
-        found = [begun(partial(_bound_points, each, most)) for each in others]
+        found = [submit(partial(_bound_points, each, most)) for each in others]
         return lambda: np.concatenate([_bound_points(first, most), *(each.result() for each in found)])
 
     def meshes(self, triangle_budget: int) -> list[TriangleMesh]:
@@ -52,7 +52,7 @@ class SeenDepth:
     def without_backs_in_sight(
         self, corners: Float32[np.ndarray, "m 3 3"], voxel_edge: float
     ) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
-        """Returns the numbers of the triangles whose `back_faces` do not lie where a camera sees that nothing is."""
+        """Returns the numbers of the triangles whose `back_faces` lie in no space that a camera sees to be empty."""
         middles = back_faces(corners, voxel_edge).mean(axis=1, dtype=np.float64)
         return np.flatnonzero(~self.views.in_free_space(middles)).astype(np.int32)
 

@@ -1,4 +1,4 @@
-"""Work on other threads: NumPy and OpenCV let them run while they compute."""
+"""Work on other threads, for NumPy and OpenCV: both release the interpreter lock while they compute."""
 
 import os
 from collections.abc import Callable
@@ -8,12 +8,12 @@ from typing import TypeVar
 
 Result = TypeVar("Result")
 
-# Threads wait for the interpreter around each call of NumPy: with less to do in each, two are no faster than one.
+# Threads wait for that lock around each call of NumPy: with smaller bands, two are no faster than one.
 LEAST_BAND_ROWS = 320
 
 
-def begun(call: Callable[[], Result]) -> "Future[Result]":
-    """Begins a call on another thread."""
+def submit(call: Callable[[], Result]) -> "Future[Result]":
+    """Starts a call on another thread."""
     return _threads().submit(call)
 
 
@@ -31,7 +31,7 @@ def by_bands(work: Callable[[slice], None], rows: int) -> None:
         for part in pending:
             work(part)
 
-    helpers = [begun(work_on) for _ in range(bands - 1)]
+    helpers = [submit(work_on) for _ in range(bands - 1)]
     work_on()
     for each in helpers:
         if not each.cancel():

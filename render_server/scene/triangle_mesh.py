@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene.asset_check import MAX_TRIANGLES
-from deltalight.render_server.scene.materials import Material, material_table
+from deltalight.render_server.scene.material_tables import material_table
+from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.texture_maps import TextureMap
 
 # Scanned meshes of 100k triangles are full of edges beyond 40 degrees that nobody means to be sharp.

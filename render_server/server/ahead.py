@@ -1,7 +1,7 @@
-"""What a spare render server builds ahead: the context and the renderer of the scene that another one shows now.
+"""What a spare render server (a warm standby) builds ahead: a context, and a renderer of the running server's scene.
 
-It reads the same document and nodes as that one, publishes nothing and listens nowhere. Its renderer has rendered
-pictures of each camera, so that programs, passes and what is measured first are there when it is needed.
+It reads the same document and nodes as the running server, publishes nothing and opens no socket for others. Its
+renderer renders pictures of each camera, so that shaders are compiled and estimates made before it is needed.
 """
 
 import time
@@ -45,7 +45,7 @@ log = structlog.get_logger()
 
 
 class _File(NamedTuple):
-    """What tells whether a file was written since."""
+    """The state of a file, by which later writes are noticed."""
 
     path: str
     written_ns: int
@@ -65,9 +65,10 @@ class _Built:
 
 
 class Ahead:
-    """Keeps a renderer ready for the settings of a server that runs; `is_called` ends that, and waits so long for it.
+    """Keeps a renderer ready to take over from a running server with these settings.
 
-    One that cannot be built, or for which there is no memory, is not tried again before the document changes.
+    `is_called` waits for so many seconds and returns whether the spare must take over. A renderer that cannot be
+    built, or for which there is no memory, is not tried again before the document changes.
     """
 
     def __init__(self, settings: ServerSettings, keys: Keys | None, is_called: IsCalled) -> None:
@@ -78,7 +79,7 @@ class Ahead:
         self._is_done = False  # with this document
 
     def keep(self) -> None:
-        """Builds, anew after each change of the document, until it is called."""
+        """Builds the renderer, again after each change of the document, until the spare is called."""
         while not self._is_called(LOOK_INTERVAL_S):
             try:
                 self._look()
@@ -91,7 +92,7 @@ class Ahead:
     def take(
         self, settings: ServerSettings, scene: SceneDocument
     ) -> tuple[GpuContext | None, SceneRenderer | None]:
-        """Returns what serves these settings and this scene; None for what has to be made. The rest is freed."""
+        """Returns the context and renderer if they fit these settings and this scene, else None; frees the rest."""
         if self._gpu is not None and not self._fits(self._gpu, settings):
             self._release()
         built = self._built
@@ -133,7 +134,7 @@ class Ahead:
             self._build()
 
     def _shows_document(self) -> bool:
-        """Returns whether what was built last is the document as it is now."""
+        """Returns whether the renderer was built from the document as it is now."""
         built = self._built
         return built is not None and self._is_current(built, self._settings, self._settings.initial_scene())
 

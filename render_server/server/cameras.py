@@ -1,4 +1,4 @@
-"""The cameras of a room: each node's streams are paired for themselves, their newest frames are rendered together.
+"""The cameras of a room: streams are paired for each node, and the cameras' newest frames are rendered together.
 
 A node is a camera once it has sent a complete frame. It keeps its place among the others while it is left out: it is
 silent, sees another board than the first one, or its frames are of another time. What one that is silent or late saw
@@ -15,8 +15,8 @@ import structlog
 
 from deltalight.protocol.messages import MAX_CAMERAS, CameraEntry, CameraStatus, Message
 from deltalight.protocol.subscriber import ReceivedMultipart
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, PairingSettings
-from deltalight.render_server.started_frame import CameraFrame
 
 SILENT_NS = 2 * 10**9  # without a frame; or this many of the camera's periods, if they are longer
 SILENT_PERIODS = 5
@@ -74,7 +74,7 @@ class _Place:
         return max(SILENT_NS, SILENT_PERIODS * self.period_ns)
 
     def entry(self) -> CameraEntry:
-        """Returns what receivers of pictures are told of it."""
+        """Returns its entry in the message for receivers of pictures."""
         header = self.newest.color
         return CameraEntry(
             node=self.name,
@@ -312,7 +312,7 @@ def _captured_ns(place: _Place) -> int:
 
 
 def _is_of_the_time_of(place: _Place, newest: _Place) -> bool:
-    """Whether a frame was taken about when the other one was; also where clocks were never compared."""
+    """Whether two frames were taken at about the same time; true too where clocks were never compared."""
     one, two = place.newest.color, newest.newest.color
     if one.clock_bound_ns is None or two.clock_bound_ns is None:
         return True

@@ -42,7 +42,7 @@ Built = TypeVar("Built")
 Kind = TypeVar("Kind", bound=MessageBase)
 
 
-class SourceOrder(StrictModel):
+class SourceRequest(StrictModel):
     """Endpoints to read frames from; null = those that were configured."""
 
     endpoints: tuple[str, ...] | None = Field(min_length=1, max_length=MAX_ENDPOINTS)

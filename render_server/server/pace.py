@@ -14,18 +14,18 @@ POLL_S = 0.02
 CPU_TIMES = Path("/proc/stat")
 
 IsCalled = Callable[[float], bool]
-"""Waits so many seconds at most to be called; returns whether it is."""
+"""Waits for at most so many seconds; returns whether the spare was called to take over."""
 
 
 class CalledError(BaseException):
-    """What is being built is needed now, and is not ready."""
+    """The spare must take over before what it builds is ready."""
 
 
 class Pace:
-    """Rests between kernels and programs until it is called, and ends what is being built there if it `may_end`.
+    """Throttles a spare by rests between kernels, until it is called; then ends what it builds if it `may_end`.
 
-    In software it takes a third of the processor time that others leave. A lower priority would not do: a process
-    without privileges does not get its own back, and a GPU knows none.
+    In software the spare takes a third of the processor time that others leave. A lower priority would not do: a
+    process without privileges cannot raise it again, and a GPU has no priorities.
     """
 
     def __init__(self, gpu: GpuContext, is_called: IsCalled) -> None:
@@ -36,7 +36,7 @@ class Pace:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Keeps the pace in the block."""
+        """Context that is throttled."""
         watchers = self._gpu.watchers, self._gpu.compile_watchers
         for each in watchers:
             each.append(self._rest)

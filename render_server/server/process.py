@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -33,12 +34,7 @@ from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.render_server.frame_budget import HeldLevels
-from deltalight.render_server.gpu.context import (
-    CompileWatcher,
-    GpuContext,
-    count_gl_objects,
-    create_context,
-)
+from deltalight.render_server.gpu.context import CompileWatcher, GpuContext, count_gl_objects, create_context
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
@@ -212,7 +208,7 @@ class BuiltAhead(Protocol):
     def take(
         self, settings: ServerSettings, scene: SceneDocument
     ) -> tuple[GpuContext | None, SceneRenderer | None]:
-        """Returns what serves these settings and this scene; None for what has to be made."""
+        """Returns the context and renderer if they fit these settings and this scene, else None."""
 
 
 def _topic(item: Sendable) -> str:
@@ -285,17 +281,10 @@ def serve(
         stack.callback(sender.close)
         source = FrameSource(settings.subscribe, keys)
         stack.callback(source.close)
-
-        def use_source(endpoints: Sequence[str] | None) -> SourceInUse:
-            is_another = source.use(endpoints)
-            if is_another:
-                sender.forget()
-            return SourceInUse(source.endpoints, is_another)
-
-        def drops() -> dict[str, int]:
-            refused = {"commands_not_allowed": replies.not_allowed} if replies.not_allowed else {}
-            return {"send": sender.dropped, **source.drops, **refused}
-
+        commands = CommandQueue()
+        replies = ReplyServer(settings.control, commands.ask, node=settings.name, keys=keys)
+        stack.callback(replies.close)
+        stack.callback(commands.close)
         session = RenderSession(
             renderer,
             scene,
@@ -305,22 +294,32 @@ def serve(
             renderer_name=renderer_name,
             keep_scene=lambda kept: _keep(settings.session, kept),
             endpoints=len(source.endpoints),
-            use_source=use_source,
+            use_source=partial(_use_source, source, sender),
             count_objects=count_objects,
-            mailbox_drops=drops,
+            mailbox_drops=partial(_drops, source, sender, replies),
         )
         if compile_watchers is not None:
             compile_watchers.append(_Preparation(session, sender))
-        commands = CommandQueue()
-        replies = ReplyServer(settings.control, commands.ask, node=settings.name, keys=keys)
-        stack.callback(replies.close)
-        stack.callback(commands.close)
         log.info("render server runs", renderer=renderer_name, publish=settings.publish)
         try:
             _loop(session, source, sender, commands)
         except GpuResetError as fault:
             sender.say_last(session.stats(ends_by=fault))
             raise
+
+
+def _use_source(source: FrameSource, sender: Sender, endpoints: Sequence[str] | None) -> SourceInUse:
+    """Reads other endpoints; pictures of the old ones that wait to be sent are discarded."""
+    is_another = source.use(endpoints)
+    if is_another:
+        sender.forget()
+    return SourceInUse(source.endpoints, is_another)
+
+
+def _drops(source: FrameSource, sender: Sender, replies: ReplyServer) -> dict[str, int]:
+    """Returns the number of messages that were dropped, by topic or reason."""
+    refused = {"commands_not_allowed": replies.not_allowed} if replies.not_allowed else {}
+    return {"send": sender.dropped, **source.drops, **refused}
 
 
 class _Preparation:

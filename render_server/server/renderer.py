@@ -1,4 +1,4 @@
-"""What a session asks of the renderer: `SceneRenderer` answers it, and so do the stand-ins of tests."""
+"""The interface between session and renderer: `SceneRenderer` implements it, and so do fakes in tests."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,8 +11,8 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.frame_budget import Level
-from deltalight.render_server.started_frame import CameraFrame
 
 
 class OtherView(Protocol):

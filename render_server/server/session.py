@@ -8,20 +8,17 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import structlog
 from jaxtyping import Float64, UInt8
-from pydantic import ConfigDict, Field
 
-from deltalight.protocol.documents import StrictModel, nearest, validate
+from deltalight.protocol.documents import nearest, validate
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import as_counts, as_sentence
 from deltalight.protocol.messages import (
-    MAX_OTHERS,
     CamerasMessage,
     CameraStatus,
     CompositeMessage,
@@ -36,9 +33,10 @@ from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.gpu.context import is_software_renderer
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.cameras import RoomCameras, Taken
-from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceOrder
+from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceRequest
 from deltalight.render_server.server.renderer import Pending, Renderer
-from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
+from deltalight.render_server.server.requests import PickRequest, RoomMeshRequest, WatchRequest
+from deltalight.render_server.server.snapshot import SnapshotRequest, take_snapshot
 
 RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
@@ -49,32 +47,6 @@ WATCHED_NS = 60 * 10**9
 SOME_SHADERS = 60  # of a first picture; that of the demo has 57
 
 log = structlog.get_logger()
-
-
-class PickOrder(StrictModel):
-    """A pixel of the composite (centres are at integers), and an object to look through.
-
-    `camera`: whose picture; None = the first one's.
-    """
-
-    model_config = ConfigDict(strict=True)
-
-    x: float
-    y: float
-    ignore: str | None = None
-    camera: str | None = None
-
-
-class WatchOrder(StrictModel):
-    """The views that somebody looks at."""
-
-    views: tuple[ShownView, ...] = Field(max_length=MAX_OTHERS + 1)
-
-
-class RoomOrder(StrictModel):
-    """The GLB file to write the real scene to, on the render server's host."""
-
-    file: Path
 
 
 @dataclass(frozen=True)
@@ -114,13 +86,26 @@ def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
 
 
 class RenderSession:
-    """Holds one scene, its renderer and the frames that wait for it.
+    """Holds one scene, its renderer and the frames that wait for it. Frames are rendered in the `watched` views, too.
 
-    Frames are rendered in the views `watched`, too. `scene_id` is the sender's id of the scene, if given; `instance`
-    distinguishes this session from those before a restart, and `epoch` orders the render servers of a room.
-    `keep_scene` is called with every accepted scene, so that a restart can resume with it; `mailbox_drops` returns
-    what the receiver dropped, by topic; so many `endpoints` are read at first, and `use_source` makes it read others
-    (None: those configured); `count_objects` returns what the GPU holds, by kind.
+    Attributes:
+        scene: the scene document.
+        scene_id: the sender's id of the scene, if given.
+        instance: distinguishes this session from those before a restart.
+
+    Args:
+        renderer: renders the frames.
+        scene: the first scene.
+        pairing: how frames of colour and depth, and of several cameras, are paired.
+        name: the render server's name.
+        epoch: orders the render servers of a room.
+        renderer_name: the device's, for statistics.
+        keep_scene: is called with every accepted scene, so that a restart can resume with it.
+        mailbox_drops: returns the number of messages that the receiver dropped, by topic.
+        endpoints: how many are read at first.
+        use_source: reads other endpoints (None: those configured).
+        count_objects: returns the number of objects on the GPU, by kind.
+        clock_ns: the time.
     """
 
     def __init__(
@@ -308,7 +293,7 @@ class RenderSession:
 
     def _watch(self, request: ControlRequest) -> dict[str, object]:
         """Renders frames in these views too from now on, and in those of other senders."""
-        views = validate(WatchOrder, request.payload, "the command watch").views
+        views = validate(WatchRequest, request.payload, "the command watch").views
         self._watchers[request.node] = (self._clock_ns(), views)
         return {"views": list(self.watched)}
 
@@ -324,16 +309,16 @@ class RenderSession:
         return {}
 
     def _pick(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(PickOrder, request.payload, "the command pick")
-        return self._renderer.pick(order.x, order.y, order.ignore, order.camera).as_dict()
+        wanted = validate(PickRequest, request.payload, "the command pick")
+        return self._renderer.pick(wanted.x, wanted.y, wanted.ignore, wanted.camera).as_dict()
 
     def _room(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(RoomOrder, request.payload, "the command room")
+        order = validate(RoomMeshRequest, request.payload, "the command room")
         self._renderer.room().write(order.file)
         return {}
 
     def _snapshot(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(SnapshotOrder, request.payload, "the command snapshot")
+        order = validate(SnapshotRequest, request.payload, "the command snapshot")
         wanted = self._newest[:1] if order.camera is None else self._newest
         frame = next((each.frame for each in wanted if order.camera in (None, each.camera)), None)
         if frame is None:
@@ -349,7 +334,7 @@ class RenderSession:
         }
 
     def _set_source(self, request: ControlRequest) -> dict[str, object]:
-        order = validate(SourceOrder, request.payload, "the command set_source")
+        order = validate(SourceRequest, request.payload, "the command set_source")
         self._finish_started()
         source = self._use_source(order.endpoints)
         if source.is_another:

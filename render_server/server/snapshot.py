@@ -17,7 +17,7 @@ from deltalight.protocol.frames import ViewFrame, linear_color
 from deltalight.protocol.message_fields import Name
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.protocol.scene import SceneDocument, parse_scene
-from deltalight.render_server.started_frame import CameraFrame
+from deltalight.render_server.camera_frames import CameraFrame
 
 CAMERA_VIEW = "camera"
 EXR_NAME = "composite.exr"
@@ -32,7 +32,7 @@ class SnapshotPicture(StrictModel):
     method: dict[str, Any] | None = None
 
 
-class SnapshotOrder(StrictModel):
+class SnapshotRequest(StrictModel):
     """What to write into an existing folder; `exr` adds composite.exr (linear, the scene's own method).
 
     `camera`: whose frame; None = the first one's.
@@ -44,7 +44,7 @@ class SnapshotOrder(StrictModel):
     exr: bool = False
 
     @model_validator(mode="after")
-    def _names_differ(self) -> "SnapshotOrder":
+    def _names_differ(self) -> "SnapshotRequest":
         names = [picture.name for picture in self.pictures]
         if len(set(names)) < len(names):
             raise ValueError("two pictures have the same name, but every name must be unique")
@@ -105,7 +105,7 @@ class Snapshot:
 
 
 def take_snapshot(
-    renderer: SnapshotRenderer, scene: SceneDocument, taken: Sequence[CameraFrame], order: SnapshotOrder
+    renderer: SnapshotRenderer, scene: SceneDocument, taken: Sequence[CameraFrame], order: SnapshotRequest
 ) -> Snapshot:
     """Writes the ordered pictures of one frame; afterwards the renderer shows `scene` and that frame again.
 

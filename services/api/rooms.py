@@ -204,11 +204,6 @@ class _Builder:
             chooses_source=self._settings.jobs,
         )
         live_hub = LiveHub(link.watch, on_failure=lambda reason: events.publish("notice", {"text": reason}))
-
-        def publish_recording(session: RecordingSession, is_growing: bool) -> None:
-            body = recordings.recording_event(self._recordings, session, is_growing=is_growing)
-            events.publish("recording", body)
-
         replay = ReplayControl(
             link,
             beside,
@@ -230,13 +225,7 @@ class _Builder:
             tickets=self._tickets,
             recordings=self._recordings,
             videos=self._videos,
-            recording_sessions=RecordingSessions(
-                self._recordings,
-                endpoints,
-                publish_recording,
-                lambda text: events.publish("notice", {"text": text}),
-                None if self._settings.rooms is None else (self._settings.rooms, room),
-            ),
+            recording_sessions=self._recording_sessions(room, endpoints, events),
             replay=replay,
             snapshots=self._snapshots,
             settings=self._settings,
@@ -247,6 +236,19 @@ class _Builder:
             whep=self._whep,
             room=room,
             server_name=RENDER_SERVER if control is not None else room,
+        )
+
+    def _recording_sessions(self, room: str, endpoints: Sequence[str], events: EventHub) -> RecordingSessions:
+        def publish(session: RecordingSession, is_growing: bool) -> None:
+            body = recordings.recording_event(self._recordings, session, is_growing=is_growing)
+            events.publish("recording", body)
+
+        return RecordingSessions(
+            self._recordings,
+            endpoints,
+            publish,
+            lambda text: events.publish("notice", {"text": text}),
+            None if self._settings.rooms is None else (self._settings.rooms, room),
         )
 
 

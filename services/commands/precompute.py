@@ -45,7 +45,7 @@ def precompute(
 
 def _precompute_scene(path: Path) -> None:
     from deltalight.protocol.scene import load_scene
-    from deltalight.render_server.precomputed import precompute_scene
+    from deltalight.render_server.precomputation.precomputed import precompute_scene
 
     def notify(sentence: str) -> None:
         typer.echo(sentence, err=True)

@@ -17,8 +17,8 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.lights.octahedral import even_directions, harmonics
-from deltalight.render_server.occlusion_fields import compute_field
 from deltalight.render_server.passes.occlusion_fields import LightProbeCapture
+from deltalight.render_server.precomputation.occlusion_fields import compute_field
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.occlusion_field import OcclusionField
 from tests.render_server.scenes import (
@@ -297,7 +297,9 @@ def test_a_scene_that_comes_later_is_shown_at_once_and_shaded_when_its_field_is_
         was_shown.wait(PATIENCE_S)
         return compute_field(*given)
 
-    monkeypatch.setattr("deltalight.render_server.occlusion_fields.compute_field", compute_later)
+    monkeypatch.setattr(
+        "deltalight.render_server.precomputation.occlusion_fields.compute_field", compute_later
+    )
     document = stage.document([stage.virtual(ball(RADIUS), (0.0,) * 3)], [ambient(1.0)], floor())
     renderer = SceneRenderer(gpu, document)
     view = frame(plain(), pose=look_at(*CLOSE))

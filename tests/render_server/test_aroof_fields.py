@@ -14,14 +14,14 @@ from jaxtyping import Float64
 
 from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.lights.octahedral import even_directions, harmonics
-from deltalight.render_server.occlusion_fields import (
+from deltalight.render_server.precomputation.job_cache import Checkpoint
+from deltalight.render_server.precomputation.occlusion_fields import (
     OcclusionFields,
     compute_field,
     field_digest,
     load_field,
     store_field,
 )
-from deltalight.render_server.precomputation import KeptParts
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.occlusion_field import (
     FieldSettings,
@@ -276,7 +276,7 @@ def test_fields_that_were_not_used_for_longest_give_way(
         os.utime(tmp_path / f"{number}.npz", ns=(number, number))
     assert load_field(tmp_path, "0", SETTINGS) is not None
     room = 3 * (tmp_path / "0.npz").stat().st_size
-    monkeypatch.setattr("deltalight.render_server.precomputation.cache_limit_bytes", lambda: room)
+    monkeypatch.setattr("deltalight.render_server.precomputation.job_cache.cache_limit_bytes", lambda: room)
     store_field(tmp_path, "3", ball_field)
     assert sorted(path.name for path in tmp_path.glob("*.npz*")) == [
         f"{number}.npz{end}" for number in (0, 2, 3) for end in ("", ".sha256")
@@ -288,7 +288,8 @@ def test_a_second_start_computes_nothing(
 ) -> None:
     store_field(tmp_path, field_digest(object_surface([ball], plain=True), SETTINGS), ball_field)
     monkeypatch.setattr(
-        "deltalight.render_server.occlusion_fields.compute_field", lambda *_: pytest.fail("computed")
+        "deltalight.render_server.precomputation.occlusion_fields.compute_field",
+        lambda *_: pytest.fail("computed"),
     )
     found = OcclusionFields(pytest.fail, tmp_path).find(placed(ball), SETTINGS)
     assert found is not None
@@ -299,7 +300,7 @@ def test_a_field_that_was_broken_off_goes_on_with_its_next_shell(
     tmp_path: Path, ball: TriangleMesh, ball_field: OcclusionField
 ) -> None:
     surface = object_surface([ball], plain=True)
-    parts, computed = KeptParts(tmp_path, "ab"), []
+    parts, computed = Checkpoint(tmp_path, "ab"), []
 
     def counting(name: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
         def counted() -> np.ndarray:

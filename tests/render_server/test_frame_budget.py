@@ -12,6 +12,7 @@ import pytest
 from deltalight.protocol.cached_files import write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.frame_budget import (
     HELD_BYTES,
     PATIENCE,
@@ -24,8 +25,7 @@ from deltalight.render_server.frame_budget import (
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
-from deltalight.render_server.server.snapshot import SnapshotOrder, SnapshotPicture, take_snapshot
-from deltalight.render_server.started_frame import CameraFrame
+from deltalight.render_server.server.snapshot import SnapshotPicture, SnapshotRequest, take_snapshot
 from tests.render_server.protected_scenes import Case, scene_of
 from tests.render_server.scenes import Stage, psnr_db
 from tests.render_server.test_quality_tiers import seen
@@ -321,7 +321,7 @@ def test_a_size_that_was_shown_before_is_not_built_again(gpu: GpuContext, hurrie
 
 def test_snapshots_are_full_size(hurried: Walker, whole: Walker, tmp_path: Path) -> None:
     aside = 0.004 * (hurried.count % 8)
-    order = SnapshotOrder(folder=tmp_path, pictures=(SnapshotPicture(name="now"),))
+    order = SnapshotRequest(folder=tmp_path, pictures=(SnapshotPicture(name="now"),))
     taken = take_snapshot(
         hurried.renderer,
         hurried.renderer.scene,

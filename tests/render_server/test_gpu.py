@@ -28,14 +28,9 @@ from deltalight.render_server.gpu.context import (
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.gpu.textures import AsyncReadback, gpu_objects, sizes_bytes, texture_2d
 from deltalight.render_server.methods.differential import SolutionVoxels
-from deltalight.render_server.methods.dvct import InjectedVoxels
+from deltalight.render_server.methods.dvct_paper import InjectedVoxels
 from deltalight.render_server.methods.voxel_volumes import DeltaVoxels
-from deltalight.render_server.passes.volumes import (
-    ABOVE_BORDERS,
-    PlacedVolume,
-    VolumePlacement,
-    place_volume,
-)
+from deltalight.render_server.passes.volumes import ABOVE_BORDERS, PlacedVolume, VolumePlacement, place_volume
 from deltalight.render_server.passes.voxels import (
     LARGEST_ITEM_BYTES,
     LEAST_SURFELS,

@@ -16,7 +16,7 @@ from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.lights.light_map import COSINE_BANDS, coefficients_around, distant_coefficients
 from deltalight.render_server.lights.lights import build_lights
 from deltalight.render_server.lights.octahedral import even_directions, harmonics, turned_harmonics
-from deltalight.render_server.precomputed_transfers import ObjectTransfers, transfer_settings
+from deltalight.render_server.precomputation.light_transfers import ObjectTransfers, transfer_settings
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.bvh import RayCaster
 from deltalight.render_server.scene.materials import Material
@@ -223,7 +223,9 @@ def test_what_is_broken_off_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
     def broken_off(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("deltalight.render_server.precomputed_transfers.compute_object_transfer", broken_off)
+    monkeypatch.setattr(
+        "deltalight.render_server.precomputation.light_transfers.compute_object_transfer", broken_off
+    )
     with pytest.raises(KeyboardInterrupt):
         ObjectTransfers(pytest.fail, tmp_path).find(placed(mesh_of(ball())), SETTINGS)
     assert list(tmp_path.iterdir()) == []

@@ -13,6 +13,7 @@ import trimesh
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose, ViewFrame
 from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.gpu.context import GpuContext, count_gl_objects
 from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.renderer import SceneRenderer
@@ -20,7 +21,6 @@ from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.scene.depth_surface import depth_surface
 from deltalight.render_server.scene.depth_views import DepthViews, PosedSurface
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
-from deltalight.render_server.started_frame import CameraFrame
 from deltalight.render_server.view import CameraView, resized_frame
 from tests.render_server.scenes import (
     HEIGHT,

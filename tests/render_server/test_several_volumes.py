@@ -19,7 +19,8 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
 from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.graph import Graph
-from deltalight.render_server.methods.dvct import DVCT, InjectedVoxels, state_memory
+from deltalight.render_server.methods.dvct import DVCT, state_memory
+from deltalight.render_server.methods.dvct_paper import InjectedVoxels
 from deltalight.render_server.methods.method import SOFTWARE_DEFAULTS
 from deltalight.render_server.methods.volume_placement import (
     group_near,
@@ -27,7 +28,8 @@ from deltalight.render_server.methods.volume_placement import (
     place_volumes,
     relative_gaps,
 )
-from deltalight.render_server.methods.voxel_volumes import DeltaVoxels, affordable_size, sets_memory_mb
+from deltalight.render_server.methods.voxel_sets import affordable_size, sets_memory_mb
+from deltalight.render_server.methods.voxel_volumes import DeltaVoxels
 from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (

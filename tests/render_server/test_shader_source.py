@@ -2,7 +2,7 @@
 
 import pytest
 
-from deltalight.render_server.gpu.shader_source import declarations, preprocessed
+from deltalight.render_server.gpu.shader_source import declarations, expand_macros, preprocessed
 
 
 def test_declarations_are_those_that_the_defines_leave() -> None:
@@ -66,7 +66,7 @@ def test_branches_nest_and_uncomputed_ones_stay() -> None:
             "C",
         ]
     )
-    assert preprocessed(text).split() == ["2", "5", "6", "7"]
+    assert expand_macros(*preprocessed(text)).split() == ["2", "5", "6", "7"]
 
 
 def test_a_workgroup_size_that_hangs_on_an_uncomputed_condition_is_refused() -> None:

@@ -12,10 +12,10 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.radiance_files import read_linear
 from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
-from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
-from deltalight.render_server.started_frame import CameraFrame
+from deltalight.render_server.server.snapshot import SnapshotRequest, take_snapshot
 from tests.render_server.scenes import (
     Stage,
     ambient,
@@ -53,9 +53,9 @@ def read_png(path: Path) -> np.ndarray:
     return np.asarray(cv2.imread(str(path))[..., ::-1])
 
 
-def order(folder: Path, *pictures: dict[str, object], exr: bool = False) -> SnapshotOrder:
+def order(folder: Path, *pictures: dict[str, object], exr: bool = False) -> SnapshotRequest:
     data = {"folder": str(folder), "pictures": pictures, "exr": exr}
-    return validate(SnapshotOrder, data, "the order")
+    return validate(SnapshotRequest, data, "the order")
 
 
 def with_view(document: SceneDocument, view: str) -> SceneDocument:

@@ -16,10 +16,10 @@ from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.renderer import OtherView
 from deltalight.render_server.room_mesh import RoomMesh
-from deltalight.render_server.started_frame import CameraFrame
 from deltalight.services import ports
 
 NOWHERE = {"kind": "nothing", "object": None, "point_m": None, "normal": None, "distance_m": None}

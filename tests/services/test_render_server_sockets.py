@@ -24,10 +24,10 @@ from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.gpu.context import CompileWatcher
 from deltalight.render_server.server import process
 from deltalight.render_server.server.process import ServerSettings, serve
-from deltalight.render_server.started_frame import CameraFrame
 from deltalight.services import ports
 from deltalight.services.api.streams import ProcessWatch
 from tests.services.api_samples import UPLOAD, running_api

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     TABLE_Z_M,
     BenchmarkScene,
@@ -11,7 +12,6 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import ball, rabbit
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, Triple, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
 
 WHITE: Triple = (0.80, 0.79, 0.77)
 RED: Triple = (0.80, 0.10, 0.05)

@@ -7,6 +7,7 @@ Their geometry, framing and light are not published, so those here are this proj
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     TABLE_Z_M,
     BenchmarkScene,
@@ -16,8 +17,7 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import block, rabbit
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, Triple, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
-from deltalight.benchmarks.ground_truth.scenes.shadow_edges import edge_of_shadow
+from deltalight.benchmarks.ground_truth.shadow_edges import edge_of_shadow
 
 LAMP = SphereLamp((0.70, -0.60, 0.80), 3.6, 0.07, (1.0, 0.95, 0.88))
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     TABLE_Z_M,
     BenchmarkScene,
@@ -11,7 +12,6 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import ball, block
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
 
 GAP_M = 0.0005
 """Of air below the objects: faces that coincide with the table would be hit in either order."""

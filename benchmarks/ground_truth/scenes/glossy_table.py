@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     BOARD,
     TABLE_Z_M,
@@ -13,7 +14,6 @@ from deltalight.benchmarks.ground_truth.energy_keeping import energy_keeping
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import pawn, vase
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking, shape, sheet_surface, texture
-from deltalight.benchmarks.ground_truth.scenes import rooms
 from deltalight.benchmarks.ground_truth.textures import wood
 
 ROUGHNESS = 0.25

@@ -2,11 +2,11 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish, VirtualObject
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import pawn, rabbit
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
 
 LAMP = SphereLamp((1.00, 0.02, 0.57), 3.5, 0.05, (1.0, 0.94, 0.84))
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     BOARD,
     TABLE_Z_M,
@@ -21,7 +22,6 @@ from deltalight.benchmarks.ground_truth.parts import (
     sheet,
     sheet_surface,
 )
-from deltalight.benchmarks.ground_truth.scenes import rooms
 
 ROUGHNESS = 0.1
 STEEL: Triple = (0.62, 0.60, 0.57)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     TABLE_Z_M,
     BenchmarkScene,
@@ -13,8 +14,7 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import block, rabbit
 from deltalight.benchmarks.ground_truth.parts import Matrix, MeshFolder, Triple, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
-from deltalight.benchmarks.ground_truth.scenes.shadow_edges import edge_of_shadow
+from deltalight.benchmarks.ground_truth.shadow_edges import edge_of_shadow
 
 FRAMES = 12
 STEP_M = 0.004

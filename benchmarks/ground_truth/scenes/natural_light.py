@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish, VirtualObject
 from deltalight.benchmarks.ground_truth.meshes import rabbit, ring
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
 from deltalight.benchmarks.ground_truth.textures import smooth_noise
 
 SUN_DIRECTION = np.array([0.62, -0.42, 0.66])

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     TABLE_Z_M,
     BenchmarkScene,
@@ -11,7 +12,6 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
 from deltalight.benchmarks.ground_truth.lamps import Ambient, Panel, Spot
 from deltalight.benchmarks.ground_truth.meshes import vase
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
 
 PANEL = Panel((-0.45, -0.35, 0.60), (0.0, 0.5, 0.0), (0.282, 0.0, 0.282), 9.0, (0.94, 0.97, 1.0))
 """Half a metre by 40 cm; leans over the table at 45 degrees."""

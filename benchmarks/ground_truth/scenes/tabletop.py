@@ -2,11 +2,11 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish, VirtualObject
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import ball, pawn, rabbit
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
 
 LAMP = SphereLamp((1.05, -0.30, 0.72), 4.5, 0.06, (1.0, 0.93, 0.82))
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from deltalight.benchmarks.ground_truth import rooms
 from deltalight.benchmarks.ground_truth.benchmark_scene import (
     TABLE_Z_M,
     BenchmarkScene,
@@ -11,8 +12,7 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import block, pawn
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, Triple, looking
-from deltalight.benchmarks.ground_truth.scenes import rooms
-from deltalight.benchmarks.ground_truth.scenes.shadow_edges import edge_of_shadow
+from deltalight.benchmarks.ground_truth.shadow_edges import edge_of_shadow
 
 WARM = SphereLamp((-0.75, -0.30, 0.65), 2.6, 0.05, (1.0, 0.62, 0.28))
 COOL = SphereLamp((1.10, -0.25, 0.65), 4.4, 0.05, (0.35, 0.60, 1.0))

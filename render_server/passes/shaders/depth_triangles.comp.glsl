@@ -24,7 +24,7 @@ bool on_one_surface(int a, int b, int c) {
 }
 
 // Whether the quad is cut from 0 to 3: along the lesser step, and between the neighbours of a hole.
-bool falls() {
+bool is_cut_from_0_to_3() {
     bool falling = abs(corner[0].x - corner[3].x) <= abs(corner[1].x - corner[2].x);
     falling = falling || corner[1].x == 0.0 || corner[2].x == 0.0;
     return falling && corner[0].x > 0.0 && corner[3].x > 0.0;
@@ -34,7 +34,7 @@ void main() {
     ivec2 quad = ivec2(gl_GlobalInvocationID.xy), size = textureSize(nodes, 0);
     if (any(greaterThanEqual(quad, size - 1))) return;
     for (int i = 0; i < 4; ++i) corner[i] = texelFetch(nodes, quad + ivec2(i & 1, i >> 1), 0).xyz;
-    bool falling = falls();
+    bool falling = is_cut_from_0_to_3();
     ivec3 first = falling ? ivec3(0, 2, 3) : ivec3(0, 2, 1), second = falling ? ivec3(0, 3, 1) : ivec3(1, 2, 3);
     bool has_first = on_one_surface(first.x, first.y, first.z), has_second = on_one_surface(second.x, second.y, second.z);
     uint node = uint(first_vertex + quad.y * size.x + quad.x), row = uint(size.x);

@@ -53,7 +53,7 @@ bool is_there(uint triangle, int k) {
 bool is_there(uint triangle, int k) { return true; }
 #endif
 
-void meet(uint triangle) {
+void intersect(uint triangle) {
     Plane plane = plane_of(corners_of(triangle));
     mat3 products = mat3(plane.normal, plane.u, plane.v);   // of all three with a ray: linear in it
     vec3 at = ray * products, beside = right * products, below = down * products;
@@ -82,8 +82,8 @@ uint next_list(inout int list, inout int first, inout int before) {
     return is_new ? tiles[tile].first : 0u;
 }
 
-// Meets all triangles of the lists; false if one of them is not whole. All in one loop, so that no lane waits for the lists of others.
-bool meet_lists() {
+// Intersects the rays with all triangles of the lists; false if one of them is not whole. All in one loop, so that no lane waits for the lists of others.
+bool intersect_lists() {
     int list = -1, first = -1, before = -1;
     uint at = 0u;
     do {
@@ -93,7 +93,7 @@ bool meet_lists() {
         if (at == FULL) return false;
         if (at != 0u) {
             uvec2 node = nodes[at - 1u];
-            meet(node.x);
+            intersect(node.x);
             at = node.y;
         }
     } while (at != 0u || list < LISTS - 1);
@@ -177,7 +177,7 @@ void add_samples(ivec2 pixel) {
 
 void sample_pixel(ivec2 pixel) {
     begin_pixel(pixel);
-    if (meet_lists()) add_samples(pixel);
+    if (intersect_lists()) add_samples(pixel);
     else imageStore(sample_coverage, pixel, float(SAMPLES) * imageLoad(sample_coverage, pixel));
 }
 

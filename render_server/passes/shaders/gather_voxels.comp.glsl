@@ -64,7 +64,7 @@ void add_to_tail(vec3 corner, int k, float area, vec3 next, float returned) {
 bool is_sampled(uint slot) { return true; }
 #endif
 
-void forget(int slot) {
+void clear_light(int slot) {
 #ifndef TAIL
     if (!keeps_mu) group_light[2 * slot] = vec4(0.0);
     group_light[2 * slot + 1] = vec4(0.0);
@@ -78,7 +78,7 @@ void gather(int slot) {
     float area = max(float(group_sums[at + GROUP_AREA]), 1.0);
     vec3 sum = sums_at(at + GROUP_NORMAL);
     if (sum == vec3(0.0)) {
-        forget(slot);
+        clear_light(slot);
         return;
     }
     vec3 n = normalize(sum);

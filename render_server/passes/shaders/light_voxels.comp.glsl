@@ -137,8 +137,8 @@ void add(uint voxel, vec3 n, float area, float opaque, vec3 radiance) {
 }
 
 #if !defined(REAL_DELTA) && !defined(SOLUTION)
-// What the sums lack: everything at first, then the gain of gathered light. w: 1 where the camera measured it.
-vec3 unsummed(uint own, vec4 radiance) {
+// Radiance that the sums lack: all of it at first, then what gathered light changes. w: 1 where the camera measured it.
+vec3 radiance_to_add(uint own, vec4 radiance) {
 #ifdef GATHERED
     vec3 summed = surfel_light(own, RADIANCE_MU).rgb;
 #else
@@ -164,7 +164,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     carried *= below;
     m.emission *= below;
 #endif
-    return unsummed(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
+    return radiance_to_add(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
 }
 #endif
 
@@ -174,11 +174,11 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     if (surfel_light(own, RADIANCE_MU).w > 0.5) return vec3(0.0);
 #else
     vec3 p = s.position_area.xyz;
-    if (camera_sees(p, n)) return unsummed(own, vec4(measured_radiance(p), 1.0));
+    if (camera_sees(p, n)) return radiance_to_add(own, vec4(measured_radiance(p), 1.0));
 #endif
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
-    return unsummed(own, vec4(unseen_albedo(s.position_area.xyz) / PI * mu, 0.0));
+    return radiance_to_add(own, vec4(unseen_albedo(s.position_area.xyz) / PI * mu, 0.0));
 }
 #endif
 

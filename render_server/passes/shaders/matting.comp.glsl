@@ -32,7 +32,7 @@ void look_along(ivec2 pixel, float z, vec3 ray, vec2 direction, inout Side front
         if (!in_picture(at)) return;
         float real = texelFetch(real_surface_position, at, 0).w;
         if (real <= 0.0) continue;
-        if (real >= hides_before(z)) {
+        if (real >= occluding_depth(z)) {
             if (backs < TAKEN && !near_front(at, z)) { add(back, pixel, offset, ray); ++backs; }
         } else if (fronts < TAKEN && inside_front(at, z)) { add(front, pixel, offset, ray); ++fronts; }
     }

@@ -48,7 +48,8 @@ bool remembered(ivec2 texel, SurfacePoint s) {
 bool remembered(ivec2 texel, SurfacePoint s) { return false; }
 #endif
 
-void leave(ivec2 texel, SurfacePoint s) {
+// Of texels that nothing can reach: the environment alone.
+void store_environment(ivec2 texel, SurfacePoint s) {
     vec3 e = s.present ? environment_irradiance(s.normal) : vec3(0.0);
     vec3 c = vec3(0.0);
     if (s.present && s.roughness >= 0.0)
@@ -66,6 +67,6 @@ void main() {
     enter_volume(s.position);
     bool reached = s.present && (is_in_lit_area(real_pixel(texel)) || volume_fade(volume_coordinate(s.position)) > 0.0
         || object_may_shadow(s.position, 0.0, true));
-    if (!reached) leave(texel, s);
+    if (!reached) store_environment(texel, s);
     else if (!remembered(texel, s)) append_texel(texel, low_resolution_size.x);
 }

@@ -62,28 +62,30 @@ void choose_rounding(LightView view, ivec2 texel, float depth) {
 int rounded(float amount) { return even < 0.0 ? fixed_point(amount) : int(floor(amount * FIXED_POINT + even)); }
 
 // Sums of the texels of one voxel that a thread comes to one after another: one addition to memory for all of them.
-int held_slot = -1;
-ivec3 held_delta = ivec3(0), held_rho = ivec3(0);
-int held_area = 0;
+int open_slot = -1;
+ivec3 open_delta = ivec3(0), open_rho = ivec3(0);
+int open_area = 0;
 
-void add_held() {
-    if (held_slot < 0) return;
-    int at = held_slot * LIGHT_SUMS;
+// Adds the open sums to memory.
+void flush_sums() {
+    if (open_slot < 0) return;
+    int at = open_slot * LIGHT_SUMS;
     for (int j = 0; j < 3; ++j) {
 #ifndef VIRTUAL   // what objects gain in V_delta is what they gain in V_rho (split_radiance)
-        atomicAdd(sums[at + DELTA + j], held_delta[j]);
+        atomicAdd(sums[at + DELTA + j], open_delta[j]);
 #endif
-        atomicAdd(sums[at + RHO + j], held_rho[j]);
+        atomicAdd(sums[at + RHO + j], open_rho[j]);
     }
-    atomicAdd(sums[at + AREA], held_area);
+    atomicAdd(sums[at + AREA], open_area);
 }
 
-void go_to(int slot) {
-    if (slot == held_slot) return;
-    add_held();
-    held_slot = slot;
-    held_delta = held_rho = ivec3(0);
-    held_area = 0;
+// Makes a slot the open one.
+void select_slot(int slot) {
+    if (slot == open_slot) return;
+    flush_sums();
+    open_slot = slot;
+    open_delta = open_rho = ivec3(0);
+    open_area = 0;
 }
 
 // Flux and area per voxel face, so that fixed point serves every scale.
@@ -92,20 +94,20 @@ ivec3 parts_of(vec3 flux) {
     return ivec3(rounded(shares.r), rounded(shares.g), rounded(shares.b));
 }
 
-void hold(int slot, bool shadowed, vec3 flux, float area) {
-    go_to(slot);
+void accumulate(int slot, bool shadowed, vec3 flux, float area) {
+    select_slot(slot);
     ivec3 parts = parts_of(flux);
-    if (shadowed) held_delta -= parts; else held_rho += parts;
-    held_area += rounded(area / (voxel_edge * voxel_edge));
+    if (shadowed) open_delta -= parts; else open_rho += parts;
+    open_area += rounded(area / (voxel_edge * voxel_edge));
 }
 
 // Of a light that comes with an object.
-void hold_gained(int slot, vec3 flux, float area) {
-    go_to(slot);
+void accumulate_gain(int slot, vec3 flux, float area) {
+    select_slot(slot);
     ivec3 parts = parts_of(flux);
-    held_delta += parts;
-    held_rho += parts;
-    held_area += rounded(area / (voxel_edge * voxel_edge));
+    open_delta += parts;
+    open_rho += parts;
+    open_area += rounded(area / (voxel_edge * voxel_edge));
 }
 
 #ifdef VIRTUAL
@@ -132,7 +134,7 @@ void split(Light light, LightView view, ivec2 texel) {
     if (slot < 0) return;
     vec3 flux = texel_light(light, view, s) * within_range(light, p) * virtual_albedo(texel);
     vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
-    hold(slot, false, flux, lit_area(light, view, s, p, n));
+    accumulate(slot, false, flux, lit_area(light, view, s, p, n));
 }
 #else
 bool is_wanted(LightView view, ivec2 texel) {
@@ -154,9 +156,9 @@ void split(Light light, LightView view, ivec2 texel) {
     float area = lit_area(light, view, s, p, n);
     if (is_virtual(light)) {
         if (shadowed) flux = vec3(0.0);
-        hold_gained(slot, flux, area);
+        accumulate_gain(slot, flux, area);
     } else {
-        hold(slot, shadowed, flux, area);
+        accumulate(slot, shadowed, flux, area);
     }
 }
 #endif
@@ -170,5 +172,5 @@ void main() {
         split(light, view, map_texel(view, i));
         i = next_wanted(view, i + items_apart());
     } while (i < texels_of(view));
-    add_held();
+    flush_sums();
 }

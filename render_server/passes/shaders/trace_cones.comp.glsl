@@ -1,5 +1,5 @@
-// Diffuse and specular cones of the exact operator at 1/scale of the picture (docs/method.md 3, 4.5).
-// REAL: E_mu and E_rho of ambient + bounced light on real surfaces. VIRTUAL: E_rho and the specular cone of the object.
+// Diffuse and specular cones of the exact operator at 1/scale of the picture (docs/method.md 3.2, 4.5). REAL: E_mu and
+// E_rho of ambient and bounced light at real surfaces, without and with the objects. Otherwise: E_rho at the objects.
 #ifndef REAL
 #define TWO_SIDED_STARTS
 #endif
@@ -11,14 +11,11 @@
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
+layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho; a: volume fade (REAL), 1 where traced (otherwise)
+layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb mean radiance of the specular lobe
 #ifdef REAL
 layout(rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where traced
-layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
-#else
-layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where traced
-#endif
-#ifdef REAL
-layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mean radiance of the specular cone
+layout(rgba16f) writeonly uniform image2D specular_mu;      // as specular_rho, without the objects
 #define READS_TAIL
 #include "common/bounce_tail.glsl"
 #include "common/least_change.glsl"
@@ -30,20 +27,28 @@ vec3 with_further_bounces(vec3 e_mu, vec3 e_rho, vec3 q, vec3 n) {
     return seen ? max(e_rho + further, vec3(0.0)) : e_rho;
 }
 #endif
-layout(rgba16f) writeonly uniform image2D specular_rho;
 #include "common/camera.glsl"
 
 // Four adjacent texels share four times as many directions, each cone half as wide as its own solid angle;
 // bilateral_cone_filter takes the mean.
 ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y & 1), 0.5, 0.0); }
 
+// Whether the irradiance must be traced, because nothing usable is kept of the last frame's.
 #ifdef REUSES
 uniform usampler2D stale_texels;
-// Whether the last frame does not know the irradiance.
-bool is_fresh(ivec2 texel) { return (texelFetch(stale_texels, texel, 0).r & 2u) != 0u; }
+bool is_stale(ivec2 texel) { return (texelFetch(stale_texels, texel, 0).r & 2u) != 0u; }
 #else
-bool is_fresh(ivec2 texel) { return true; }
+bool is_stale(ivec2 texel) { return true; }
 #endif
+
+// Mean radiance of a cone without (mu) and with the objects (rho).
+struct SpecularCone { vec3 mu; vec3 rho; };
+
+SpecularCone specular_cone(vec3 q, vec3 direction, float half_angle) {
+    March m = march(q, direction, 2.0 * tan(half_angle), false);
+    vec3 beyond = environment(direction, half_angle);
+    return SpecularCone(m.c_mu + m.t_mu * beyond, m.c_rho + m.t_rho * beyond);
+}
 
 #ifndef REAL
 #pragma switch MEASURED
@@ -61,17 +66,15 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
     for (int k = 0; k < int(measured_base(row).a); ++k) {
         vec3 reflected = lobe_albedo_of(row, k, dot(s.normal, v));
         float half_angle = lobe_widths(row, k).y;
-        March m = march(q, d, 2.0 * tan(half_angle), false);
-        sum += reflected * (m.c_rho + m.t_rho * environment(d, half_angle));
+        sum += reflected * specular_cone(q, d, half_angle).rho;
         total += reflected;
     }
     return sum / max(total, vec3(1e-6));
 }
 #endif
-#endif
 
-#ifndef REAL
 #ifdef EXTENDED
+#define COATED
 #include "common/shown_coating.glsl"
 
 // A cone for the base's lobe and one for the coat's, weighted by what they reflect.
@@ -83,58 +86,53 @@ vec3 coated_specular(ivec2 texel, SurfacePoint s, vec3 q) {
     do {
         vec3 d = reflect(-v, k == 0 ? s.normal : coat_normal(m.over, s.normal));
         float half_angle = specular_half_angle(k == 0 ? m.roughness : m.over.roughness);
-        March met = march(q, d, 2.0 * tan(half_angle), false);
-        sum += (k == 0 ? 1.0 - share : share) * (met.c_rho + met.t_rho * environment(d, half_angle));
+        sum += (k == 0 ? 1.0 - share : share) * specular_cone(q, d, half_angle).rho;
     } while (++k < lobes);
     return sum;
 }
 #endif
 #endif
 
-void trace(ivec2 texel) {
-    SurfacePoint s = surface_point(texel);
-    enter_volume(s.position);
-    vec3 q = volume_coordinate(s.position);
-    vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
-#ifdef REAL
-    diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
-    e_rho = with_further_bounces(e_mu, e_rho, q, s.normal);
-#else
-    start_on(s.normal, s.two_sided);
-    if (is_fresh(texel)) diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
-#endif
+// The specular lobe at a texel by one cone, or one for each of the material's lobes; black without a lobe.
+SpecularCone specular_lobe(ivec2 texel, SurfacePoint s, vec3 q) {
+    SpecularCone lobe = SpecularCone(vec3(0.0), vec3(0.0));
+    bool reflects = s.roughness >= 0.0;
 #ifdef MEASURED
     int row = measured_row(texel);
     if (row >= 0) {
-        c_rho = measured_specular(s, q, row);
-        s.roughness = -1.0;
+        lobe.rho = measured_specular(s, q, row);
+        reflects = false;
     }
 #endif
-#ifndef REAL
-#ifdef EXTENDED
-    if (s.roughness >= 0.0) {
-        c_rho = coated_specular(texel, s, q);
-        s.roughness = -1.0;
+#ifdef COATED
+    if (reflects) lobe.rho = coated_specular(texel, s, q);
+#else
+    if (reflects) {
+        vec3 mirrored = reflect(-normalize(camera_position - s.position), s.normal);
+        lobe = specular_cone(q, mirrored, specular_half_angle(s.roughness));
     }
 #endif
-#endif
-    if (s.roughness >= 0.0) {
-        vec3 v = normalize(camera_position - s.position);
-        vec3 d = reflect(-v, s.normal);
-        float half_angle = specular_half_angle(s.roughness);
-        March m = march(q, d, 2.0 * tan(half_angle), false);
-        vec3 r = environment(d, half_angle);
-        c_mu = m.c_mu + m.t_mu * r;
-        c_rho = m.c_rho + m.t_rho * r;
-    }
+    return lobe;
+}
+
+void trace(ivec2 texel) {
+    SurfacePoint s = surface_point(texel);
+    enter_volume(s.position);
+    vec3 q = volume_coordinate(s.position), e_mu, e_rho;
 #ifdef REAL
+    diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
+    e_rho = with_further_bounces(e_mu, e_rho, q, s.normal);
+    SpecularCone specular = specular_lobe(texel, s, q);
     imageStore(irradiance_mu, texel, vec4(e_mu, 1.0));
     imageStore(irradiance_rho, texel, vec4(e_rho, volume_fade(q)));
-    imageStore(specular_mu, texel, vec4(c_mu, 1.0));
+    imageStore(specular_mu, texel, vec4(specular.mu, 1.0));
 #else
-    if (is_fresh(texel)) imageStore(irradiance_rho, texel, vec4(e_rho, 1.0));
+    start_on(s.normal, s.two_sided);
+    if (is_stale(texel)) diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
+    SpecularCone specular = specular_lobe(texel, s, q);
+    if (is_stale(texel)) imageStore(irradiance_rho, texel, vec4(e_rho, 1.0));
 #endif
-    imageStore(specular_rho, texel, vec4(c_rho, 1.0));
+    imageStore(specular_rho, texel, vec4(specular.rho, 1.0));
 }
 
 // The texels that select_cone_texels or low_res_grid listed.

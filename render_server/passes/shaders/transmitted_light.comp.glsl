@@ -18,19 +18,19 @@ uniform float pixel_size;      // m at 1 m depth
 
 const float NOWHERE = 1e30;        // distance of what a ray does not meet
 const int MOST_SURFACES = 24;      // that the paths of one ray may meet
-const int HELD = 4;                // paths that wait
+const int MOST_PENDING = 4;        // paths that are still to be traced
 const float LEAST_WEIGHT = 0.004;  // of a path that goes on: a step of 8-bit codes
 const float NARROWEST = 1e-3;      // rad: half-angle of the smallest lamp
 
 struct Path { vec3 from; vec3 direction; vec3 weight; int medium; };
 
-Path held[HELD];
-int held_count;
+Path pending[MOST_PENDING];
+int pending_count;
 
 float greatest(vec3 c) { return max(max(c.r, c.g), c.b); }
 
-void hold(vec3 from, vec3 direction, vec3 weight, int medium) {
-    if (held_count < HELD && greatest(weight) > LEAST_WEIGHT) held[held_count++] = Path(from, direction, weight, medium);
+void push_path(vec3 from, vec3 direction, vec3 weight, int medium) {
+    if (pending_count < MOST_PENDING && greatest(weight) > LEAST_WEIGHT) pending[pending_count++] = Path(from, direction, weight, medium);
 }
 
 // Fraction of a cone around d that a disc of half-angle `radius` around l fills. Both are even discs, which overlap by a smooth step from
@@ -72,25 +72,25 @@ vec3 outside(vec3 from, vec3 d, float spread, float object) {
     return seen.rgb + (1.0 - seen.a) * beyond;
 }
 
-// Holds what the surface makes of a path: one part goes on through it, the other is reflected. That part of the path
-// from the camera is the surface's own reflection already.
-void divide(Interface i, Path path, bool first) {
+// Splits a path at a surface into a transmitted and a reflected one. The reflected part of the path
+// from the camera is left out: it is the surface's own reflection already.
+void split_path(Interface i, Path path, bool first) {
     bool inside = path.medium >= 0;
     vec3 reflectance = interface_reflectance(i, path.direction, inside);
     int beyond = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
     vec3 back = mirrored(i, path.direction), through = refracted(i, path.direction, inside);
-    if (!first) hold(leave(i, back), back, path.weight * reflectance, path.medium);
-    hold(leave(i, through), through, path.weight * (1.0 - reflectance) * i.surface.passing, beyond);
+    if (!first) push_path(leave(i, back), back, path.weight * reflectance, path.medium);
+    push_path(leave(i, through), through, path.weight * (1.0 - reflectance) * i.surface.passing, beyond);
 }
 
 // Radiance along all paths of a ray that meets a transparent surface first.
-vec3 follow(Ray ray, MeshHit hit, float spread) {
+vec3 trace_paths(Ray ray, MeshHit hit, float spread) {
     vec3 sum = vec3(0.0);
-    held_count = 0;
+    pending_count = 0;
     float length_m = hit.distance;
-    divide(interface_at(hit, ray, pixel_size * length_m), Path(ray.from, ray.direction, vec3(1.0), -1), true);
-    for (int met = 0; met < MOST_SURFACES && held_count > 0; ++met) {
-        Path path = held[--held_count];
+    split_path(interface_at(hit, ray, pixel_size * length_m), Path(ray.from, ray.direction, vec3(1.0), -1), true);
+    for (int met = 0; met < MOST_SURFACES && pending_count > 0; ++met) {
+        Path path = pending[--pending_count];
         Ray next = Ray(path.from, path.direction);
         MeshHit object = closest_hit(next);
         bool stops = object.triangle < 0 || !is_transparent(material_of_triangle(max(object.triangle, 0)));
@@ -104,7 +104,7 @@ vec3 follow(Ray ray, MeshHit hit, float spread) {
             sum += path.weight * kept_over(path.medium, inside_m) * outside(path.from, path.direction, spread, object.distance);
         } else {
             path.weight *= kept_over(path.medium, object.distance);
-            divide(interface_at(object, next, pixel_size * (length_m + object.distance)), path, false);
+            split_path(interface_at(object, next, pixel_size * (length_m + object.distance)), path, false);
         }
     }
     return sum;
@@ -144,7 +144,7 @@ vec3 transmitted(ivec2 pixel) {
         for (int k = 0; k < RAY_COUNT; ++k)
             if (hits[k].triangle >= 0) turned = max(turned, distance(normals[j], normals[k]));
         Ray ray = camera_ray(pixel, place_within(j));
-        sum += follow(ray, hits[j], spread_behind(interface_at(hits[j], ray, 0.0), turned));
+        sum += trace_paths(ray, hits[j], spread_behind(interface_at(hits[j], ray, 0.0), turned));
         count += 1.0;
     }
     return sum / max(count, 1.0);

@@ -85,7 +85,8 @@ vec4 centroid_area(vec3 a, vec3 b, vec3 c, vec3 n, bvec3 within) {
     return vec4(found, sum.z * length(n) / size[w]);
 }
 
-void touch(uint voxel) {
+// Gives a voxel a slot, unless it has one.
+void allocate_slot(uint voxel) {
     if (atomicCompSwap(grid[voxel], 0u, 0xffffffffu) != 0u) return;
     uint slot = atomicAdd(slot_count, 1u);
     touched[slot] = voxel;
@@ -104,7 +105,7 @@ void emit(Piece t, int material, vec4 part, ivec3 voxel, vec3 a, vec3 b, vec3 c,
     uint index = atomicAdd(surfel_count, 1u);
     if (index >= uint(surfels.length())) return;
     uint v = voxel_index(voxel + ivec3(0, 0, volume * volume_size), volume_size);
-    touch(v);
+    allocate_slot(v);
     surfels[index].position_area = vec4(volume_origin + part.xyz * voxel_edge, part.w * voxel_edge * voxel_edge);
     surfels[index].normal_material = vec4(normalize(n), float(material));
     surfels[index].uv_voxel = vec4(uv_at(t, part.xyz, a, b, c, n), uintBitsToFloat(v), double_sided[material]);

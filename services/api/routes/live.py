@@ -1,7 +1,7 @@
 """Routes of live data: the composite, picking, the fish-eye picture, events."""
 
 import asyncio
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -22,6 +22,7 @@ from deltalight.services.api.limits import RateLimit
 from deltalight.services.api.live_hub import LiveHub, Viewer
 from deltalight.services.api.live_video import LiveCodec
 from deltalight.services.api.problems import ProblemError, responses, unavailable
+from deltalight.services.coroutines import run_until_first_ends
 from deltalight.services.storage.faults import NotFoundError
 
 PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
@@ -134,7 +135,9 @@ async def live(
         return
     under_way = _UnderWay()
     with shared.live.viewer(VIEWS.get(view or ""), CODECS[codec], camera) as viewer:
-        await _first_of(_send_frames(socket, viewer, under_way), _take_messages(socket, viewer, under_way))
+        await run_until_first_ends(
+            _send_frames(socket, viewer, under_way), _take_messages(socket, viewer, under_way)
+        )
 
 
 @live_router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description cannot express
@@ -229,18 +232,7 @@ async def events(socket: WebSocket, shared: Shared) -> None:
     with shared.events.listening() as queue:
         role = principal_of(socket.scope).role
         await socket.send_text(packed("hello", {"version": __version__, "role": role}))
-        await _first_of(_send_events(socket, queue), _expect_nothing(socket))
-
-
-async def _first_of(*streams: Coroutine[Any, Any, None]) -> None:
-    """Run coroutines until one of them ends, then end the others."""
-    tasks = {asyncio.ensure_future(each) for each in streams}
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await run_until_first_ends(_send_events(socket, queue), _expect_nothing(socket))
 
 
 class _UnderWay:

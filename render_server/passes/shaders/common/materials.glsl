@@ -57,7 +57,7 @@ const int BASE_COLOR = 0, METALLIC_ROUGHNESS = 1, NORMAL = 2, OCCLUSION = 3, EMI
 const int COAT = 5, COAT_ROUGHNESS = 6, COAT_NORMAL = 7, SHEEN = 8, SHEEN_ROUGHNESS = 9;
 const int SPECULAR = 10, SPECULAR_COLOR = 11, TRANSMITTED = 12;
 #endif
-const int CLAMPED = 1, MIRRORED = 2;   // wraps; 0 repeats
+const int MIRRORED = 2;   // of wraps: 0 repeats, 1 clamps
 const float MASKED = 1.0, BLENDED = 2.0;   // modes of alpha
 const float MASK_SLOPE = 8.0;              // of coverage over alpha (scene/materials.py)
 const float APART = 5.588238;              // of the noise of materials and sides: what lies behind is left out elsewhere

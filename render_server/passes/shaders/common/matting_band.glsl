@@ -12,7 +12,7 @@ bool in_picture(ivec2 at) {
 // Whether a real surface in front of depth z is within reach.
 bool near_front(ivec2 at, float z) {
     float nearest = texelFetch(nearest_depth, at / BLOCK, 0).r;
-    return nearest > 0.0 && nearest < hides_before(z);
+    return nearest > 0.0 && nearest < occluding_depth(z);
 }
 
 // Whether the pixel and those INSIDE pixels from it on all sides show real surfaces in front of depth z.

@@ -25,15 +25,15 @@ vec3 on_plane(SurfaceEntry e, vec3 p, vec3 ray) {
     return abs(slope) > 1e-4 ? p - ray * (plane_height(e, p) / slope) : p;
 }
 
-// Where a point measured at depth z lies, as far as noise explains, in the plane of a sheet.
-vec3 towards_sheet(SurfaceEntry sheet, vec3 p, vec3 ray, float z) {
+// A point measured at depth z, moved along its ray towards the plane of a sheet, as far as noise explains.
+vec3 snapped_to_sheet(SurfaceEntry sheet, vec3 p, vec3 ray, float z) {
     float slope = dot(ray, sheet_normal(sheet)), noise = SIGMAS * noise_sigma * z * z;
     return abs(slope) > 1e-4 ? p - ray * clamp(sheet_height(sheet, p) / slope, -noise, noise) : p;
 }
 
 bool is_paper(vec3 p, vec3 ray, float z) {
     for (int i = 0; i < surface_count && surfaces[i].region[0].w == SHEET; ++i)
-        if (on_sheet(surfaces[i], towards_sheet(surfaces[i], p, ray, z))) return true;
+        if (on_sheet(surfaces[i], snapped_to_sheet(surfaces[i], p, ray, z))) return true;
     return false;
 }
 

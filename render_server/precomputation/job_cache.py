@@ -1,4 +1,4 @@
-"""What is precomputed of objects: found on disk by content, or computed before or beside rendering."""
+"""Precomputed data of objects: read from a cache on disk by content, or computed before or beside rendering."""
 
 import threading
 from abc import ABC, abstractmethod
@@ -33,8 +33,8 @@ Data = TypeVar("Data")
 log = structlog.get_logger()
 
 
-class _EndedError(Exception):
-    """Nobody waits for the data any more."""
+class _CancelledError(Exception):
+    """Nobody needs the data any more."""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
@@ -51,7 +51,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def store_arrays(path: Path, **arrays: np.ndarray) -> None:
-    """Writes a cached .npz file, and removes those that were not used for longest beyond the limit of its folder.
+    """Writes a cached .npz file; evicts the least recently used ones beyond the limit of its folder.
 
     Raises:
         DeltalightError: the folder cannot be written.
@@ -62,21 +62,22 @@ def store_arrays(path: Path, **arrays: np.ndarray) -> None:
     prune(path.parent, cache_limit_bytes(), keep=path)
 
 
-class KeptParts:
-    """Finished parts of a computation, in the cache of what it makes: one that was killed goes on there.
+class Checkpoint:
+    """Finished parts of a long computation, kept so that it resumes there after it was killed.
 
-    They count to the limit of the cache. What the disk refuses is computed again.
+    They are in the cache of what is computed, and count towards its limit. A part that cannot be written is computed
+    again.
     """
 
     def __init__(self, folder: Path, digest: str) -> None:
         self._folder, self._digest = folder, digest
 
     def count(self) -> int:
-        """Returns how many there are."""
+        """Returns the number of finished parts."""
         return len(list(self._folder.glob(f"{self._digest}-*.npz")))
 
     def part(self, name: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
-        """Returns a part, computed or as it was kept (a `PartKeeper`)."""
+        """Returns a part as it was kept, or computes and keeps it (a `PartKeeper`)."""
         path = self._folder / f"{self._digest}-{name}.npz"
         found = load_arrays(path)
         if found is not None and "part" in found:
@@ -87,47 +88,47 @@ class KeptParts:
         return made
 
     def remove(self) -> None:
-        """Removes all: what they are parts of is complete."""
+        """Removes all parts, because the computation is complete."""
         for path in self._folder.glob(f"{self._digest}-*"):
             path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
 class Job(Generic[Data]):
-    """How the data of one object come about: read from the cache (None: not there), or computed and stored.
+    """How to get the data of one object: `load` them from the cache (None: not there), or `compute` and `store` them.
 
-    `parts` are those that `compute` keeps meanwhile.
+    `checkpoint` holds the parts that `compute` finished so far, if it keeps any.
     """
 
     load: Callable[[], Data | None]
     compute: Callable[[ProgressCallback], Data]
     store: Callable[[Data], None]
-    parts: KeptParts | None = None
+    checkpoint: Checkpoint | None = None
 
 
 @dataclass(eq=False)
 class _Entry(Generic[Data]):
-    """One asset's data with one set of settings; holds `meshes`, whose identities are its key."""
+    """One asset's data with one set of settings. Its key has the ids of `meshes`, which it keeps alive therefore."""
 
     meshes: tuple[TriangleMesh, ...]
     name: str
     data: Data | None = None
     fault: str | None = None
     thread: threading.Thread | None = None
-    ended: threading.Event = field(default_factory=threading.Event)
+    cancelled: threading.Event = field(default_factory=threading.Event)
 
 
 class Precomputations(ABC, Generic[Settings, Data]):
-    """Caches data for the lifetime of a renderer; `notify` receives sentences for the user.
+    """Precomputed data of one kind, held for the lifetime of a renderer; `notify` receives sentences for the user.
 
-    With `waits`, `find` blocks until they are ready and shows a progress bar on a terminal. Without, a thread
-    computes them (embree and matrix products release the interpreter lock) and `find` returns None meanwhile.
+    With `waits`, `find` blocks until the data are ready and shows a progress bar on a terminal. Without, it returns
+    None while a thread computes them (Embree and matrix products release the interpreter lock).
     """
 
     cache: ClassVar[str]
     kind: ClassVar[str]
     meanwhile: ClassVar[str]
-    """What the user is told of the time until they are ready."""
+    """What the user is told about the time until the data are ready."""
 
     def __init__(
         self, notify: Callable[[str], None], folder: Path | None = None, *, waits: bool = True
@@ -140,11 +141,11 @@ class Precomputations(ABC, Generic[Settings, Data]):
 
     @abstractmethod
     def _surface_key(self, item: PlacedObject) -> Hashable:
-        """Returns what the data depend on besides meshes and settings."""
+        """Returns a key of everything besides meshes and settings that the data depend on."""
 
     @abstractmethod
     def _job(self, item: PlacedObject, settings: Settings) -> Job[Data]:
-        """Returns how the data come about."""
+        """Returns how to get the data."""
 
     def find(self, item: PlacedObject, settings: Settings) -> Data | None:
         """Returns the data of an object's asset; None while they are being computed.
@@ -155,7 +156,7 @@ class Precomputations(ABC, Generic[Settings, Data]):
         key = (*(id(mesh) for mesh in item.meshes), self._surface_key(item))
         entry = self._entries.get((key, settings))
         if entry is None:
-            self._forget_earlier(item.id, settings)
+            self._cancel_earlier(item.id, settings)
             entry = self._entries[key, settings] = _Entry(item.meshes, item.id)
             self._begin(entry, self._job(item, settings))
         if entry.thread is not None and self.waits:
@@ -164,10 +165,10 @@ class Precomputations(ABC, Generic[Settings, Data]):
             self._notify(entry.fault)
         return entry.data
 
-    def _forget_earlier(self, name: str, settings: Settings) -> None:
-        """Drops what the object was before; while a colour is being chosen, no queue of all its shades builds up."""
+    def _cancel_earlier(self, name: str, settings: Settings) -> None:
+        """Cancels jobs for earlier states of the object, so that none queue up while a user picks a colour."""
         for key in [key for key in self._entries if key[1] == settings and self._entries[key].name == name]:
-            self._entries.pop(key).ended.set()
+            self._entries.pop(key).cancelled.set()
 
     def _begin(self, entry: _Entry[Data], job: Job[Data]) -> None:
         entry.data = job.load()
@@ -178,14 +179,14 @@ class Precomputations(ABC, Generic[Settings, Data]):
             made = job.compute(step)
             try:
                 job.store(made)
-                if job.parts is not None:
-                    job.parts.remove()
+                if job.checkpoint is not None:
+                    job.checkpoint.remove()
             except DeltalightError as error:
                 entry.fault = f"object `{entry.name}`: its {self.kind} is not kept: {error}"
             entry.data = made
 
         if self.waits:
-            parts = 0 if job.parts is None else job.parts.count()
+            parts = 0 if job.checkpoint is None else job.checkpoint.count()
             if parts:
                 self._notify(
                     f"object `{entry.name}`: {parts} parts of its {self.kind} are from a run that was cut off."
@@ -197,25 +198,25 @@ class Precomputations(ABC, Generic[Settings, Data]):
         self._notify(
             f"object `{entry.name}`: its {self.kind} is being computed, once; until then {self.meanwhile}."
         )
-        entry.thread = threading.Thread(target=self._beside, args=(entry, make), daemon=True)
+        entry.thread = threading.Thread(target=self._in_background, args=(entry, make), daemon=True)
         entry.thread.start()
 
-    def _beside(self, entry: _Entry[Data], make: Callable[[ProgressCallback], None]) -> None:
+    def _in_background(self, entry: _Entry[Data], make: Callable[[ProgressCallback], None]) -> None:
         def step(_fraction: float) -> None:
-            if entry.ended.is_set():
-                raise _EndedError
+            if entry.cancelled.is_set():
+                raise _CancelledError
 
         try:
             with self._one_at_a_time:
                 step(0.0)
                 make(step)
-        except _EndedError:
+        except _CancelledError:
             pass
-        except Exception as error:  # whatever it is, the picture goes on without
+        except Exception as error:  # rendering goes on without the data
             entry.fault = f"object `{entry.name}`: its {self.kind} cannot be computed ({error})."
             log.debug(self.kind, exc_info=error)
 
     def release(self) -> None:
-        """Lets threads end at their next step."""
+        """Cancels all jobs; threads end at their next step."""
         for entry in self._entries.values():
-            entry.ended.set()
+            entry.cancelled.set()

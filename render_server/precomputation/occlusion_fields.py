@@ -1,4 +1,4 @@
-"""The occlusion fields of a scene's objects: found on disk by content, or computed before or beside rendering."""
+"""Occlusion fields of a scene's objects: settings, files, and the computation of what the cache lacks."""
 
 import hashlib
 from dataclasses import astuple
@@ -11,7 +11,13 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.gpu_scene import PlacedObject
-from deltalight.render_server.precomputation import Job, KeptParts, Precomputations, load_arrays, store_arrays
+from deltalight.render_server.precomputation.job_cache import (
+    Checkpoint,
+    Job,
+    Precomputations,
+    load_arrays,
+    store_arrays,
+)
 from deltalight.render_server.scene.occlusion_field import (
     FieldSettings,
     ObjectRays,
@@ -85,7 +91,7 @@ def compute_field(
 
 
 def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
-    """Writes a field, and removes those that were not used for longest beyond the limit of the cache.
+    """Writes a field; evicts the least recently used ones beyond the limit of the cache.
 
     Raises:
         DeltalightError: the folder cannot be written.
@@ -130,12 +136,12 @@ class OcclusionFields(Precomputations[FieldSettings, OcclusionField]):
     def _job(self, item: PlacedObject, settings: FieldSettings) -> Job[OcclusionField]:
         surface = object_surface(item.meshes, plain=item.material is not None)
         digest = field_digest(surface, settings)
-        parts = KeptParts(self._folder, digest)
+        checkpoint = Checkpoint(self._folder, digest)
         return Job(
             lambda: load_field(self._folder, digest, settings),
-            lambda step: compute_field(surface, settings, step, parts.part),
+            lambda step: compute_field(surface, settings, step, checkpoint.part),
             lambda made: store_field(self._folder, digest, made),
-            parts,
+            checkpoint,
         )
 
 

@@ -1,4 +1,4 @@
-"""The precomputed transfer of a scene's objects: found on disk by content, or computed before or beside rendering."""
+"""Precomputed light transfer of a scene's objects: settings, files, and the computation of what the cache lacks."""
 
 import hashlib
 from collections.abc import Hashable
@@ -11,7 +11,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.gpu_scene import PlacedObject
-from deltalight.render_server.precomputation import Job, Precomputations, load_arrays, store_arrays
+from deltalight.render_server.precomputation.job_cache import Job, Precomputations, load_arrays, store_arrays
 from deltalight.render_server.scene.precomputed_transfer import (
     ObjectTransfer,
     TransferSettings,
@@ -45,7 +45,7 @@ def transfer_digest(surface: TransferSurface, settings: TransferSettings) -> str
 
 
 def store_transfer(folder: Path, digest: str, made: ObjectTransfer) -> None:
-    """Writes a transfer, and removes those that were not used for longest beyond the limit of the cache.
+    """Writes a transfer; evicts the least recently used ones beyond the limit of the cache.
 
     Raises:
         DeltalightError: the folder cannot be written.

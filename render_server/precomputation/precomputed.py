@@ -1,4 +1,4 @@
-"""All that a renderer has precomputed of its objects, and what a scene document asks to be precomputed."""
+"""All precomputed data of a renderer's objects; computes those that a scene document asks for."""
 
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -11,11 +11,15 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.gpu_scene import PlacedObject
-from deltalight.render_server.occlusion_fields import OcclusionFields, field_settings, require_rigid
-from deltalight.render_server.precomputed_transfers import (
+from deltalight.render_server.precomputation.light_transfers import (
     ObjectTransfers,
     require_rigid_transfer,
     transfer_settings,
+)
+from deltalight.render_server.precomputation.occlusion_fields import (
+    OcclusionFields,
+    field_settings,
+    require_rigid,
 )
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
@@ -30,17 +34,17 @@ class Precomputed:
         self.transfers = ObjectTransfers(notify, waits=waits)
 
     def stop_waiting(self) -> None:
-        """From now on computes beside rendering."""
+        """From now on, computes in the background."""
         self.fields.waits = self.transfers.waits = False
 
     def release(self) -> None:
-        """Lets threads end at their next step."""
+        """Cancels all jobs; threads end at their next step."""
         self.fields.release()
         self.transfers.release()
 
 
 def precompute_scene(scene: SceneDocument, notify: Callable[[str], None]) -> Iterator[str]:
-    """Computes what the visible objects lack in the cache, with a progress bar; yields a line for each of them.
+    """Computes the data of visible objects that are not in the cache, with a progress bar; yields a line for each.
 
     Raises:
         DeltalightError: the scene asks for nothing precomputed, an object changes its shape, or its asset cannot be

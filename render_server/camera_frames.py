@@ -1,24 +1,21 @@
-"""What a renderer keeps of each camera, and its frames whose pictures are on their way from the GPU."""
+"""Frames of the cameras in a room, and what a renderer keeps of each camera."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
-
-import numpy as np
-from jaxtyping import Float64, UInt8
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.render_server.frame_graph import ShownBuffers
-from deltalight.render_server.live_scene import RelitFrame
 from deltalight.render_server.picking import ShownFrame
 from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts
+from deltalight.render_server.relit_frame import RelitFrame
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.view import CameraView, PosedFrame
 
 
 class PassTimes(NamedTuple):
-    """Milliseconds by pass: of those that the frame ran, and of the others when they last ran."""
+    """Milliseconds by pass: of passes that the frame `ran`, and of `reused` results, when their passes last ran."""
 
     ran: dict[str, float]
     reused: dict[str, float]
@@ -26,7 +23,7 @@ class PassTimes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CameraFrame:
-    """A frame of one of a room's cameras; without `is_shown` it lights the room, and no picture of it is made."""
+    """A frame of the camera with that name. Without `is_shown` it only lights the room: nobody wants its picture."""
 
     camera: str
     frame: ViewFrame
@@ -34,15 +31,20 @@ class CameraFrame:
 
     @classmethod
     def numbered(cls, frames: Sequence[ViewFrame]) -> "list[CameraFrame]":
-        """Returns frames of cameras that have no names."""
+        """Returns frames of cameras that are named by their numbers."""
         return [cls(str(number), frame) for number, frame in enumerate(frames)]
 
 
 @dataclass(eq=False)
 class CameraState:
-    """What is kept of one camera: its artifacts, its last frame with a pose, at the composite's size, and its newest.
+    """What a renderer keeps of one camera.
 
-    `sized`: the newest frame as it came, and at the composite's size. `shown` and `relit` are of the newest picture.
+    Attributes:
+        artifacts: estimate of the camera's noise, blur and the like.
+        posed: the last frame that had a pose, at the composite's size.
+        sized: the newest frame as it arrived, and the same at the composite's size.
+        shown: what the newest picture shows, for picking.
+        relit: the newest picture's frame, ready to compose again.
     """
 
     artifacts: CameraArtifacts = field(default_factory=CameraArtifacts)
@@ -52,17 +54,21 @@ class CameraState:
     relit: RelitFrame | None = None
 
     def forget_picture(self) -> None:
-        """Forgets the newest picture, whose buffers another one takes."""
+        """Forgets the newest picture, because the next one reuses its buffers."""
         self.shown = self.relit = None
 
     def holds(self, frame: ViewFrame) -> bool:
-        """Whether the newest frame that came is this one."""
+        """Whether this is the newest frame that arrived."""
         return self.sized is not None and self.sized[0] is frame
 
 
 @dataclass(frozen=True, eq=False)
 class FrameSource:
-    """What all views of a frame are made from; `lights` are plain values."""
+    """What all views of one frame are made from.
+
+    `relit`, `buffers` (of `relit`) and the view `seen` are None without a pose, the first two also without
+    anything to relight. `lights` are plain values.
+    """
 
     camera: CameraState
     frame: ViewFrame
@@ -86,18 +92,3 @@ class FrameSource:
         if view == "lights" and self.is_lit:
             return self.seen if self.frame.radiance_map is None else None
         return None if view == "rsm" and self.relit is not None else self.seen
-
-
-@dataclass(frozen=True, eq=False)
-class StartedView:
-    """A picture of one view; `take` returns it, and waits for the GPU if it was `composed` there."""
-
-    view: ShownView
-    seen: CameraView | None
-    take: Callable[[], UInt8[np.ndarray, "h w 3"]]
-    composed: RelitFrame | None
-
-    @property
-    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
-        """The pose that the picture was made with; None if there is none, or it is not the camera's."""
-        return None if self.seen is None else self.seen.world_from_camera
