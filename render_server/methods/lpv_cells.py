@@ -152,6 +152,10 @@ class LpvCells:
         self._transmit.run(self._through_joint, self.size, self._real_covered, self._virtual_covered)
         return self._through_joint
 
+    def covered_by_objects(self, _through: moderngl.Texture3D | None) -> moderngl.Buffer | None:
+        """Returns the sums of faces that the objects cover; None: nothing is blocked."""
+        return self._virtual_covered if self._has_geometry else None
+
     def release(self) -> None:
         """Frees the GL objects."""
         release_held(self)
@@ -166,7 +170,8 @@ def release_held(owner: object) -> None:
 class CellStages:
     """The resources of cells of one size (`cell_stages`), each of all volumes.
 
-    `through` is what lets light pass between cells; `real` and `objects` are surfels.
+    `through` is what lets light pass between cells, `covered` what the objects cover of their faces; `real` and
+    `objects` are surfels.
     """
 
     real: Resource[PerVolume[VoxelStore]]
@@ -175,6 +180,7 @@ class CellStages:
     real_light: Resource[PerVolume[moderngl.Buffer]]
     change: Resource[PerVolume[moderngl.Buffer]]
     through: Resource[PerVolume[moderngl.Texture3D | None]]
+    covered: Resource[PerVolume[moderngl.Buffer | None]]
 
 
 def cell_stages(
@@ -200,6 +206,7 @@ def cell_stages(
     joint = g.value(f"inject scene joint{suffix}", joint_scene, scene, s.objects, lit.object_maps)
     changed = (objects, joint, lit.object_maps, real_light)
     change = g.stage(f"inject change{suffix}", OfEach(each, LpvCells.inject_change), *changed)
-    covered = (objects, s.objects, volume, through_real)
-    through = g.stage(f"geometry volume{suffix}", OfEach(each, LpvCells.cover_joint), *covered)
-    return CellStages(real, objects, joint, real_light, change, through)
+    blocking = (objects, s.objects, volume, through_real)
+    through = g.stage(f"geometry volume{suffix}", OfEach(each, LpvCells.cover_joint), *blocking)
+    covered = g.value(f"covered by objects{suffix}", OfEach(each, LpvCells.covered_by_objects), through)
+    return CellStages(real, objects, joint, real_light, change, through, covered)

@@ -93,6 +93,30 @@ def own_extents(extents: Sequence[ObjectExtent], placements: Placements) -> list
     return own
 
 
+def outside_fractions(
+    extents: Sequence[ObjectExtent], placements: Placements
+) -> Float64[np.ndarray, "count count"]:
+    """Returns how much of the box around each volume's own objects (rows) lies outside of each volume (columns).
+
+    0 outside of its own, and for a volume without objects.
+    """
+    fractions = np.zeros((len(placements), len(placements)))
+    for row, group in enumerate(own_extents(extents, placements)):
+        for column, placement in enumerate(placements):
+            if group and row != column:
+                fractions[row, column] = 1 - _inside_fraction(ObjectExtent.around(group), placement)
+    return fractions
+
+
+def _inside_fraction(group: ObjectExtent, placement: VolumePlacement) -> float:
+    """Returns how much of the box around a group lies in a volume."""
+    low, high = group.bounds
+    corners = placement.corners
+    edges = np.maximum(high - low, 1e-9)  # of flat things
+    within = (np.minimum(high, corners[-1]) - np.maximum(low, corners[0]) + 1e-9) / edges
+    return float(np.clip(within, 0, 1).prod())
+
+
 def _box(own: Sequence[ObjectExtent], placement: VolumePlacement) -> Float64[np.ndarray, "_ 3"]:
     """Returns corners of a box around objects; the volume's middle if there are none."""
     return np.stack(ObjectExtent.around(own).bounds) if own else placement.corners.mean(axis=0)[None]
