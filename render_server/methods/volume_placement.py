@@ -13,6 +13,7 @@ from deltalight.render_server.gpu.kernel import Binding
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import object_extent
+from deltalight.render_server.methods.object_groups import group_near, relative_gaps
 from deltalight.render_server.passes.volumes import (
     MOST_VOLUMES,
     VolumePlacement,
@@ -148,26 +149,6 @@ def place_volumes(
 def _placed(group: ObjectExtent, size: int, edge: float) -> VolumePlacement:
     low, high = group.upright
     return place_volume(low, high, size, edge)
-
-
-def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
-    """Returns the gaps between objects' own volumes, by half the sum of two edges; negative: they overlap."""
-    middles = np.stack([each.upright.mean(axis=0) for each in parts])
-    halves = np.array([each.volume_edge / 2 for each in parts])
-    reach = halves[:, None] + halves
-    return np.asarray(np.abs(middles[:, None] - middles).max(axis=-1) / reach - 1)
-
-
-def group_near(gaps: Float64[np.ndarray, "n n"], most: int = MOST_VOLUMES) -> list[list[int]]:
-    """Joins objects whose gap is negative, then the nearest until `most` groups are left (single linkage)."""
-    groups = {index: [index] for index in range(len(gaps))}
-    for one, other in sorted(combinations(groups, 2), key=lambda pair: gaps[pair]):
-        if gaps[one, other] >= 0 and len({id(group) for group in groups.values()}) <= most:
-            break
-        if groups[one] is not groups[other]:
-            joined = sorted(groups[one] + groups[other])
-            groups |= dict.fromkeys(joined, joined)
-    return [group for index, group in groups.items() if group[0] == index]
 
 
 def _volume_edges(groups: Sequence[ObjectExtent], gaps: Sequence[Sequence[float]]) -> list[float]:

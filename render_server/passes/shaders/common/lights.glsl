@@ -165,13 +165,19 @@ vec2 light_sample(Spread k, int j, int count) {
     return k.square ? 2.0 * vec2(along, fract(phi / (2.0 * PI))) - 1.0 : sqrt(along) * vec2(cos(phi), sin(phi));
 }
 
+// The view that shows p or, if none does, to whose tile it is nearest: a penumbra may reach beyond. Views around groups of objects
+// are apart, and so are the penumbrae of what they show (passes/group_views.py).
 int view_containing(int first, int count, vec3 p) {
-    for (int i = first; i < first + count - 1; ++i) {
+    int found = first + count - 1, end = count > 1 ? first + count : first;
+    float nearest = NOTHING;
+    for (int i = first; i < end; ++i) {
         LightView view = listed_view(i);
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
-        if (v.z > 0.0 && all(lessThanEqual(abs(lateral(view, v)), vec2(view.tile.w)))) return i;
+        vec2 s = abs(lateral(view, v));
+        float beyond = v.z > 0.0 ? max(max(s.x, s.y) - view.tile.w, 0.0) : NOTHING;
+        if (beyond < nearest) { nearest = beyond; found = i; }
     }
-    return first + count - 1;
+    return found;
 }
 
 // Every loop over a light's samples appears twice, once for discs and once for squares, with no iterations for the
