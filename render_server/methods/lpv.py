@@ -111,8 +111,11 @@ class DifferenceVolumes:
         change: moderngl.Buffer,
         scene: Bindings,
         through: moderngl.Texture3D | None,
-    ) -> LightVolume:
-        """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
+    ) -> tuple[LightVolume, moderngl.Buffer | None]:
+        """Propagates V_rho again, with the light that surfaces reflect of the previous pass.
+
+        Returns it and the sums of what they reflect; None if there is no bounce.
+        """
         own = {**scene, **query_bindings(self._settings)}
         last = self._settings.resolved_bounces
         for number in range(1, last + 1):
@@ -124,11 +127,7 @@ class DifferenceVolumes:
             if number == last > 1:
                 self._tail.extend(self._before, self._bounced)
             self._rho.run(through, injected, change, self._bounced)
-        return rho
-
-    def reflected(self, _rho: LightVolume) -> moderngl.Buffer | None:
-        """Returns the sums of all bounces; None if there are none."""
-        return self._bounced if self._settings.resolved_bounces > 0 else None
+        return rho, self._bounced if last > 0 else None
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -307,20 +306,16 @@ def difference_stages(
     """V_mu is subtracted from V_rho."""
     size = settings.volume_size
     each = several(g, "volumes", partial(DifferenceVolumes, g.gpu, settings, size))
-    propagate_mu, propagate_rho, bounce = (
-        OfEach(each, method)
-        for method in (
-            DifferenceVolumes.propagate_mu,
-            DifferenceVolumes.propagate_rho,
-            DifferenceVolumes.bounce,
-        )
-    )
+    propagate_mu = OfEach(each, DifferenceVolumes.propagate_mu)
+    propagate_rho = OfEach(each, DifferenceVolumes.propagate_rho)
     mu = g.stage("propagate mu", propagate_mu, "inject real", "geometry volume real")
     c = cell_stages(g, s, lit, settings, cubes, size)
     first = g.stage("propagate rho", propagate_rho, c.real_light, c.change, c.through)
     surfels = g.value("surfels", both_surfels, c.real, c.objects)
-    rho = g.stage("bounces", bounce, first, mu, surfels, c.real_light, c.change, c.joint, c.through)
-    reflected = g.value("reflected light", OfEach(each, DifferenceVolumes.reflected), rho)
+    names = "bounces", "reflected light"
+    bounce = OfEach(each, DifferenceVolumes.bounce, outputs=len(names))
+    bounced = first, mu, surfels, c.real_light, c.change, c.joint, c.through
+    rho, reflected = g.stages("bounces", bounce, *bounced, outputs=names)
     sources = exchanged(g, s, cubes, c.change, c.covered, reflected)
     all_mu, all_rho = joined(g, "light mu", mu), joined(g, "light rho", rho)
     shown = g.stage("shown cells", g.shared("shown cells", partial(ShownCells, g.gpu, size)).show, c.change)

@@ -144,17 +144,16 @@ class LpvCells:
         state: GeometryState,
         volume: PlacedVolume,
         _real: moderngl.Texture3D | None,
-    ) -> moderngl.Texture3D | None:
-        """Computes the transmittance between cells with the objects; None: nothing is blocked."""
+    ) -> tuple[moderngl.Texture3D | None, moderngl.Buffer | None]:
+        """Computes the transmittance between cells with the objects, and the sums of faces that these cover.
+
+        None: nothing is blocked.
+        """
         if not self._has_geometry:
-            return None
+            return None, None
         self._cover.run(self._virtual_covered, objects, volume.placement, state.buffers.cutouts)
         self._transmit.run(self._through_joint, self.size, self._real_covered, self._virtual_covered)
-        return self._through_joint
-
-    def covered_by_objects(self, _through: moderngl.Texture3D | None) -> moderngl.Buffer | None:
-        """Returns the sums of faces that the objects cover; None: nothing is blocked."""
-        return self._virtual_covered if self._has_geometry else None
+        return self._through_joint, self._virtual_covered
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -207,6 +206,7 @@ def cell_stages(
     changed = (objects, joint, lit.object_maps, real_light)
     change = g.stage(f"inject change{suffix}", OfEach(each, LpvCells.inject_change), *changed)
     blocking = (objects, s.objects, volume, through_real)
-    through = g.stage(f"geometry volume{suffix}", OfEach(each, LpvCells.cover_joint), *blocking)
-    covered = g.value(f"covered by objects{suffix}", OfEach(each, LpvCells.covered_by_objects), through)
+    names = f"geometry volume{suffix}", f"covered by objects{suffix}"
+    cover = OfEach(each, LpvCells.cover_joint, outputs=len(names))
+    through, covered = g.stages(names[0], cover, *blocking, outputs=names)
     return CellStages(real, objects, joint, real_light, change, through, covered)
