@@ -18,6 +18,7 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import Light, LightSet
 from deltalight.render_server.lights.mirror_lights import mirror_lights
 from deltalight.render_server.methods.method import ResolvedSettings
+from deltalight.render_server.methods.object_groups import points_of_groups
 from deltalight.render_server.passes.lights import LightBuffers, MirrorVisibility
 from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
@@ -132,6 +133,7 @@ class LightStages:
             mirrors=mirrors,
             virtual_lights=lamps,
             blocking=blocking.points,
+            groups=points_of_groups(extent),
         )
 
     def _receivers_of(self, real: GeometryState, extent: ObjectExtent) -> Points:

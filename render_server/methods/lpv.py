@@ -6,14 +6,16 @@ from functools import partial
 from typing import Any
 
 import moderngl
+import numpy as np
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources
 from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
+from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages
+from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages, object_extent
 from deltalight.render_server.methods.lighting import (
     Layers,
     Shading,
@@ -24,7 +26,7 @@ from deltalight.render_server.methods.lpv_cells import cell_stages, release_held
 from deltalight.render_server.methods.lpv_memory import PrintedSizes, affordable_count, state_memory
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from deltalight.render_server.methods.per_volume import OfEach, PerVolume, several
-from deltalight.render_server.methods.volume_placement import SizeOf, volume_placements
+from deltalight.render_server.methods.volume_placement import SizeOf, outside_fractions, volume_placements
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import (
@@ -35,6 +37,7 @@ from deltalight.render_server.passes.lpv import (
     LpvShow,
     LpvStart,
     PropagatedLight,
+    cells_of,
     injected_sums,
     lobe_weights,
     moment_weights,
@@ -44,10 +47,11 @@ from deltalight.render_server.passes.lpv_lighting import (
     LpvBounceTail,
     LpvFields,
     LpvInjectMaps,
+    LpvSources,
     query_bindings,
 )
 from deltalight.render_server.passes.shading import DirectLight
-from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
+from deltalight.render_server.passes.volumes import MOST_VOLUMES, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 
 
@@ -107,8 +111,11 @@ class DifferenceVolumes:
         change: moderngl.Buffer,
         scene: Bindings,
         through: moderngl.Texture3D | None,
-    ) -> LightVolume:
-        """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
+    ) -> tuple[LightVolume, moderngl.Buffer | None]:
+        """Propagates V_rho again, with the light that surfaces reflect of the previous pass.
+
+        Returns it and the sums of what they reflect; None if there is no bounce.
+        """
         own = {**scene, **query_bindings(self._settings)}
         last = self._settings.resolved_bounces
         for number in range(1, last + 1):
@@ -120,7 +127,7 @@ class DifferenceVolumes:
             if number == last > 1:
                 self._tail.extend(self._before, self._bounced)
             self._rho.run(through, injected, change, self._bounced)
-        return rho
+        return rho, self._bounced if last > 0 else None
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -218,11 +225,51 @@ class CellGrid:
         release_held(self)
 
 
+class LightExchange:
+    """Light that leaves the volumes and arrives in others (docs/method.md 5.9)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._sources = LpvSources(gpu)
+
+    def sum_up(
+        self,
+        cubes: PerVolume[VolumePlacement],
+        extent: ObjectExtent,
+        change: PerVolume[moderngl.Buffer],
+        covered: PerVolume[moderngl.Buffer | None],
+        bounced: PerVolume[moderngl.Buffer | None] | None = None,
+    ) -> moderngl.Texture | None:
+        """Sums up what leaves each volume; a single one has nobody to send it to."""
+        if len(cubes) < 2:
+            return None
+        self._sources.make_room(len(cubes))
+        outside = np.zeros((len(cubes), MOST_VOLUMES))
+        outside[:, : len(cubes)] = outside_fractions(extent.parts, cubes)
+        for volume, (cube, own) in enumerate(zip(cubes, change, strict=True)):
+            self._sources.sum_up(
+                volume,
+                cube.divided(cells_of(own)),
+                own,
+                bounced=None if bounced is None else bounced[volume],
+                covered=covered[volume],
+                arriving=outside[volume].tolist(),
+            )
+        return self._sources.rows
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._sources.release()
+
+
 @dataclass(frozen=True, eq=False)
 class LitCells:
-    """What a form of the method hands to shading: a reader of fields, V_rho and its volume, that of the change."""
+    """What a form of the method hands to shading: a reader of fields, V_rho and its volume, that of the change.
+
+    `sources`: what volumes send to each other.
+    """
 
     read: Callable[[LpvFields, Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]]
+    sources: Resource[moderngl.Texture | None]
     rho: Resource[PropagatedLight]
     rho_volume: Resource[PlacedVolume]
     volume: Resource[PlacedVolume]
@@ -232,6 +279,14 @@ class LitCells:
 def joined(g: Graph, name: str, light: Resource[PerVolume[LightVolume]]) -> Resource[PropagatedLight]:
     """Declares the light of all volumes as surfaces read it."""
     return g.stage(name, g.shared(name, partial(LpvJoin, g.gpu)).run, light)
+
+
+def exchanged(
+    g: Graph, s: FrameResources, cubes: Resource[PerVolume[VolumePlacement]], *light: Resource[Any]
+) -> Resource[moderngl.Texture | None]:
+    """Declares what volumes send to each other: of the `light` injected, what the objects cover, and all bounces."""
+    exchange = g.shared("exchange", partial(LightExchange, g.gpu))
+    return g.stage("exchange between volumes", exchange.sum_up, cubes, object_extent(g, s), *light)
 
 
 def placed_cells(
@@ -251,19 +306,17 @@ def difference_stages(
     """V_mu is subtracted from V_rho."""
     size = settings.volume_size
     each = several(g, "volumes", partial(DifferenceVolumes, g.gpu, settings, size))
-    propagate_mu, propagate_rho, bounce = (
-        OfEach(each, method)
-        for method in (
-            DifferenceVolumes.propagate_mu,
-            DifferenceVolumes.propagate_rho,
-            DifferenceVolumes.bounce,
-        )
-    )
+    propagate_mu = OfEach(each, DifferenceVolumes.propagate_mu)
+    propagate_rho = OfEach(each, DifferenceVolumes.propagate_rho)
     mu = g.stage("propagate mu", propagate_mu, "inject real", "geometry volume real")
     c = cell_stages(g, s, lit, settings, cubes, size)
     first = g.stage("propagate rho", propagate_rho, c.real_light, c.change, c.through)
     surfels = g.value("surfels", both_surfels, c.real, c.objects)
-    rho = g.stage("bounces", bounce, first, mu, surfels, c.real_light, c.change, c.joint, c.through)
+    names = "bounces", "reflected light"
+    bounce = OfEach(each, DifferenceVolumes.bounce, outputs=len(names))
+    bounced = first, mu, surfels, c.real_light, c.change, c.joint, c.through
+    rho, reflected = g.stages("bounces", bounce, *bounced, outputs=names)
+    sources = exchanged(g, s, cubes, c.change, c.covered, reflected)
     all_mu, all_rho = joined(g, "light mu", mu), joined(g, "light rho", rho)
     shown = g.stage("shown cells", g.shared("shown cells", partial(ShownCells, g.gpu, size)).show, c.change)
     volume = placed_cells(g, "volume", size, cubes)
@@ -271,9 +324,9 @@ def difference_stages(
     def read(
         fields: LpvFields, scene: Resource[Bindings], grid: Resource[LowResGrid]
     ) -> Resource[ConeFields]:
-        return g.stage("cones", fields.read_difference, scene, grid, all_mu, all_rho)
+        return g.stage("cones", fields.read_difference, scene, grid, sources, all_mu, all_rho)
 
-    return LitCells(read, all_rho, volume, volume, shown)
+    return LitCells(read, sources, all_rho, volume, volume, shown)
 
 
 def both_surfels(
@@ -311,6 +364,7 @@ def printed_stages(
     after = g.stage(
         "propagate direct", OfEach(each, PrintedVolumes.propagate_direct), injected, direct.through
     )
+    sources = exchanged(g, s, cubes, indirect.change, indirect.covered)
     all_rho, all_delta = joined(g, "light rho", rho), joined(g, "light delta", delta)
     change: tuple[Resource[Any], ...] = (all_delta, joined(g, "light direct", after))
     show = g.shared("shown cells", partial(ShownCells, g.gpu, sizes.indirect)).show
@@ -321,9 +375,9 @@ def printed_stages(
     def read(
         fields: LpvFields, scene: Resource[Bindings], grid: Resource[LowResGrid]
     ) -> Resource[ConeFields]:
-        return g.stage("cones", fields.read_printed, scene, grid, *change, all_rho, rho_volume)
+        return g.stage("cones", fields.read_printed, scene, grid, sources, *change, all_rho, rho_volume)
 
-    return LitCells(read, all_rho, rho_volume, volume, shown)
+    return LitCells(read, sources, all_rho, rho_volume, volume, shown)
 
 
 def _volume_sizes(settings: DlpvMethod) -> SizeOf:
@@ -350,7 +404,7 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map", reuses=reuses)
     shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
     fields = LpvFields(g.gpu, settings, shading.cones)
-    marching = g.value("marching", fields.marching, cells.rho, cells.rho_volume)
+    marching = g.value("marching", fields.marching, cells.rho, cells.rho_volume, cells.sources)
 
     def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         return cells.read(fields, scene, grid)

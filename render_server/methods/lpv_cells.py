@@ -144,13 +144,16 @@ class LpvCells:
         state: GeometryState,
         volume: PlacedVolume,
         _real: moderngl.Texture3D | None,
-    ) -> moderngl.Texture3D | None:
-        """Computes the transmittance between cells with the objects; None: nothing is blocked."""
+    ) -> tuple[moderngl.Texture3D | None, moderngl.Buffer | None]:
+        """Computes the transmittance between cells with the objects, and the sums of faces that these cover.
+
+        None: nothing is blocked.
+        """
         if not self._has_geometry:
-            return None
+            return None, None
         self._cover.run(self._virtual_covered, objects, volume.placement, state.buffers.cutouts)
         self._transmit.run(self._through_joint, self.size, self._real_covered, self._virtual_covered)
-        return self._through_joint
+        return self._through_joint, self._virtual_covered
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -166,7 +169,8 @@ def release_held(owner: object) -> None:
 class CellStages:
     """The resources of cells of one size (`cell_stages`), each of all volumes.
 
-    `through` is what lets light pass between cells; `real` and `objects` are surfels.
+    `through` is what lets light pass between cells, `covered` what the objects cover of their faces; `real` and
+    `objects` are surfels.
     """
 
     real: Resource[PerVolume[VoxelStore]]
@@ -175,6 +179,7 @@ class CellStages:
     real_light: Resource[PerVolume[moderngl.Buffer]]
     change: Resource[PerVolume[moderngl.Buffer]]
     through: Resource[PerVolume[moderngl.Texture3D | None]]
+    covered: Resource[PerVolume[moderngl.Buffer | None]]
 
 
 def cell_stages(
@@ -200,6 +205,8 @@ def cell_stages(
     joint = g.value(f"inject scene joint{suffix}", joint_scene, scene, s.objects, lit.object_maps)
     changed = (objects, joint, lit.object_maps, real_light)
     change = g.stage(f"inject change{suffix}", OfEach(each, LpvCells.inject_change), *changed)
-    covered = (objects, s.objects, volume, through_real)
-    through = g.stage(f"geometry volume{suffix}", OfEach(each, LpvCells.cover_joint), *covered)
-    return CellStages(real, objects, joint, real_light, change, through)
+    blocking = (objects, s.objects, volume, through_real)
+    names = f"geometry volume{suffix}", f"covered by objects{suffix}"
+    cover = OfEach(each, LpvCells.cover_joint, outputs=len(names))
+    through, covered = g.stages(names[0], cover, *blocking, outputs=names)
+    return CellStages(real, objects, joint, real_light, change, through, covered)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import update_wrapper
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 from deltalight.render_server.gpu.textures import Releasable, release_all
 from deltalight.render_server.graph import Graph
@@ -36,19 +36,25 @@ class Several(Generic[Item]):
 
 
 class OfEach(Generic[Item, T]):
-    """A stage that calls a method of each item. Of inputs for each volume, everyone gets its own."""
+    """A stage that calls a method of each item. Of inputs for each volume, everyone gets its own.
 
-    def __init__(self, items: Several[Item], method: Callable[..., T]) -> None:
-        self._items, self._method = items, method
+    Of a method that returns several `outputs`, it returns each for all volumes.
+    """
+
+    def __init__(self, items: Several[Item], method: Callable[..., T], *, outputs: int = 1) -> None:
+        self._items, self._method, self._outputs = items, method, outputs
         update_wrapper(self, method)  # reports of the graph tell what it does
 
-    def __call__(self, *inputs: Any) -> PerVolume[T]:  # noqa: ANN401 (a stage's)
+    def __call__(self, *inputs: Any) -> PerVolume[T] | tuple[PerVolume[Any], ...]:  # noqa: ANN401 (a stage's)
         """Returns what the method returns for each volume."""
         count = next(len(each) for each in inputs if isinstance(each, PerVolume))
-        return PerVolume(
+        found = [
             self._method(item, *(each[index] if isinstance(each, PerVolume) else each for each in inputs))
             for index, item in enumerate(self._items.of(count))
-        )
+        ]
+        if self._outputs == 1:
+            return PerVolume(found)
+        return tuple(PerVolume(each) for each in zip(*cast(Any, found), strict=True))
 
     def __eq__(self, other: object) -> bool:
         """Whether both do the same: views share such stages."""

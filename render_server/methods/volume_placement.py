@@ -13,6 +13,7 @@ from deltalight.render_server.gpu.kernel import Binding
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import object_extent
+from deltalight.render_server.methods.object_groups import group_near, relative_gaps
 from deltalight.render_server.passes.volumes import (
     MOST_VOLUMES,
     VolumePlacement,
@@ -93,6 +94,30 @@ def own_extents(extents: Sequence[ObjectExtent], placements: Placements) -> list
     return own
 
 
+def outside_fractions(
+    extents: Sequence[ObjectExtent], placements: Placements
+) -> Float64[np.ndarray, "count count"]:
+    """Returns how much of the box around each volume's own objects (rows) lies outside of each volume (columns).
+
+    0 outside of its own, and for a volume without objects.
+    """
+    fractions = np.zeros((len(placements), len(placements)))
+    for row, group in enumerate(own_extents(extents, placements)):
+        for column, placement in enumerate(placements):
+            if group and row != column:
+                fractions[row, column] = 1 - _inside_fraction(ObjectExtent.around(group), placement)
+    return fractions
+
+
+def _inside_fraction(group: ObjectExtent, placement: VolumePlacement) -> float:
+    """Returns how much of the box around a group lies in a volume."""
+    low, high = group.bounds
+    corners = placement.corners
+    edges = np.maximum(high - low, 1e-9)  # of flat things
+    within = (np.minimum(high, corners[-1]) - np.maximum(low, corners[0]) + 1e-9) / edges
+    return float(np.clip(within, 0, 1).prod())
+
+
 def _box(own: Sequence[ObjectExtent], placement: VolumePlacement) -> Float64[np.ndarray, "_ 3"]:
     """Returns corners of a box around objects; the volume's middle if there are none."""
     return np.stack(ObjectExtent.around(own).bounds) if own else placement.corners.mean(axis=0)[None]
@@ -124,26 +149,6 @@ def place_volumes(
 def _placed(group: ObjectExtent, size: int, edge: float) -> VolumePlacement:
     low, high = group.upright
     return place_volume(low, high, size, edge)
-
-
-def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
-    """Returns the gaps between objects' own volumes, by half the sum of two edges; negative: they overlap."""
-    middles = np.stack([each.upright.mean(axis=0) for each in parts])
-    halves = np.array([each.volume_edge / 2 for each in parts])
-    reach = halves[:, None] + halves
-    return np.asarray(np.abs(middles[:, None] - middles).max(axis=-1) / reach - 1)
-
-
-def group_near(gaps: Float64[np.ndarray, "n n"], most: int = MOST_VOLUMES) -> list[list[int]]:
-    """Joins objects whose gap is negative, then the nearest until `most` groups are left (single linkage)."""
-    groups = {index: [index] for index in range(len(gaps))}
-    for one, other in sorted(combinations(groups, 2), key=lambda pair: gaps[pair]):
-        if gaps[one, other] >= 0 and len({id(group) for group in groups.values()}) <= most:
-            break
-        if groups[one] is not groups[other]:
-            joined = sorted(groups[one] + groups[other])
-            groups |= dict.fromkeys(joined, joined)
-    return [group for index, group in groups.items() if group[0] == index]
 
 
 def _volume_edges(groups: Sequence[ObjectExtent], gaps: Sequence[Sequence[float]]) -> list[float]:

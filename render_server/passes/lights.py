@@ -16,6 +16,7 @@ from deltalight.render_server.gpu.uniform_block import Block, Float, Int, Unifor
 from deltalight.render_server.lights.lights import DirectionalLight, Light, RectangleLight
 from deltalight.render_server.lights.mirror_lights import MirrorLight
 from deltalight.render_server.lights.octahedral import prefilter
+from deltalight.render_server.passes.group_views import views_of_groups
 from deltalight.render_server.passes.shadow_maps import (
     NEAREST_M,
     FittedViews,
@@ -149,11 +150,13 @@ class LightBuffers:
         mirrors: Sequence[MirrorLight] = (),
         virtual_lights: Sequence[Light] = (),
         blocking: Float64[np.ndarray, "b 3"] | None = None,
+        groups: Sequence[Float64[np.ndarray, "g 3"]] = (),
     ) -> None:
         """Fits the views of each light, those of the scene and those that come with objects.
 
         To the real points that may receive the objects' shadow, and to the virtual objects; `blocking`: points of all
-        objects, if those are some. Views of mirror images are limited to the front of their planes.
+        objects, if those are some; `groups`: those of objects far apart. Views of mirror images are limited to the
+        front of their planes.
         """
         self.mirrors, self._virtual_count = list(mirrors), len(virtual_lights)
         lights = [*lights, *virtual_lights]
@@ -162,7 +165,8 @@ class LightBuffers:
         axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
         real = self._views_around_objects.of(lights, receivers, real_points)
         blocking = virtual_points if blocking is None else blocking
-        virtual = self._views_of_objects.of(lights, virtual_points, blocking)
+        around_all = self._views_of_objects.of(lights, virtual_points, blocking)
+        virtual = views_of_groups(lights, groups, blocking, around_all)
         for mirror in mirrors:
             real.append(mirror_views(mirror, receivers, real_points, mirror.tolerance_m))
             virtual.append(mirror_views(mirror, virtual_points, virtual_points))

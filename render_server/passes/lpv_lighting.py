@@ -1,6 +1,6 @@
 """Light into and out of light propagation volumes: injection, bounces, surface irradiance (docs/method.md 5)."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import moderngl
 
@@ -8,12 +8,12 @@ from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
-from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import LightVolume, PropagatedLight, cells_of
-from deltalight.render_server.passes.volumes import PlacedVolume
+from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import VoxelStore
 
 
@@ -144,6 +144,57 @@ class LpvBounceTail:
         release_all(self._measure, self._extend, self._parts)
 
 
+SOURCE_TEXELS = 9  # of a volume: those of two sources, and which fractions arrive where (light_sources.glsl)
+
+
+class LpvSources:
+    """What several volumes change of the light beyond them, as point sources (docs/method.md 5.9)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._kernel = Kernel(gpu, "lpv_sources")
+        self.rows: moderngl.Texture | None = None
+
+    def make_room(self, count: int) -> None:
+        """Makes a row for each of `count` volumes."""
+        if self.rows is None or self.rows.height != count:
+            release_all(self.rows)
+            self.rows = texture_2d(self._gpu, (SOURCE_TEXELS, count), 4, "f4")
+
+    def sum_up(
+        self,
+        volume: int,
+        cells: VolumePlacement,
+        change: moderngl.Buffer,
+        *,
+        bounced: moderngl.Buffer | None,
+        covered: moderngl.Buffer | None,
+        arriving: Sequence[float],
+    ) -> None:
+        """Sums the light injected into a `volume` of these cells, in which its objects have `covered` faces.
+
+        `arriving`: fractions of it that arrive in each volume.
+        """
+        self._kernel.run(
+            (self._kernel.local_size[0],),
+            Change=change,
+            Bounced=bounced,
+            VirtualCovered=covered,
+            sources=self.rows,
+            cells=cells.size,
+            cell_edge=cells.voxel_edge,
+            low_corner=cells.origin,
+            has_bounced=bounced is not None,
+            has_geometry=covered is not None,
+            row=volume,
+            arriving=tuple(arriving),
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._kernel, self.rows)
+
+
 class LpvQuery:
     """Reads irradiance from light volumes on the reduced grid, into the fields that other methods trace by cones."""
 
@@ -216,15 +267,23 @@ class LpvFields:
         self._fields, self._bindings = fields, query_bindings(settings)
         self._query = LpvQuery(gpu)
 
-    def marching(self, rho: PropagatedLight, volume: PlacedVolume) -> dict[str, Binding]:
+    def marching(
+        self, rho: PropagatedLight, volume: PlacedVolume, sources: moderngl.Texture | None
+    ) -> dict[str, Binding]:
         """Returns the bindings for lighting reflected points from V_rho, whose cells fill the `volume`."""
-        return {**light_volume_bindings(rho, rho), **volume.bindings, **self._bindings}
+        own = {**self._bindings, "light_sources": sources}
+        return {**light_volume_bindings(rho, rho), **volume.bindings, **own}
 
     def read_difference(
-        self, scene: Bindings, grid: LowResGrid, mu: PropagatedLight, rho: PropagatedLight
+        self,
+        scene: Bindings,
+        grid: LowResGrid,
+        sources: moderngl.Texture | None,
+        mu: PropagatedLight,
+        rho: PropagatedLight,
     ) -> ConeFields:
         """Reads the irradiance at real surfaces and at the objects."""
-        own = {**scene, **self._bindings}
+        own = {**scene, **self._bindings, "light_sources": sources}
         self._query.read_real(self._fields, grid, mu, rho, own)
         self._query.read_virtual(self._fields, grid, rho, own)
         return self._fields
@@ -233,13 +292,14 @@ class LpvFields:
         self,
         scene: Bindings,
         grid: LowResGrid,
+        sources: moderngl.Texture | None,
         delta: PropagatedLight,
         direct: PropagatedLight | None,
         rho: PropagatedLight,
         rho_volume: PlacedVolume,
     ) -> ConeFields:
         """Reads the change of irradiance at real surfaces, and the irradiance at the objects."""
-        own = {**scene, **self._bindings}
+        own = {**scene, **self._bindings, "light_sources": sources}
         self._query.read_change(self._fields, grid, delta, direct, own)
         self._query.read_virtual(self._fields, grid, rho, {**own, **rho_volume.bindings})
         return self._fields

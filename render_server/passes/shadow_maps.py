@@ -18,6 +18,7 @@ from deltalight.render_server.gpu.textures import release_all, release_target, t
 from deltalight.render_server.lights.lights import DirectionalLight, Lamp, Light
 from deltalight.render_server.lights.mirror_lights import MirrorLight
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
+from deltalight.render_server.passes.volumes import MOST_VOLUMES
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
 FAR_MARGIN = 1.02
@@ -104,8 +105,10 @@ def atlas_bytes(tiles: int, tile_size: int) -> int:
 
 def most_maps_bytes(lights: Sequence[Light], tile_size: int) -> int:
     """Returns the most bytes that maps of the real scene and of the objects take; `tile_size` in texels."""
-    views = sum(1 if isinstance(light, DirectionalLight) else MOST_VIEWS for light in lights)
-    return 2 * atlas_bytes(views, tile_size)
+    distant = sum(isinstance(light, DirectionalLight) for light in lights)
+    lamps = MOST_VIEWS * (len(lights) - distant)
+    of_groups = MOST_VOLUMES * distant  # passes/group_views.py
+    return atlas_bytes(lamps + distant, tile_size) + atlas_bytes(lamps + of_groups, tile_size)
 
 
 def require_atlas_fits(gpu: GpuContext, tiles: int, tile_size: int) -> None:

@@ -24,6 +24,7 @@ UNREAD: Bindings = {
     "Materials": None,
     "MATERIAL_MAPS": False,
     "CUTOUTS": False,
+    "HIDES_BACKS": False,
     "EXTENDED": False,
 }  # what the surface at a hit is like
 

@@ -5,6 +5,7 @@
 #include "common/light_rays.glsl"
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"
+#define MEETS_BACKS   // what is not seen from behind reflects light and casts shadows all the same
 #include "common/ray_mesh.glsl"
 #include "common/ray_pattern.glsl"
 #include "common/lobe.glsl"

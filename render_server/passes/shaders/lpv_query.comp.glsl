@@ -5,6 +5,7 @@
 #include "common/brdf.glsl"
 #include "common/volume.glsl"
 #include "common/lpv_light.glsl"
+#include "common/lpv_exchange.glsl"
 #include "common/low_res_grid.glsl"
 
 #include "common/pixel_group.glsl"
@@ -47,11 +48,12 @@ void shade(ivec2 texel, SurfacePoint s) {
     }
     if (fade > 0.0) {
 #ifdef CHANGE
-        e_rho += from_volume(true, q, s.normal);
+        e_rho += from_volume(true, q, s.normal) + from_other_volumes(s.position, s.normal);
         if (direct_size > 0) e_rho += irradiance_in(false, direct_size, q * float(direct_size) / float(volume_size), s.normal);
 #else
         vec3 mu = from_volume(false, q, s.normal), rho = from_volume(true, q, s.normal);
-        e_rho = max(e_mu + fade * mu + (rho - mu), vec3(0.0));   // composition fades the change
+        vec3 change = rho - mu + from_other_volumes(s.position, s.normal);
+        e_rho = max(e_mu + fade * mu + change, vec3(0.0));   // composition fades the change
         e_mu = max(e_mu + fade * mu, vec3(0.0));
 #endif
     }
@@ -66,7 +68,8 @@ void shade(ivec2 texel, SurfacePoint s) {
     if (s.present) {
         enter_volume(s.position);
         vec3 q = volume_coordinate(s.position);
-        e = max(environment_irradiance(s.normal) + from_volume(true, q, s.normal), vec3(0.0));
+        vec3 arriving = from_volume(true, q, s.normal) + from_other_volumes(s.position, s.normal);
+        e = max(environment_irradiance(s.normal) + arriving, vec3(0.0));
         c = mirrored(s);
     }
     imageStore(irradiance_rho, texel, vec4(e, s.present ? 1.0 : 0.0));

@@ -3,6 +3,7 @@
 #include "common/volume.glsl"
 #include "common/environment.glsl"
 #include "common/lpv_light.glsl"
+#include "common/lpv_exchange.glsl"
 #include "common/brdf.glsl"
 #include "common/materials.glsl"
 #include "common/mirror.glsl"
@@ -33,7 +34,8 @@ void gather(ivec2 texel) {
     Mirror m = mirror_at(mirror_pixel(texelFetch(sample_pixels, texel, 0)));
     enter_volume(position);
     vec3 q = volume_coordinate(position), d = reflect(normalize(position - m.point), normal.xyz);
-    vec3 e = max(environment_irradiance(normal.xyz) + from_volume(true, q, normal.xyz), vec3(0.0));
+    vec3 arriving = from_volume(true, q, normal.xyz) + from_other_volumes(position, normal.xyz);
+    vec3 e = max(environment_irradiance(normal.xyz) + arriving, vec3(0.0));
     vec3 seen = environment(d, specular_half_angle(materials[int(normal.w)].dielectric.a));
     imageStore(irradiance_out, texel, vec4(e, open_fraction(m, position)));
     imageStore(specular_out, texel, vec4(seen, 1.0));

@@ -43,12 +43,17 @@ float first_depth(sampler2D map, LightView view, ivec2 texel) {
     return d >= 1.0 ? NOTHING : linear_depth(view, d);
 }
 
-// The view of a lamp's `count` views, from `first` on, that shows p: the last of them, if no other does.
+// Of a lamp's `count` views, from `first` on: the one that shows p or, if none does, to whose tile it is nearest: a penumbra may reach beyond. Views around groups of objects
+// are apart, and so are the penumbrae of what they show (passes/group_views.py).
 int view_containing(int first, int count, vec3 p) {
-    for (int i = first; i < first + count - 1; ++i) {
+    int found = first + count - 1, end = count > 1 ? first + count : first;
+    float nearest = NOTHING;
+    for (int i = first; i < end; ++i) {
         LightView view = listed_view(i);
         vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
-        if (v.z > 0.0 && all(lessThanEqual(abs(lateral(view, v)), vec2(view.tile.w)))) return i;
+        vec2 s = abs(lateral(view, v));
+        float beyond = v.z > 0.0 ? max(max(s.x, s.y) - view.tile.w, 0.0) : NOTHING;
+        if (beyond < nearest) { nearest = beyond; found = i; }
     }
-    return first + count - 1;
+    return found;
 }

@@ -1,7 +1,11 @@
 // Closest hit of a ray on the objects' triangles, and the surface there. The hierarchy (render_server/scene/bvh.py)
-// is in depth-first order with skips, so that no stack is needed.
+// is in depth-first order with skips, so that no stack is needed. Backs that the camera does not see, rays do not meet either, unless
+// they are a light's (MEETS_BACKS); of transparent bodies they meet both sides.
 #include "common/materials.glsl"
 #pragma switch CUTOUTS
+#ifndef MEETS_BACKS
+#pragma switch HIDES_BACKS
+#endif
 
 struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first triangle << 3 | count, or -1
 // Of textures, because software renderers load buffers lane by lane, number by number. Their bits are floats and integers.
@@ -37,6 +41,10 @@ bool meets_box(vec3 low, vec3 high, vec3 from, vec3 inverse, float limit) {
     return enter <= min(min(far.x, far.y), min(far.z, limit));
 }
 
+int material_of_triangle(int triangle) {
+    return int(vertices[floatBitsToInt(face_at(3 * triangle).w) * VERTEX_FLOATS + 11]);
+}
+
 #ifdef CUTOUTS
 // Whether a triangle's material is not there, at the barycentric place of corners 1 and 2.
 bool is_open_at(int at, vec2 place) {
@@ -48,9 +56,19 @@ bool is_open_at(int at, vec2 place) {
         uv += weights[k] * vec2(vertices[rows[k] + 6], vertices[rows[k] + 7]);
         clear += weights[k] * fract(vertices[rows[k] + 11]);
     }
-    int material = int(vertices[rows.x + 11]);
+    int material = material_of_triangle(at);
     return is_cut_out(material, opacity_of(material, uv, opacity_of_vertices(clear), 0.0), even_noise(PLACES * place));
 }
+#endif
+
+#ifdef HIDES_BACKS
+bool is_hidden_back(int at, float det) {
+    if (det > 0.0) return false;
+    int material = material_of_triangle(at);
+    return hides_back(material) && materials[material].emission.a == 0.0;
+}
+#else
+bool is_hidden_back(int at, float det) { return false; }
 #endif
 
 // Moeller and Trumbore 1997, both sides.
@@ -66,6 +84,7 @@ void meet_triangle(int at, Ray ray, inout MeshHit hit) {
     float v = dot(ray.direction, q) / det;
     float t = dot(e2, q) / det;
     if (u < -EDGE || v < -EDGE || u + v > 1.0 + EDGE || t <= 0.0 || t >= hit.distance) return;
+    if (is_hidden_back(at, det)) return;
 #ifdef CUTOUTS
     if (is_open_at(at, vec2(u, v))) return;
 #endif

@@ -67,7 +67,3 @@ vec3 mirrored(Interface i, vec3 d) {
 vec3 kept_over(int medium, float path) { return medium < 0 ? vec3(1.0) : exp(-materials[medium].medium.rgb * path); }
 
 bool is_transparent(int material) { return materials[material].emission.a > 0.0 && materials[material].base_color.a < 1.0; }
-
-int material_of_triangle(int triangle) {
-    return int(vertices[floatBitsToInt(face_at(3 * triangle).w) * VERTEX_FLOATS + 11]);
-}

@@ -1,0 +1,40 @@
+"""Groups of objects far apart (docs/method.md 4): each has a volume and light maps of its own."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float64
+
+from deltalight.render_server.gpu_scene import ObjectExtent
+from deltalight.render_server.passes.volumes import MOST_VOLUMES
+
+
+def points_of_groups(extent: ObjectExtent) -> list[Float64[np.ndarray, "n 3"]]:
+    """Returns the points of each group of objects whose own volumes do not meet those of others; world, m."""
+    parts = [each for each in extent.parts if each.volume_edge > 0]
+    if len(parts) < 2:
+        return [extent.points]
+    return [
+        np.concatenate([parts[each].points for each in group]) for group in group_near(relative_gaps(parts))
+    ]
+
+
+def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
+    """Returns the gaps between objects' own volumes, by half the sum of two edges; negative: they overlap."""
+    middles = np.stack([each.upright.mean(axis=0) for each in parts])
+    halves = np.array([each.volume_edge / 2 for each in parts])
+    reach = halves[:, None] + halves
+    return np.asarray(np.abs(middles[:, None] - middles).max(axis=-1) / reach - 1)
+
+
+def group_near(gaps: Float64[np.ndarray, "n n"], most: int = MOST_VOLUMES) -> list[list[int]]:
+    """Joins objects whose gap is negative, then the nearest until `most` groups are left (single linkage)."""
+    groups = {index: [index] for index in range(len(gaps))}
+    for one, other in sorted(combinations(groups, 2), key=lambda pair: gaps[pair]):
+        if gaps[one, other] >= 0 and len({id(group) for group in groups.values()}) <= most:
+            break
+        if groups[one] is not groups[other]:
+            joined = sorted(groups[one] + groups[other])
+            groups |= dict.fromkeys(joined, joined)
+    return [group for index, group in groups.items() if group[0] == index]
