@@ -188,8 +188,12 @@ def extrapolate_planes(
     """
     directions = octahedral_grid(size).reshape(-1, 3)
     bounds = [(plane, samples.only(plane.inliers)) for plane in planes if _bounds_room(plane, samples)]
-    lamps = np.array([light.position for light in lights if isinstance(light, Lamp)], np.float64).reshape(-1, 3)
-    known_m = max((_longest_extent(np.concatenate([seen.position, lamps])) for _, seen in bounds), default=0.0)
+    lamps = np.array([light.position for light in lights if isinstance(light, Lamp)], np.float64).reshape(
+        -1, 3
+    )
+    known_m = max(
+        (_longest_extent(np.concatenate([seen.position, lamps])) for _, seen in bounds), default=0.0
+    )
     layers = [
         _plane_layer(plane, seen, lights, frustum, known_m=known_m, centre=centre, directions=directions)
         for plane, seen in bounds
