@@ -2,9 +2,9 @@
 
 How far is unknown. A plane seen over a length L continues for at least d beyond the border with probability
 L / (L + d), because the border cuts it at a place that is independent of it (Gott 1993, Nature 363, for lengths in
-place of times). L is the longest extent that is seen of any plane that bounds the room, because they meet: a wall of
-which the picture shows a strip is unlikely to end just above it or beside it. Its radiance there follows from the
-lights and from its reflectance where it is seen.
+place of times). L is the longest extent that is known of the room, because its planes meet: that of a plane in view
+with the lamps, which the room contains. A wall of which the picture shows a strip is unlikely to end just above it or
+beside it. Its radiance there follows from the lights and from its reflectance where it is seen.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from deltalight.protocol.octahedral import octahedral_grid
-from deltalight.render_server.lights.lights import Light, incident_light
+from deltalight.render_server.lights.lights import Lamp, Light, incident_light
 
 # Twice the planes of a room's corner: things have large faces too.
 MAX_PLANES = 6
@@ -188,9 +188,14 @@ def extrapolate_planes(
     """
     directions = octahedral_grid(size).reshape(-1, 3)
     bounds = [(plane, samples.only(plane.inliers)) for plane in planes if _bounds_room(plane, samples)]
-    seen_m = max((_longest_extent(seen.position) for _, seen in bounds), default=0.0)
+    lamps = np.array([light.position for light in lights if isinstance(light, Lamp)], np.float64).reshape(
+        -1, 3
+    )
+    known_m = max(
+        (_longest_extent(np.concatenate([seen.position, lamps])) for _, seen in bounds), default=0.0
+    )
     layers = [
-        _plane_layer(plane, seen, lights, frustum, seen_m=seen_m, centre=centre, directions=directions)
+        _plane_layer(plane, seen, lights, frustum, known_m=known_m, centre=centre, directions=directions)
         for plane, seen in bounds
     ]
     radiance, beyond = np.zeros((len(directions), 3)), np.ones(len(directions))
@@ -232,7 +237,7 @@ def _plane_layer(
     lights: Sequence[Light],
     frustum: ViewFrustum,
     *,
-    seen_m: float,
+    known_m: float,
     centre: Float64[np.ndarray, "3"],
     directions: Float64[np.ndarray, "n 3"],
 ) -> _PlaneLayer:
@@ -243,25 +248,25 @@ def _plane_layer(
     distance[meets] = -height / falling[meets]
     probability, radiance = np.zeros(len(directions)), np.zeros((len(directions), 3))
     places = centre + distance[meets, None] * directions[meets]
-    probability[meets] = _continuation_probability(places, seen, frustum, seen_m)
+    probability[meets] = _continuation_probability(places, seen, frustum, known_m)
     radiance[meets] = _expected_radiance(places, plane, seen, lights)
     return _PlaneLayer(distance, probability, radiance)
 
 
 def _continuation_probability(
-    places: Float64[np.ndarray, "m 3"], seen: RealSamples, frustum: ViewFrustum, seen_m: float
+    places: Float64[np.ndarray, "m 3"], seen: RealSamples, frustum: ViewFrustum, known_m: float
 ) -> Float64[np.ndarray, " m"]:
     """Returns the probability that a plane extends to positions on it.
 
     The visible length is twice that from the centre of the visible part to where the line to the position leaves the
-    view, or the longest extent `seen_m` (m) that is visible of the room's bounds if that is longer.
+    view, or the longest extent `known_m` (m) that is known of the room if that is longer.
     """
     middle = seen.position.mean(axis=0)
     start = frustum.inside(middle[None])
     end = frustum.inside(places)
     in_view = np.divide(start, start - end, out=np.ones_like(end), where=end < 0).min(axis=1)
     away_m = np.linalg.norm(places - middle, axis=1)
-    length_m = np.maximum(2 * in_view * away_m, seen_m)
+    length_m = np.maximum(2 * in_view * away_m, known_m)
     return np.asarray(length_m / (length_m + (1 - in_view) * away_m))
 
 

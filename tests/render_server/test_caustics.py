@@ -110,6 +110,19 @@ def test_flat_mirror_lights_a_patch_of_the_floor(gpu: GpuContext, stage: Stage) 
     assert not light[aside].any()
 
 
+def test_light_beside_an_object_hardly_depends_on_the_reduced_grid(gpu: GpuContext, tmp_path: Path) -> None:
+    """Below a ball on the floor, beams are narrower than what four pixels can hold."""
+    light = []
+    for scale in (1, 4):
+        stage = Stage(tmp_path, {**COARSE, "cone_scale": scale})
+        objects = [stage.virtual(ball(RADIUS, (0, 0, RADIUS), detail=5), material={**DOWN, "roughness": 0.2})]
+        document = stage.document(objects, [directional((-0.3, 1.0, -1.0), IRRADIANCE)], floor())
+        without = document.replaced(method=document.method.replaced(caustics=False))
+        light.append(fields(gpu, document).direct_rho - fields(gpu, without).direct_rho)
+    fine, coarse = light
+    assert np.abs(coarse - fine).sum() < 0.03 * fine.sum()
+
+
 def shown_area(found: Fields) -> np.ndarray:
     """Area of the surface that each pixel shows, up to a factor."""
     away = np.asarray(EYE) - found.position[..., :3]

@@ -20,7 +20,7 @@ from deltalight.render_server.estimation.plane_extrapolation import (
     extrapolate_planes,
 )
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.lights import Light, SphereLight
+from deltalight.render_server.lights.lights import DirectionalLight, Light, SphereLight
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, floor, frame, look_at, plain, shifted
 
@@ -162,6 +162,20 @@ def test_a_strip_of_a_wall_beside_a_long_one_goes_on_as_that_does() -> None:
     assert beside.sum() >= 4
     for parts, length in (([(*strip, 0.3)], 0.2), ([(*strip, 0.3), (*end, 0.3)], 2.0)):
         found = continued(*shown(*parts)).probability.reshape(-1)[beside]
+        assert found == pytest.approx(length / (length + beyond), rel=1e-5)
+
+
+def test_a_wall_reaches_as_far_as_lamps_say_that_the_room_does() -> None:
+    """The view shows 2 m of it. With a lamp 4 m to the right of its middle, 5 m of the room are known."""
+    planes, samples = shown((*AHEAD, 0.3))
+    lamp = SphereLight(np.array([4, 1.0, 0.5], np.float32), np.zeros(3, np.float32), 0.02)
+    sun = DirectionalLight(np.array([0, 1, 0], np.float32), np.zeros(3, np.float32), 0.0)
+    place = CENTRE + DIRECTIONS / np.where(DIRECTIONS[:, 1:2] > 0, DIRECTIONS[:, 1:2], np.inf)
+    left = (DIRECTIONS[:, 1] > 0) & (place[:, 0] < -1) & (np.abs(place[:, 2] - 0.5) < 1e-9)
+    beyond = -1 - place[left, 0]
+    assert left.sum() >= 4
+    for light, length in ((lamp, 5.0), (sun, 2.0)):
+        found = continued(planes, samples, (light,)).probability.reshape(-1)[left]
         assert found == pytest.approx(length / (length + beyond), rel=1e-5)
 
 

@@ -10,7 +10,9 @@ uniform ivec2 picture_pixels;
 uniform int scale;
 
 const float LEAST_SLANT = 1.5;     // around corners too
-const float SMOOTH_TEXELS = 1.0;   // footprints with a radius of this many texels of the reduced grid go there
+// Footprints with a radius of this many texels of the reduced grid go there: a standard deviation is then a texel, and the grid holds
+// a normal distribution.
+const float SMOOTH_TEXELS = FOOTPRINT_CUT;
 
 // Slant of the surface that the beam hits: length of the footprint relative to the beam's width.
 float slant_at(Beam beam, int layer, vec2 centre) {
