@@ -188,12 +188,8 @@ def extrapolate_planes(
     """
     directions = octahedral_grid(size).reshape(-1, 3)
     bounds = [(plane, samples.only(plane.inliers)) for plane in planes if _bounds_room(plane, samples)]
-    lamps = np.array([light.position for light in lights if isinstance(light, Lamp)], np.float64).reshape(
-        -1, 3
-    )
-    known_m = max(
-        (_longest_extent(np.concatenate([seen.position, lamps])) for _, seen in bounds), default=0.0
-    )
+    lamps = _lamps_inside([plane for plane, _ in bounds], lights)
+    known_m = max((_longest_extent(np.vstack([seen.position, lamps])) for _, seen in bounds), default=0.0)
     layers = [
         _plane_layer(plane, seen, lights, frustum, known_m=known_m, centre=centre, directions=directions)
         for plane, seen in bounds
@@ -229,6 +225,16 @@ def _bounds_room(plane: DetectedPlane, samples: RealSamples) -> bool:
     """Whether nothing is visible behind a plane; faces of things have the room behind them, and end."""
     behind = samples.position @ plane.normal < plane.offset - 3 * samples.tolerance_m
     return bool(behind.mean() <= MAX_STRAY_FRACTION)
+
+
+def _lamps_inside(bounds: Sequence[DetectedPlane], lights: Sequence[Light]) -> Float64[np.ndarray, "n 3"]:
+    """Returns the positions of lamps that no plane of the room has behind it: those light the room from outside."""
+    inside = [
+        light.position
+        for light in lights
+        if isinstance(light, Lamp) and all(light.position @ plane.normal > plane.offset for plane in bounds)
+    ]
+    return np.array(inside, np.float64).reshape(-1, 3)
 
 
 def _plane_layer(

@@ -166,15 +166,17 @@ def test_a_strip_of_a_wall_beside_a_long_one_goes_on_as_that_does() -> None:
 
 
 def test_a_wall_reaches_as_far_as_lamps_say_that_the_room_does() -> None:
-    """The view shows 2 m of it. With a lamp 4 m to the right of its middle, 5 m of the room are known."""
+    """The view shows 2 m of it. With a lamp 4 m to the right of its middle, 5 m are known; one behind it is outside."""
     planes, samples = shown((*AHEAD, 0.3))
-    lamp = SphereLight(np.array([4, 1.0, 0.5], np.float32), np.zeros(3, np.float32), 0.02)
+    lamp, outside = (
+        SphereLight(np.array([4, y, 0.5], np.float32), np.zeros(3, np.float32), 0.02) for y in (0.999, 1.1)
+    )
     sun = DirectionalLight(np.array([0, 1, 0], np.float32), np.zeros(3, np.float32), 0.0)
     place = CENTRE + DIRECTIONS / np.where(DIRECTIONS[:, 1:2] > 0, DIRECTIONS[:, 1:2], np.inf)
     left = (DIRECTIONS[:, 1] > 0) & (place[:, 0] < -1) & (np.abs(place[:, 2] - 0.5) < 1e-9)
     beyond = -1 - place[left, 0]
     assert left.sum() >= 4
-    for light, length in ((lamp, 5.0), (sun, 2.0)):
+    for light, length in ((lamp, 5.0), (outside, 2.0), (sun, 2.0)):
         found = continued(planes, samples, (light,)).probability.reshape(-1)[left]
         assert found == pytest.approx(length / (length + beyond), rel=1e-5)
 
