@@ -10,7 +10,7 @@ from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume
-from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.voxels import LevelFilter, VoxelMipmap, VoxelStore
 
 LIGHT_SUMS = 14  # per slot: shaders/common/split_sums.glsl
 
@@ -123,21 +123,18 @@ class ResolveInjection:
 
 
 class FilterIsotropic:
-    """Filters the levels of V_delta and V_rho above level 0, one dispatch per level for both."""
+    """Filters the levels of V_delta and V_rho above level 0, of both together."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._kernel = Kernel(gpu, "filter_isotropic", DIRECTIONS=1)
+        self._levels = LevelFilter(gpu, "filter_isotropic", DIRECTIONS=1)
 
     def run(self, delta: VoxelMipmap, rho: VoxelMipmap, volume: PlacedVolume) -> None:
         """Rebuilds all levels from level 0."""
-        for level in range(1, volume.placement.levels):
-            cells = volume.placement.size >> level
-            threads = (cells, cells, cells * len(volume.placements))
-            self._kernel.run(threads, volume.bindings, delta=delta.texture, rho=rho.texture, level=level)
+        self._levels.run(volume, 1, delta=delta.texture, rho=rho.texture)
 
     def release(self) -> None:
         """Frees the program."""
-        self._kernel.release()
+        self._levels.release()
 
 
 class DeltaError:
