@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import moderngl
 
-from deltalight.render_server.gpu.clearing import clear_buffers
+from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffers
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
@@ -123,11 +123,10 @@ class Caustics:
         self._beams: moderngl.Texture | None = None
         self._places: moderngl.Texture | None = None
         self._end = Kernel(gpu, "caustic_ends")
-        self._find_places = Kernel(gpu, "caustic_places")
+        self._find_bounds = Kernel(gpu, "caustic_bounds", **reuse_define(reuses))
         self._tiles = tuple(-(-edge // TILE) for edge in grid.size)
         self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
         self._tile_beams = gpu.ctx.buffer(reserve=4)
-        self._find_balls = Kernel(gpu, "caustic_balls", **reuse_define(reuses))
         self._find_tiles = Kernel(gpu, "caustic_tiles")
         rows = 8 if gpu.is_software else 2  # software renderers read a beam once for each of few threads
         self._gather = Kernel(
@@ -180,12 +179,14 @@ class Caustics:
             "picture_pixels": grid.picture_size,
             "scale": grid.scale,
         }
-        self._find_places.run((self._threads,), shared, scene)
         self._gather_wide(shared, scene)
         self._splat.run((self._threads,), shared, scene)
+        clear_ahead(self._gpu, (self._tile_beams, self._tile_beams.size))
+        if self._last_sums is not None:
+            clear_ahead(self._gpu, (self._last_sums, self._last_sums.size))
 
     def _gather_wide(self, shared: Bindings, scene: Bindings) -> None:
-        """Adds the wide beams, in each tile of the reduced grid those that may reach what it samples."""
+        """Finds where beams are, and adds the wide ones: in each tile of the reduced grid those that may reach it."""
         assert self._places is not None
         most, (across, down) = self._places.height * BEAMS_A_ROW, self._tiles
         own: Bindings = {
@@ -194,7 +195,10 @@ class Caustics:
             "tile_balls": self._balls,
             "TileBeams": self._tile_beams,
         }
-        self._find_balls.run((across, 2 * down), own, shared, scene)
+        ball_groups = -(-2 * across * down // self._find_bounds.local_size[0])
+        self._find_bounds.run(
+            (self._threads + ball_groups * self._find_bounds.local_size[0],), own, shared, scene
+        )
         self._find_tiles.run((list_threads(self._gpu, most), down), own, shared, scene)
         self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
 
@@ -208,10 +212,9 @@ class Caustics:
             self._beams,
             self._places,
             self._end,
-            self._find_places,
+            self._find_bounds,
             self._balls,
             self._tile_beams,
-            self._find_balls,
             self._find_tiles,
             self._gather,
             self._splat,

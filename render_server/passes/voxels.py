@@ -307,7 +307,12 @@ class LevelFilter:
         self._kernel = Kernel(gpu, name, **defines, **({"FUSED": 1} if self._is_fused else {}))
 
     def run(
-        self, volume: PlacedVolume, directions: int, *shared: Bindings, first: int = 1, **images: moderngl.Texture3D
+        self,
+        volume: PlacedVolume,
+        directions: int,
+        *shared: Bindings,
+        first: int = 1,
+        **images: moderngl.Texture3D,
     ) -> None:
         """Rebuilds the levels from `first` on, of mipmaps of so many directions."""
         levels = volume.placement.levels

@@ -1,11 +1,14 @@
-// Where each beam may light the picture.
+// Where each beam may light the picture; and a ball around the surfaces that need light in each tile (its middle and radius, world m),
+// of real surfaces and below them of objects. The first workgroups find the balls, the others walk the beams.
 #include "common/geometry.glsl"
 #include "common/walk.glsl"
 #define FINDS_PLACES
 #include "common/beam_footprint.glsl"
+#include "common/beam_tiles.glsl"
 #include "common/camera.glsl"
 
 layout(local_size_x = 64) in;
+layout(rgba32f) writeonly uniform image2D tile_balls;
 uniform ivec2 picture_pixels;
 uniform int scale;
 
@@ -35,7 +38,31 @@ BeamPlace place_of(Beam beam) {
     return BeamPlace(low, high, layer, sharp ? 1 : 0);
 }
 
+vec4 ball_around(ivec2 tile, int layer) {
+    vec3 low = vec3(1e9), high = vec3(-1e9);
+    for (int i = 0; i < TILE * TILE; ++i) {
+        LitTexel t = lit_texel(TILE * tile + ivec2(i % TILE, i / TILE), layer);
+        low = min(low, t.needed ? t.p : low);
+        high = max(high, t.needed ? t.p : high);
+    }
+    bool any_needed = low.x <= high.x;
+    return any_needed ? vec4(0.5 * (low + high), 0.5 * distance(low, high)) : vec4(0.0, 0.0, 0.0, -1e9);
+}
+
+void find_ball(int number) {
+    if (number >= 2 * tiles.x * tiles.y) return;
+    ivec2 at = ivec2(number % tiles.x, number / tiles.x);
+    bool is_real = at.y < tiles.y;
+    imageStore(tile_balls, at, ball_around(at - ivec2(0, is_real ? 0 : tiles.y), is_real ? REAL_LAYER : OBJECT_LAYER));
+}
+
 void main() {
+    uint groups = gl_NumWorkGroups.x, group = spread(gl_WorkGroupID.x, groups), thread = gl_LocalInvocationID.x;
+    uint of_balls = (2u * uint(tiles.x * tiles.y) + 63u) / 64u;
+    if (group < of_balls) {
+        find_ball(int(64u * group + thread));
+        return;
+    }
     uint count = beams_held();
-    for (uint i = first_item(); i < count; i += items_apart()) put_place(i, place_of(beam_at(i)));
+    for (uint i = 64u * (group - of_balls) + thread; i < count; i += 64u * (groups - of_balls)) put_place(i, place_of(beam_at(i)));
 }
