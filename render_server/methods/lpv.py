@@ -9,7 +9,7 @@ import moderngl
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources
-from deltalight.render_server.gpu.clearing import clear_buffer
+from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.graph import Graph, Resource
@@ -120,6 +120,7 @@ class DifferenceVolumes:
             if number == last > 1:
                 self._tail.extend(self._before, self._bounced)
             self._rho.run(through, injected, change, self._bounced)
+        clear_ahead(self._gpu, *((sums, sums.size) for sums in (self._bounced, self._before)))
         return rho
 
     def release(self) -> None:

@@ -7,7 +7,7 @@ import moderngl
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources, Observation
-from deltalight.render_server.gpu.clearing import clear_buffer
+from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
@@ -85,6 +85,7 @@ class LpvCells:
         """Voxelises at half a cell; only the store's surfels are used."""
         clear_buffer(self._gpu, store.grid)
         self._voxelize.run(store, meshes, self._half_cells)
+        clear_ahead(self._gpu, (store.grid, store.grid.size))
 
     def real_scene(
         self,
@@ -150,6 +151,7 @@ class LpvCells:
             return None
         self._cover.run(self._virtual_covered, objects, volume.placement, state.buffers.cutouts)
         self._transmit.run(self._through_joint, self.size, self._real_covered, self._virtual_covered)
+        clear_ahead(self._gpu, (self._virtual_covered, self._virtual_covered.size))
         return self._through_joint
 
     def release(self) -> None:

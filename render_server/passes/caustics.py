@@ -118,7 +118,6 @@ class Caustics:
         lower = "output.width and output.height"
         self._sums = gpu.storage_buffer(size, lower)
         self._last_sums = gpu.storage_buffer(size, lower) if reuses else None
-        self._reuse = Kernel(gpu, "reuse_caustics") if reuses else None
         self._count = gpu.ctx.buffer(reserve=4)
         self._beams: moderngl.Texture | None = None
         self._places: moderngl.Texture | None = None
@@ -168,8 +167,6 @@ class Caustics:
             self._sums, self._last_sums = self._last_sums, self._sums
         clear_buffers(self._gpu, (self._sums, self._sums.size), (self._tile_beams, self._tile_beams.size))
         grid = self._grid
-        if self._reuse is not None:
-            self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
         shared: Bindings = {
             **self.bindings,
             "BeamCount": self._count,
@@ -195,19 +192,26 @@ class Caustics:
             "tile_balls": self._balls,
             "TileBeams": self._tile_beams,
         }
-        ball_groups = -(-2 * across * down // self._find_bounds.local_size[0])
         self._find_bounds.run(
-            (self._threads + ball_groups * self._find_bounds.local_size[0],), own, shared, scene
+            (self._bound_threads(),), own, shared, self._grid.bindings, scene, **self._last_bindings()
         )
         self._find_tiles.run((list_threads(self._gpu, most), down), own, shared, scene)
         self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
+
+    def _bound_threads(self) -> int:
+        """Returns those of all tiles of both layers, of texels if the last frame's are reused, and of beams."""
+        items = [2 * math.prod(self._tiles), 0 if self._last_sums is None else math.prod(self._grid.size)]
+        group = self._find_bounds.local_size[0]
+        return self._threads + sum(-(-count // group) * group for count in items)
+
+    def _last_bindings(self) -> dict[str, Binding]:
+        return {} if self._last_sums is None else {"LastSums": self._last_sums}
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(
             self._sums,
             self._last_sums,
-            self._reuse,
             self._count,
             self._beams,
             self._places,

@@ -69,13 +69,13 @@ class EdgeTriangles:
 
     def clear(self, pixels: moderngl.Buffer) -> None:
         """Marks no tile, and empties all lists, that of `pixels` too."""
-        clear_buffers(self._gpu, *self._starts(pixels))
+        clear_buffers(self._gpu, *self._scratch(pixels))
 
     def used_up(self, pixels: moderngl.Buffer) -> None:
         """Lets that be cleared ahead: nobody reads marks, lists and `pixels` any more."""
-        clear_ahead(self._gpu, *self._starts(pixels))
+        clear_ahead(self._gpu, *self._scratch(pixels))
 
-    def _starts(self, pixels: moderngl.Buffer) -> tuple[Start, ...]:
+    def _scratch(self, pixels: moderngl.Buffer) -> tuple[Start, ...]:
         return (self.tiles, self.tiles.size), (self.nodes, NODES_HEADER_BYTES), (pixels, LIST_HEADER_BYTES)
 
     def find_thin(self, mesh: MeshBuffers, view: CameraView, raster: GeometryBuffer, scene: Bindings) -> None:
