@@ -105,7 +105,7 @@ class EdgeTriangles:
             scene,
             own,
             mesh.solid,
-            mesh_corners=mesh.corners,
+            mesh.corners,
             clip_from_world=view.clip_from_camera @ view.camera_from_world,
             triangle_count=mesh.triangle_count,
         )
@@ -183,7 +183,7 @@ class SampleCoverage:
             mesh.solid,
             self._written,
             self.triangles.lists,
-            mesh_corners=mesh.corners,
+            mesh.corners,
         )
 
     @property
