@@ -87,7 +87,7 @@ class MeshBuffers:
 
     @property
     def corners(self) -> dict[str, Binding]:
-        """What shaders/common/plane.glsl reads beside `solid` of a mesh that was written: in software, its corners."""
+        """What common/plane.glsl reads beside `solid`, of a mesh that was written: in software, its corners."""
         return {"mesh_corners": self._corner_texture()} if self._gpu.is_software else {}
 
     def _corner_texture(self) -> moderngl.Texture:

@@ -1,5 +1,6 @@
 // Triangles of a mesh as rays from the camera meet them.
 #include "common/camera.glsl"
+#include "common/solid_mesh.glsl"
 #ifdef SOFTWARE
 // Three texels a triangle in rows: an image, because software renderers load buffers lane by lane, number by number.
 layout(rgba32f) readonly uniform image2D mesh_corners;
@@ -10,8 +11,6 @@ mat3 corners_of(uint triangle) {
     return mat3(imageLoad(mesh_corners, at).xyz, imageLoad(mesh_corners, at + ivec2(1, 0)).xyz, imageLoad(mesh_corners, at + ivec2(2, 0)).xyz);
 }
 #else
-#include "common/solid_mesh.glsl"
-
 vec3 corner_of(uint number) { return vertex_vector(indices[number] * VERTEX_FLOATS); }
 
 mat3 corners_of(uint triangle) {
