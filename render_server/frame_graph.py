@@ -20,6 +20,7 @@ from deltalight.render_server.frame import (
     declare_frame,
     together,
 )
+from deltalight.render_server.gpu.clearing import clear_used_up
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu.textures import read_texture
@@ -241,6 +242,7 @@ class FrameGraph:
     def upload(self, frame: ViewFrame) -> None:
         """Begins a frame by uploading its picture."""
         if self is self._all[0]:
+            clear_used_up(self.graph.gpu)
             self.graph.begin_frame()
         self.buffers.image.upload(frame)
         self.resources.image.write(self.buffers.image)

@@ -113,6 +113,10 @@ class LiveScene:
         for sentence in self._objects.left_out(scene.objects):
             self._notify(sentence)
         self._state_lamps(scene.objects, method)
+        if before is not None and scene.lights == self._plan.scene.lights:
+            return _Plan(
+                scene, method, before
+            )  # reading them anew takes a tenth of a millisecond of each drag
         known = before if method.keeps_world else None
         return _Plan(scene, method, LightEstimator(scene.lights, self._notify, known, waits=self._waits))
 

@@ -1,5 +1,7 @@
 """Buffers and volumes set to zero on the GPU."""
 
+from collections.abc import Sequence
+
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
@@ -8,7 +10,10 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings, common_kernel
 CLEARING_GROUPS = 4096  # of workgroups at most; they stride over larger buffers
 WORD_BYTES = 4
 SHORT_BYTES = 16  # of headers of lists
-NOTHING: Bindings = dict.fromkeys(("Cleared", "Cleared1", "Cleared2", "Cleared3"))
+CLEARED = ("Cleared", *(f"Cleared{number}" for number in range(1, 8)))  # as many as any GPU binds
+NOTHING: Bindings = dict.fromkeys(CLEARED)
+Start = tuple[moderngl.Buffer, int]
+"""A buffer, and how many of its first bytes are meant (a multiple of 4)."""
 
 
 def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = None) -> None:
@@ -16,8 +21,8 @@ def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = No
     clear_buffers(gpu, (buffer, buffer.size if size is None else size))
 
 
-def clear_buffers(gpu: GpuContext, *starts: tuple[moderngl.Buffer, int]) -> None:
-    """Sets the first bytes (a multiple of 4) of one to four buffers to zero, in one dispatch.
+def clear_buffers(gpu: GpuContext, *starts: Start) -> None:
+    """Sets the starts of one to eight buffers to zero, in one dispatch; none if `clear_ahead` had that done.
 
     By a kernel: `Buffer.clear` maps the buffer, so it waits for the GPU; with glClearBufferSubData, an H200 took 9 ms
     longer for a frame of 256^3 voxels. In software, clearing is no more than a memset, 15 to 50 times as fast as a
@@ -30,14 +35,45 @@ def clear_buffers(gpu: GpuContext, *starts: tuple[moderngl.Buffer, int]) -> None
             else:
                 buffer.clear(size)
         return
+    for buffer, _ in starts:
+        gpu.used_up.pop(buffer, None)
+    dirty = [(buffer, size) for buffer, size in starts if gpu.cleared_ahead.pop(buffer, 0) < size]
+    if dirty:
+        _clear(gpu, dirty)
+
+
+def clear_ahead(gpu: GpuContext, *starts: Start) -> None:
+    """Lets buffers whose contents have been used up be cleared when the next frame begins, all in one dispatch.
+
+    Whoever fills one next calls `clear_buffers` all the same.
+    """
+    if not gpu.is_software:
+        gpu.used_up.update(starts)
+
+
+def clear_used_up(gpu: GpuContext) -> None:
+    """Clears what `clear_ahead` was told of."""
+    starts = [
+        (buffer, size)
+        for buffer, size in gpu.used_up.items()
+        if not isinstance(buffer.mglo, moderngl.InvalidObject)
+    ]
+    gpu.used_up.clear()
+    for first in range(0, len(starts), len(CLEARED)):
+        _clear(gpu, starts[first : first + len(CLEARED)])
+    gpu.cleared_ahead.update(starts)
+
+
+def _clear(gpu: GpuContext, starts: Sequence[Start]) -> None:
     kernel = common_kernel(gpu, "clear_buffer")
     words = [size // WORD_BYTES for _, size in starts]
     threads = min(max(words), CLEARING_GROUPS * kernel.local_size[0])
     bound: dict[str, Binding] = {
         **NOTHING,
-        **dict(zip(NOTHING, (buffer for buffer, _ in starts), strict=False)),
+        **dict(zip(CLEARED, (buffer for buffer, _ in starts), strict=False)),
     }
-    kernel.run((threads,), bound, word_counts=(*words, 0, 0, 0)[: len(NOTHING)])
+    counts = (*words, *[0] * len(CLEARED))[: len(CLEARED)]
+    kernel.run((threads,), bound, word_counts=counts[:4], more_word_counts=counts[4:])
 
 
 def clear_volume(gpu: GpuContext, texture: moderngl.Texture3D) -> None:

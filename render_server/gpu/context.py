@@ -3,12 +3,13 @@
 import ctypes
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Protocol
+from weakref import WeakKeyDictionary
 
 import glcontext
 import moderngl
@@ -196,6 +197,16 @@ class GpuContext:
     def group_counters(self) -> moderngl.Buffer:
         """Counters of workgroups that are done, all 0 between dispatches: the last one of each sets its own back."""
         return self.ctx.buffer(bytes(4 * MOST_GROUP_COUNTERS))
+
+    @cached_property
+    def used_up(self) -> MutableMapping[moderngl.Buffer, int]:
+        """Buffers to be cleared when the next frame begins, and how many bytes of each (gpu/clearing.py)."""
+        return WeakKeyDictionary()
+
+    @cached_property
+    def cleared_ahead(self) -> MutableMapping[moderngl.Buffer, int]:
+        """Buffers that were cleared before anybody needs them, and how many bytes of each."""
+        return WeakKeyDictionary()
 
     @cached_property
     def discarded_buffer(self) -> moderngl.Buffer:

@@ -152,7 +152,8 @@ class Shading:
         self.tier = options.tier
         self.size, self._scale = size, resolved.cone_scale
         self.reuses_light = options.tier.refresh_tiles > 0
-        self.grid = LowResGrid(gpu, size, resolved.cone_scale)
+        lists_quads = options.screen_space and options.tier.reflection_step > 1
+        self.grid = LowResGrid(gpu, size, resolved.cone_scale, lists_quads=lists_quads)
         self.cones = ConeFields(gpu, self.grid.size, remembers=self.reuses_light)
         self._history: LightHistory | None = None
         if self.reuses_light:

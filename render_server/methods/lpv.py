@@ -10,7 +10,7 @@ import numpy as np
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources
-from deltalight.render_server.gpu.clearing import clear_buffer
+from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu_scene import ObjectExtent
@@ -127,6 +127,7 @@ class DifferenceVolumes:
             if number == last > 1:
                 self._tail.extend(self._before, self._bounced)
             self._rho.run(through, injected, change, self._bounced)
+        clear_ahead(self._gpu, (self._before, self._before.size))
         return rho, self._bounced if last > 0 else None
 
     def release(self) -> None:

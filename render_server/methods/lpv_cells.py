@@ -7,7 +7,7 @@ import moderngl
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources, Observation
-from deltalight.render_server.gpu.clearing import clear_buffer
+from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
@@ -85,6 +85,7 @@ class LpvCells:
         """Voxelises at half a cell; only the store's surfels are used."""
         clear_buffer(self._gpu, store.grid)
         self._voxelize.run(store, meshes, self._half_cells)
+        clear_ahead(self._gpu, (store.grid, store.grid.size))
 
     def real_scene(
         self,

@@ -12,6 +12,7 @@ import numpy as np
 
 from deltalight.protocol.scene_method import DvctMethod, VoxelConeSettings
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.clearing import clear_ahead
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
@@ -299,6 +300,8 @@ class DeltaVoxels(DirectionalVoxels):
             self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_rho(scene, gathered=True)
             self._filter_rho()
+        if self._bounces > 0:
+            clear_ahead(self._gpu, (self.real.store.delta_sums, self.real.store.delta_sums.size))
         self._find_tail(marching)
         return self.rho, lit
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import moderngl
 
-from deltalight.render_server.gpu.clearing import clear_buffers
+from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffers
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
@@ -118,16 +118,14 @@ class Caustics:
         lower = "output.width and output.height"
         self._sums = gpu.storage_buffer(size, lower)
         self._last_sums = gpu.storage_buffer(size, lower) if reuses else None
-        self._reuse = Kernel(gpu, "reuse_caustics") if reuses else None
         self._count = gpu.ctx.buffer(reserve=4)
         self._beams: moderngl.Texture | None = None
         self._places: moderngl.Texture | None = None
         self._end = Kernel(gpu, "caustic_ends")
-        self._find_places = Kernel(gpu, "caustic_places")
+        self._find_bounds = Kernel(gpu, "caustic_bounds", **reuse_define(reuses))
         self._tiles = tuple(-(-edge // TILE) for edge in grid.size)
         self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
         self._tile_beams = gpu.ctx.buffer(reserve=4)
-        self._find_balls = Kernel(gpu, "caustic_balls", **reuse_define(reuses))
         self._find_tiles = Kernel(gpu, "caustic_tiles")
         rows = 8 if gpu.is_software else 2  # software renderers read a beam once for each of few threads
         self._gather = Kernel(
@@ -169,8 +167,6 @@ class Caustics:
             self._sums, self._last_sums = self._last_sums, self._sums
         clear_buffers(self._gpu, (self._sums, self._sums.size), (self._tile_beams, self._tile_beams.size))
         grid = self._grid
-        if self._reuse is not None:
-            self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
         shared: Bindings = {
             **self.bindings,
             "BeamCount": self._count,
@@ -180,12 +176,14 @@ class Caustics:
             "picture_pixels": grid.picture_size,
             "scale": grid.scale,
         }
-        self._find_places.run((self._threads,), shared, scene)
         self._gather_wide(shared, scene)
         self._splat.run((self._threads,), shared, scene)
+        clear_ahead(self._gpu, (self._tile_beams, self._tile_beams.size))
+        if self._last_sums is not None:
+            clear_ahead(self._gpu, (self._last_sums, self._last_sums.size))
 
     def _gather_wide(self, shared: Bindings, scene: Bindings) -> None:
-        """Adds the wide beams, in each tile of the reduced grid those that may reach what it samples."""
+        """Finds where beams are, and adds the wide ones: in each tile of the reduced grid those that may reach it."""
         assert self._places is not None
         most, (across, down) = self._places.height * BEAMS_A_ROW, self._tiles
         own: Bindings = {
@@ -194,24 +192,33 @@ class Caustics:
             "tile_balls": self._balls,
             "TileBeams": self._tile_beams,
         }
-        self._find_balls.run((across, 2 * down), own, shared, scene)
+        self._find_bounds.run(
+            (self._bound_threads(),), own, shared, self._grid.bindings, scene, **self._last_bindings()
+        )
         self._find_tiles.run((list_threads(self._gpu, most), down), own, shared, scene)
         self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
+
+    def _bound_threads(self) -> int:
+        """Returns those of all tiles of both layers, of texels if the last frame's are reused, and of beams."""
+        items = [2 * math.prod(self._tiles), 0 if self._last_sums is None else math.prod(self._grid.size)]
+        group = self._find_bounds.local_size[0]
+        return self._threads + sum(-(-count // group) * group for count in items)
+
+    def _last_bindings(self) -> dict[str, Binding]:
+        return {} if self._last_sums is None else {"LastSums": self._last_sums}
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(
             self._sums,
             self._last_sums,
-            self._reuse,
             self._count,
             self._beams,
             self._places,
             self._end,
-            self._find_places,
+            self._find_bounds,
             self._balls,
             self._tile_beams,
-            self._find_balls,
             self._find_tiles,
             self._gather,
             self._splat,

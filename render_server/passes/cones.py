@@ -16,17 +16,21 @@ class LowResGrid:
     """For each block of the picture, the pixel of a real surface (x, y) and of a virtual one (x, y), as RGBA16I.
 
     -1 marks a block that shows none; -2 - pixel represents real surfaces that objects hide. `virtual_texels` lists
-    the texels that show an object (count, then indices), `shown_pixels` the picture's pixels that do.
+    the texels that show an object (count, then indices), `shown_pixels` the picture's pixels that do; `quads`, if
+    `lists_quads`, one pixel that does of each 2 x 2.
     """
 
-    def __init__(self, gpu: GpuContext, picture_size: tuple[int, int], scale: int) -> None:
+    def __init__(
+        self, gpu: GpuContext, picture_size: tuple[int, int], scale: int, *, lists_quads: bool = False
+    ) -> None:
         self._gpu = gpu
         self.picture_size, self.scale = picture_size, scale
         self.size = (-(-picture_size[0] // scale), -(-picture_size[1] // scale))
         self.pixels = texture_2d(gpu, self.size, 4, "i2")
         self.virtual_texels = gpu.ctx.buffer(bytes(4 * (1 + self.texel_count)))
         self.shown_pixels = gpu.ctx.buffer(bytes(4 * (1 + math.prod(picture_size))))
-        self._kernel = Kernel(gpu, "low_res_grid")
+        self.quads = gpu.ctx.buffer(bytes(self.shown_pixels.size)) if lists_quads else None
+        self._kernel = Kernel(gpu, "low_res_grid", **({"QUADS": 1} if lists_quads else {}))
 
     @property
     def texel_count(self) -> int:
@@ -49,9 +53,14 @@ class LowResGrid:
         """Selects the pixels."""
         self.empty_list(self.virtual_texels)
         self._gpu.clear_start(self.shown_pixels, LIST_HEADER_BYTES)
+        quads: dict[str, Binding] = {}
+        if self.quads is not None:
+            self._gpu.clear_start(self.quads, LIST_HEADER_BYTES)
+            quads["Quads"] = self.quads
         self._kernel.run(
             self.size,
             scene,
+            quads,
             sample_pixels_out=self.pixels,
             Texels=self.virtual_texels,
             ShownPixels=self.shown_pixels,
@@ -61,10 +70,7 @@ class LowResGrid:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self.pixels.release()
-        self.virtual_texels.release()
-        self.shown_pixels.release()
-        self._kernel.release()
+        release_all(self.pixels, self.virtual_texels, self.shown_pixels, self.quads, self._kernel)
 
 
 class ConeFields:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import moderngl
 
-from deltalight.render_server.gpu.clearing import clear_buffers
+from deltalight.render_server.gpu.clearing import Start, clear_ahead, clear_buffers
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import (
@@ -69,8 +69,14 @@ class EdgeTriangles:
 
     def clear(self, pixels: moderngl.Buffer) -> None:
         """Marks no tile, and empties all lists, that of `pixels` too."""
-        starts = (self.tiles, self.tiles.size), (self.nodes, NODES_HEADER_BYTES), (pixels, LIST_HEADER_BYTES)
-        clear_buffers(self._gpu, *starts)
+        clear_buffers(self._gpu, *self._scratch(pixels))
+
+    def used_up(self, pixels: moderngl.Buffer) -> None:
+        """Lets that be cleared ahead: nobody reads marks, lists and `pixels` any more."""
+        clear_ahead(self._gpu, *self._scratch(pixels))
+
+    def _scratch(self, pixels: moderngl.Buffer) -> tuple[Start, ...]:
+        return (self.tiles, self.tiles.size), (self.nodes, NODES_HEADER_BYTES), (pixels, LIST_HEADER_BYTES)
 
     def find_thin(self, mesh: MeshBuffers, view: CameraView, raster: GeometryBuffer, scene: Bindings) -> None:
         """Marks the tiles with triangles of `mesh` that may lie between the samples that `raster` has."""
@@ -99,7 +105,7 @@ class EdgeTriangles:
             scene,
             own,
             mesh.solid,
-            mesh_corners=mesh.corners,
+            mesh.corners,
             clip_from_world=view.clip_from_camera @ view.camera_from_world,
             triangle_count=mesh.triangle_count,
         )
@@ -166,6 +172,7 @@ class SampleCoverage:
         )
         if mesh.triangle_count:
             self._add_samples(mesh, view, scene)
+        self.triangles.used_up(self.pixels)
 
     def _add_samples(self, mesh: MeshBuffers, view: CameraView, scene: Bindings) -> None:
         """Adds the further samples of the pixels that are listed."""
@@ -176,7 +183,7 @@ class SampleCoverage:
             mesh.solid,
             self._written,
             self.triangles.lists,
-            mesh_corners=mesh.corners,
+            mesh.corners,
         )
 
     @property

@@ -31,7 +31,7 @@ CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0
 LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # of the clamped cosine in them
 FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # solid angles seen from the centre of the neighbouring cell
 DIRECTION_LENGTH = 10 / 32  # of the volume's edge: distance over which a step's filter fades directions
-FUSED_STEPS = 2  # per dispatch: the border of two cells still fits 32 KB of shared memory
+FUSED_STEPS = 4  # per dispatch: half of the cells, with a border of four, still fit 32 KB of shared memory
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,12 @@ class MeshBuffers:
         }
 
     @property
-    def corners(self) -> moderngl.Texture:
-        """Positions of the triangles' corners as shaders/common/plane.glsl reads them; of a mesh that was written."""
+    def corners(self) -> dict[str, Binding]:
+        """What common/plane.glsl reads beside `solid`, of a mesh that was written: in software, its corners."""
+        return {"mesh_corners": self._corner_texture()} if self._gpu.is_software else {}
+
+    def _corner_texture(self) -> moderngl.Texture:
+        """Returns the positions of the triangles' corners."""
         assert self._written is not None
         if self._corners is None or not self._shows_corners:
             rows = max(-(-len(self.triangles) // CORNERS_ROW), 1)

@@ -152,7 +152,8 @@ class ScreenCones:
 
     `reflected` (RGBA16F): radiance times fraction of the specular lobe, and that fraction, on the picture's grid.
     `march` are defines of march.glsl to look up in voxels and environment what the picture does not show; the
-    fraction is then 1. None: that fraction of the lobe is left to other passes. `tier` says how finely.
+    fraction is then 1. None: that fraction of the lobe is left to other passes. `tier` says by how many cones; they
+    start at one pixel of each quad if the `grid` lists quads.
     """
 
     def __init__(
@@ -162,7 +163,7 @@ class ScreenCones:
         march: Mapping[str, float | str] | None,
         tier: QualityTier,
     ) -> None:
-        self._gpu, self._grid = gpu, grid
+        self._grid = grid
         self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
         self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
         voxels = {} if march is None else {"VOXELS": 1, **march}
@@ -176,12 +177,8 @@ class ScreenCones:
             **voxels,
         )
         self._traced: moderngl.Texture | None = None
-        self._list_quads: Kernel | None = None
         self._fill: Kernel | None = None
-        self._pixels = grid.shown_pixels
-        if tier.reflection_step == 2:
-            self._list_quads = Kernel(gpu, "list_quads")
-            self._pixels = gpu.ctx.buffer(bytes(grid.shown_pixels.size))
+        if grid.quads is not None:
             self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
             self._fill = Kernel(gpu, "fill_reflections")
 
@@ -197,17 +194,13 @@ class ScreenCones:
 
         `object_rays`: what rays saw of the objects (`MirrorRays.reflection`), so that cones leave them out.
         """
-        if self._list_quads is not None:
-            self._gpu.clear_start(self._pixels, LIST_HEADER_BYTES)
-            texels: Bindings = {"Texels": self._grid.virtual_texels, "scale": self._grid.scale}
-            self._list_quads.run((self._threads,), texels, scene, ShownPixels=self._pixels)
         rays: Bindings = {"OBJECT_RAYS": object_rays is not None, "object_rays": object_rays}
         self._kernel.run(
             (self._threads,),
             objects.bindings,
             rays,
             scene,
-            ShownPixels=self._pixels,
+            ShownPixels=self._grid.shown_pixels if self._grid.quads is None else self._grid.quads,
             scale=self._grid.scale,
             reflected=self.reflected if self._traced is None else self._traced,
             sample_pixels=self._grid.pixels,
@@ -224,9 +217,7 @@ class ScreenCones:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.reflected, self._traced, self._kernel, self._fill, self._list_quads)
-        if self._list_quads is not None:
-            self._pixels.release()
+        release_all(self.reflected, self._traced, self._kernel, self._fill)
 
 
 class TransmittedLight:

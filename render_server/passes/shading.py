@@ -43,8 +43,8 @@ class DirectLight:
 
     With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
     do. Without `objects_shadow` other passes do, and E_rho is E_mu. Pixels that objects do not reach are 0. `texels`
-    lists the blocks of pixels that are shaded; with `reuses`, LightHistory fills it beforehand, and `spared`: blocks
-    whose light without the objects is known, and of which they block none.
+    lists the blocks of pixels to shade; with `reuses`, LightHistory fills it beforehand, in software apart from
+    `spared` ones, whose light without the objects is known, and of which they block none.
     """
 
     def __init__(
@@ -63,10 +63,11 @@ class DirectLight:
             defines = {"REAL_SHADOWS": 1}
         self.defines: Mapping[str, float | str] = defines
         self._kernel = Kernel(gpu, "direct_light", **defines)
-        self._spared = Kernel(gpu, "direct_light", SPARED=1) if reuses else None
+        self._spared = Kernel(gpu, "direct_light", SPARED=1) if reuses and gpu.is_software else None
         self._select = Kernel(gpu, "select_direct_texels", **defines)
         self._reuses = reuses
-        self.texels, self.spared = (gpu.ctx.buffer(reserve=4) for _ in range(2))
+        self.texels = gpu.ctx.buffer(reserve=4)
+        self.spared = gpu.ctx.buffer(reserve=4) if self._spared is not None else None
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -194,11 +195,15 @@ class LightHistory:
         shared: Bindings = {**found, **grid.bindings}
         direct.select(grid, self._reached, scene)
         grid.empty_list(direct.texels)
-        grid.empty_list(direct.spared)
+        apart: dict[str, Binding] = {}
+        if direct.spared is not None:
+            grid.empty_list(direct.spared)
+            apart["Spared"] = direct.spared
         self._reproject.run(
             (list_threads(self._gpu, grid.texel_count),),
             shared,
             scene,
+            apart,
             has_history=knows_direct,
             direct_mu_out=direct.light.mu,
             direct_rho_out=direct.light.rho,
@@ -206,7 +211,6 @@ class LightHistory:
             last_direct_rho=self._last_light.rho,
             Texels=self._reached,
             Needed=direct.texels,
-            Spared=direct.spared,
         )
         self._find_stale.run(
             self._grid.size,

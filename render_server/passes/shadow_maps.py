@@ -24,6 +24,7 @@ NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they encl
 FAR_MARGIN = 1.02
 WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces of a cube
 NEAREST_M = 1e-3
+GREATEST_TILE = 4096  # texels an edge: `rsm_size` of the scene document
 CASTER_CELL = 8
 """Texels an edge of the cells in which distances to casters are known; as in shaders/common/object_shadows.glsl."""
 MOST_VIEWS = 6  # of a light: the faces of a cube
@@ -131,8 +132,9 @@ class ShadowMaps:
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._kernel = RasterKernel(gpu, "reflective_shadow_map")
-        self._find_casters = Kernel(gpu, "caster_cells", CELL=CASTER_CELL)
-        self._spread = Kernel(gpu, "caster_distance")
+        most_cells = -(-GREATEST_TILE // CASTER_CELL)
+        self._find_casters = Kernel(gpu, "caster_distance", FIND=1, CELL=CASTER_CELL, MOST_CELLS=most_cells)
+        self._spread = Kernel(gpu, "caster_distance", MOST_CELLS=most_cells)
         self._rows: moderngl.Texture | None = None
 
     def run(self, atlas: ShadowMapAtlas, meshes: Sequence[MeshBuffers], views: Sequence[LightView]) -> None:
@@ -155,15 +157,24 @@ class ShadowMaps:
 
     def measure_distances(self, atlas: ShadowMapAtlas) -> None:
         """Fills `caster_distance` of the maps as they were drawn."""
-        size, own = atlas.caster_distance.size, {"tile_cells": atlas.tile_cells}
-        if self._rows is None or self._rows.size != size:
+        (columns, rows), cells = atlas.caster_distance.size, atlas.tile_cells
+        if self._rows is None or self._rows.size != (columns, rows):
             release_all(self._rows)
-            self._rows = texture_2d(self._gpu, size, 1, "f4")
+            self._rows = texture_2d(self._gpu, (columns, rows), 1, "f4")
+        group = self._spread.local_size[0]
         self._find_casters.run(
-            size, own, cells_out=atlas.caster_distance, depth_map=atlas.depth, tile_size=atlas.tile_size
+            (columns // cells * group, rows),
+            depth_map=atlas.depth,
+            distance_out=self._rows,
+            tile_cells=cells,
+            tile_size=atlas.tile_size,
         )
-        self._spread.run(size, own, cells=atlas.caster_distance, cells_out=self._rows, axis=(1, 0))
-        self._spread.run(size, own, cells=self._rows, cells_out=atlas.caster_distance, axis=(0, 1))
+        self._spread.run(
+            (columns * group, rows // cells),
+            row_distance=self._rows,
+            distance_out=atlas.caster_distance,
+            tile_cells=cells,
+        )
 
     def release(self) -> None:
         """Frees the GL objects."""

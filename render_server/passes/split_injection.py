@@ -2,7 +2,7 @@
 
 import moderngl
 
-from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
+from deltalight.render_server.gpu.clearing import clear_buffers, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads, map_threads
@@ -10,7 +10,7 @@ from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume
-from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.voxels import LevelFilter, VoxelMipmap, VoxelStore
 
 LIGHT_SUMS = 14  # per slot: shaders/common/split_sums.glsl
 
@@ -53,8 +53,9 @@ class SplitInjection:
 
     def begin(self, *stores: VoxelStore) -> None:
         """Clears the sums."""
-        for store in stores:
-            clear_buffer(self._gpu, store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4)
+        clear_buffers(
+            self._gpu, *((store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4) for store in stores)
+        )
 
     def add(
         self,
@@ -70,14 +71,14 @@ class SplitInjection:
         chosen: Bindings = {"filled_volume": volume}
         real_sums: Bindings = {**real.bindings, **chosen, "Sums": real.delta_sums, "real_albedo": real_albedo}
         virtual_sums: Bindings = {**virtual.bindings, **chosen, "Sums": virtual.delta_sums}
+        both: Bindings = {"VirtualTouched": virtual.touched, "VirtualSums": virtual.delta_sums}
         threads = (map_threads(self._gpu, lights.tile_size),)
         for real_views, virtual_views in lights.views_of_lights:
             for view in real_views:
                 self._real.run(threads, real_sums, scene, view_index=view)
             for view in virtual_views:
                 self._virtual.run(threads, virtual_sums, scene, view_index=view)
-            for sums, of_objects in ((real_sums, False), (virtual_sums, True)):
-                self._divide.run((self._threads,), sums, of_objects=of_objects)
+            self._divide.run((self._threads,), real_sums, both)
 
     def release(self) -> None:
         """Frees the programs."""
@@ -104,18 +105,17 @@ class ResolveInjection:
         volume: PlacedVolume,
     ) -> None:
         """Writes the texels of all touched voxels."""
-        for own, other, skip_shared in ((real, virtual, False), (virtual, real, True)):
-            self._kernel.run(
-                (self._threads,),
-                own.bindings,
-                volume.bindings,
-                delta=delta.texture,
-                rho=rho.texture,
-                Light=own.delta_sums,
-                OtherGrid=other.grid,
-                OtherLight=other.delta_sums,
-                skip_shared=skip_shared,
-            )
+        self._kernel.run(
+            (self._threads,),
+            real.bindings,
+            volume.bindings,
+            delta=delta.texture,
+            rho=rho.texture,
+            Light=real.delta_sums,
+            VirtualGrid=virtual.grid,
+            VirtualTouched=virtual.touched,
+            VirtualLight=virtual.delta_sums,
+        )
 
     def release(self) -> None:
         """Frees the program."""
@@ -123,21 +123,18 @@ class ResolveInjection:
 
 
 class FilterIsotropic:
-    """Filters the levels of V_delta and V_rho above level 0, one dispatch per level for both."""
+    """Filters the levels of V_delta and V_rho above level 0, of both together."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._kernel = Kernel(gpu, "filter_isotropic", DIRECTIONS=1)
+        self._levels = LevelFilter(gpu, "filter_isotropic", DIRECTIONS=1)
 
     def run(self, delta: VoxelMipmap, rho: VoxelMipmap, volume: PlacedVolume) -> None:
         """Rebuilds all levels from level 0."""
-        for level in range(1, volume.placement.levels):
-            cells = volume.placement.size >> level
-            threads = (cells, cells, cells * len(volume.placements))
-            self._kernel.run(threads, volume.bindings, delta=delta.texture, rho=rho.texture, level=level)
+        self._levels.run(volume, 1, delta=delta.texture, rho=rho.texture)
 
     def release(self) -> None:
         """Frees the program."""
-        self._kernel.release()
+        self._levels.release()
 
 
 class DeltaError:

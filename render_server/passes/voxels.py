@@ -296,17 +296,50 @@ class ResolveVoxels:
         release_all(self._mu, self._rho)
 
 
-class FilterVoxels:
-    """Filters the levels of an anisotropic mipmap, all in one dispatch on a GPU (docs/method.md 4.4).
+class LevelFilter:
+    """Runs a kernel that filters the levels of mipmaps, all in one dispatch on a GPU (common/mipmap_tiles.glsl).
 
-    In software each is a dispatch: workgroups that wait for their own stores take 3.5 times as long there. Level 1 is
-    filtered around the touched voxels alone (ClearVoxels empties what they leave).
+    In software each is a dispatch: workgroups that wait for their own stores take 3.5 times as long there.
+    """
+
+    def __init__(self, gpu: GpuContext, name: str, **defines: int) -> None:
+        self._gpu, self._is_fused = gpu, not gpu.is_software
+        self._kernel = Kernel(gpu, name, **defines, **({"FUSED": 1} if self._is_fused else {}))
+
+    def run(
+        self,
+        volume: PlacedVolume,
+        directions: int,
+        *shared: Bindings,
+        first: int = 1,
+        **images: moderngl.Texture3D,
+    ) -> None:
+        """Rebuilds the levels from `first` on, of mipmaps of so many directions."""
+        levels = volume.placement.levels
+        for level in (first,) if self._is_fused else range(first, levels):
+            self._filter(volume, directions, level, *shared, {"level_count": levels - level, **images})
+
+    def _filter(self, volume: PlacedVolume, directions: int, level: int, *shared: Bindings) -> None:
+        """Filters from a level on, one or all of the levels that are counted."""
+        tile = self._kernel.local_size[0] if self._is_fused else 1
+        cells = math.ceil((volume.placement.size >> level) / tile) * tile  # whole tiles
+        threads = (cells, cells, cells * directions * len(volume.placements))
+        own: Bindings = {"first_level": level, "TilesDone": self._gpu.group_counters}
+        self._kernel.run(threads, volume.bindings, own, *shared)
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
+
+
+class FilterVoxels:
+    """Filters the levels of an anisotropic mipmap (docs/method.md 4.4).
+
+    In software, level 1 is filtered around the touched voxels alone (ClearVoxels empties what they leave).
     """
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._gpu, self._is_fused = gpu, not gpu.is_software
-        self._kernel = Kernel(gpu, "filter_voxels", **({"FUSED": 1} if self._is_fused else {}))
-        self._threads = list_threads(gpu)
+        self._levels, self._threads = LevelFilter(gpu, "filter_voxels"), list_threads(gpu)
         self._listed = Kernel(gpu, "filter_voxels", LISTED=1) if gpu.is_software else None
 
     def run(self, mipmap: VoxelMipmap, volume: PlacedVolume, *stores: VoxelStore) -> None:
@@ -314,23 +347,9 @@ class FilterVoxels:
 
         `stores`: all whose voxels level 0 holds; without any, every cell may hold something.
         """
-        first, levels = 1 + self._filter_listed(mipmap, volume, stores), volume.placement.levels
-        for level in (first,) if self._is_fused else range(first, levels):
-            self._filter(mipmap, volume, level, {"level_count": levels - level})
-
-    def _filter(self, mipmap: VoxelMipmap, volume: PlacedVolume, level: int, counted: Bindings) -> None:
-        """Filters from a level on, one or all of the levels that are `counted`."""
-        tile = self._kernel.local_size[0] if self._is_fused else 1
-        cells = math.ceil((volume.placement.size >> level) / tile) * tile  # whole tiles
-        fused: Bindings = {"Occupied": mipmap.occupied, "TilesDone": self._gpu.group_counters}
-        self._kernel.run(
-            (cells, cells, cells * DIRECTIONS * len(volume.placements)),
-            volume.bindings,
-            counted,
-            fused,
-            mipmap=mipmap.texture,
-            first_level=level,
-        )
+        first = 1 + self._filter_listed(mipmap, volume, stores)
+        occupied: Bindings = {"Occupied": mipmap.occupied}
+        self._levels.run(volume, DIRECTIONS, occupied, first=first, mipmap=mipmap.texture)
 
     def _filter_listed(self, mipmap: VoxelMipmap, volume: PlacedVolume, stores: Sequence[VoxelStore]) -> int:
         """Filters the levels where walking the voxels' list is faster; returns how many."""
@@ -348,4 +367,4 @@ class FilterVoxels:
 
     def release(self) -> None:
         """Frees the programs."""
-        release_all(self._kernel, self._listed)
+        release_all(self._levels, self._listed)

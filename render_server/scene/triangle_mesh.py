@@ -175,7 +175,9 @@ class TriangleMesh:
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
         """Returns the least and greatest coordinates of the vertices that triangles use."""
-        return np.stack(short_axis.bounds(self.positions.take(self._used, axis=0)))
+        uses_all = len(self._used) == len(self.positions)
+        used = self.positions if uses_all else self.positions.take(self._used, axis=0)
+        return np.stack(short_axis.bounds(used))
 
     @cached_property
     def _used(self) -> Int64[np.ndarray, " k"]:

@@ -217,6 +217,8 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     Kernel(gpu, "clear_buffer").release()
     for kind in ({}, {"FUSED": 1}, {"LISTED": 1}):
         Kernel(gpu, "filter_voxels", **kind).release()
+    for kind in ({}, {"FUSED": 1}):
+        Kernel(gpu, "filter_isotropic", DIRECTIONS=1, **kind).release()
     for rows in (2, 8):
         for reuses in (False, True):
             Kernel(

@@ -7,7 +7,13 @@ import moderngl
 import numpy as np
 import pytest
 
-from deltalight.render_server.gpu.clearing import CLEARING_GROUPS, clear_buffer
+from deltalight.render_server.gpu.clearing import (
+    CLEARING_GROUPS,
+    clear_ahead,
+    clear_buffer,
+    clear_buffers,
+    clear_used_up,
+)
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, watched
 from deltalight.render_server.gpu.list_groups import ListGroups
@@ -76,6 +82,33 @@ def test_on_a_gpu_no_buffer_is_mapped_to_be_cleared(
         ("clear_buffer", (1, 1, 1)),
     ]
     assert seen[0].written == {"Cleared": full}
+
+
+def test_what_was_used_up_is_cleared_once_when_the_next_frame_begins(gpu: GpuContext) -> None:
+    hardware = replace(gpu, is_software=False)
+    buffers = [gpu.ctx.buffer(np.full(8, FULL, np.uint32).tobytes()) for _ in range(10)]
+    short, released, again = buffers[0], buffers[1], buffers[2]
+    seen: list[Dispatch] = []
+    with watched(hardware, seen.append):
+        clear_ahead(hardware, (short, 4), *((each, 32) for each in buffers[1:]))
+        assert not seen
+        released.release()
+        clear_buffer(hardware, again)  # used in this frame already, and not used up since
+        again.write(b"\xff" * 32)
+        clear_used_up(hardware)
+        assert len(seen) == 2
+        assert [words(each)[0] for each in buffers if each is not released] == [0, FULL, *[0] * 7]
+        clear_buffers(hardware, *((each, 32) for each in buffers[3:]))
+        clear_used_up(hardware)
+        assert len(seen) == 2
+        clear_buffers(hardware, (short, 32))  # more than was cleared
+        buffers[3].write(b"\xff" * 32)
+        clear_buffer(hardware, buffers[3])
+        assert len(seen) == 4
+    assert not words(short).any()
+    assert not words(buffers[3]).any()
+    for each in buffers:
+        each.release()
 
 
 def test_the_start_of_a_buffer_is_cleared_between_kernels_and_untouched_by_the_cpu(

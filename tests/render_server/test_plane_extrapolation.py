@@ -166,7 +166,7 @@ def test_a_strip_of_a_wall_beside_a_long_one_goes_on_as_that_does() -> None:
 
 
 def test_a_wall_reaches_as_far_as_lamps_say_that_the_room_does() -> None:
-    """The view shows 2 m of it. With a lamp 4 m to the right of its middle, 5 m are known; one behind it is outside."""
+    """The view shows 2 m of it. With a lamp 4 m to the right of its middle, 5 m are known; not with one behind it."""
     planes, samples = shown((*AHEAD, 0.3))
     lamp, outside = (
         SphereLight(np.array([4, y, 0.5], np.float32), np.zeros(3, np.float32), 0.02) for y in (0.999, 1.1)

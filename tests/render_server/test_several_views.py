@@ -204,7 +204,7 @@ def test_beams_of_smooth_objects_are_traced_once_and_end_in_each_view(
     with watched(gpu, lambda run: kernels.update([run.kernel])):
         renderer.render_views([seen_room(FACING), seen_room(BEHIND)])
     assert [
-        kernels[name] for name in ("caustic_beams RAY_COUNT=4 WIDE", "caustic_ends", "caustic_places")
+        kernels[name] for name in ("caustic_beams RAY_COUNT=4 WIDE", "caustic_ends", "caustic_bounds")
     ] == [1, 2, 2]
     assert not kernels["caustic_beams RAY_COUNT=4"], "nothing mirrors so sharply"
 

@@ -15,6 +15,7 @@ from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
+from deltalight.render_server.passes.split_injection import FilterIsotropic
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
 from deltalight.render_server.passes.voxelize import (
     LONGEST_EDGE_VOXELS,
@@ -283,6 +284,35 @@ def test_levels_filtered_together_are_those_of_one_after_the_other(
         filtering.release()
     assert len(set(found)) == 1
     release_all(mipmap, volume)
+
+
+@pytest.mark.parametrize(("size", "count"), [(24, 1), (40, 2), (64, 1)])
+def test_isotropic_levels_filtered_together_are_those_of_one_after_the_other(
+    gpu: GpuContext, size: int, count: int
+) -> None:
+    """Level 1 also is the mean of the eight cells below each of its own."""
+    volume = PlacedVolume(gpu, *[VolumePlacement((9.0 * i, 0.0, 0.0), 0.1, size) for i in range(count)])
+    mipmaps = [VoxelMipmap(gpu, size, 1) for _ in range(2)]
+    level_zero = np.random.default_rng(3).random((2, size, size, count * size, 4)).astype(np.float16)
+    found = []
+    for each in (gpu, replace(gpu, is_software=False)):
+        filtering = FilterIsotropic(each)
+        for _ in range(2):  # the second time, counts of tiles that are done begin anew
+            for mipmap, texels in zip(mipmaps, level_zero, strict=True):
+                mipmap.resize(size, count)
+                mipmap.texture.write(texels.tobytes(), viewport=(0, 0, 0, count * size, size, size))
+            filtering.run(*mipmaps, volume)
+            found.append([mipmap.texture.read() for mipmap in mipmaps])
+        filtering.release()
+    assert found[1:] == found[:-1]
+    for written, texels in zip(found[0], level_zero, strict=True):
+        above = np.frombuffer(written, np.float16).reshape(-1, size, count * size, 4)[size:]
+        means = texels.reshape(size // 2, 2, size // 2, 2, -1, 2, 4).astype(np.float32).mean(axis=(1, 3, 5))
+        for index in range(count):
+            own = above[: size // 2, : size // 2, index * size : index * size + size // 2]
+            wanted = means[:, :, index * size // 2 : (index + 1) * size // 2]
+            np.testing.assert_allclose(own, wanted, atol=1e-3)
+    release_all(*mipmaps, volume)
 
 
 def test_levels_around_touched_voxels_are_those_of_all_cells(gpu: GpuContext, lab: VoxelLab) -> None:

@@ -13,7 +13,6 @@ uniform mat4 clip_from_world;
 uniform uint triangle_count;
 
 #ifdef HIDES_BACKS
-#include "common/solid_mesh.glsl"
 layout(std430) readonly buffer Sides { float sides[]; };   // of each material, as flags.x in common/materials.glsl
 
 bool is_hidden(uint triangle, mat3 corners) {

@@ -1,7 +1,6 @@
 // Filters levels of the six one-sided mipmaps (docs/method.md 4.4): two cells along k composited front to back, mean of
 // the four across. Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do not occlude
-// each other). With FUSED, a workgroup filters a tile of the first level, then the cells above it, which need no others; the last
-// workgroup of a slab to end filters the levels above those, of the slab alone. Nothing is read below cells that hold nothing,
+// each other). With FUSED, all levels in one dispatch (common/mipmap_tiles.glsl); nothing is read below cells that hold nothing,
 // which are most. Software renderers compute such cells as well: with LISTED,
 // they walk the voxels that a set touched, to the cells of level 1 around them, where nearly all of the work is.
 #include "common/volume.glsl"
@@ -18,16 +17,12 @@ layout(rgba16f) uniform image3D mipmap;
 #ifdef FUSED
 #include "common/occupancy.glsl"
 
-layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
 layout(rgba16f) coherent uniform image3D mipmap;
-layout(std430) coherent buffer TilesDone { uint tiles_done[]; };   // of each slab; 0 between dispatches
-uniform int level_count;   // how many are written
-const int TILE = 8, TILE_LEVELS = 4, THREADS = TILE * TILE * TILE;
 #else
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
 layout(rgba16f) uniform image3D mipmap;
-#endif
 uniform int first_level;   // to write; >= 1
+#endif
 #endif
 
 vec4 fetch(int level, ivec3 cell, int k) { return imageLoad(mipmap, level_base(level - 1, k) + cell); }
@@ -99,54 +94,7 @@ void main() {
 }
 #else
 #ifdef FUSED
-shared bool is_last;
-
-int thread() { return int(gl_LocalInvocationIndex); }
-
-// Lets the whole workgroup see what each of its invocations stored.
-void share_stores() {
-    memoryBarrierImage();
-    barrier();
-}
-
-void filter_tile(ivec3 tile, int k) {
-    for (int done = 0; done < min(level_count, TILE_LEVELS); ++done) {
-        int edge = TILE >> done, level = first_level + done, i = thread();
-        ivec3 own = ivec3(i % edge, i / edge % edge, i / (edge * edge)), cell = tile * edge + own;
-        if (own.z < edge && all(lessThan(cell, ivec3(volume_size >> level)))) write_cell(level, cell, k);
-        share_stores();
-    }
-}
-
-// Whether all other workgroups of the slab are done. Each invocation made its stores visible to all workgroups (the image is
-// coherent) before the first one counted its workgroup; whoever reads the last count and then passes the barrier sees them all.
-bool ends_slab(int slab, int tile_count) {
-    memoryBarrier();
-    barrier();
-    if (thread() == 0) {
-        is_last = atomicAdd(tiles_done[slab], 1u) + 1u == uint(tile_count);
-        if (is_last) tiles_done[slab] = 0u;   // nobody else counts here any more
-    }
-    memoryBarrier();
-    barrier();
-    return is_last;
-}
-
-void filter_above_tiles(int k) {
-    for (int level = first_level + TILE_LEVELS; level < first_level + level_count; ++level) {
-        int n = volume_size >> level;
-        for (int i = thread(); i < n * n * n; i += THREADS) write_cell(level, ivec3(i % n, i / n % n, i / (n * n)), k);
-        share_stores();
-    }
-}
-
-void main() {
-    int tiles = ((volume_size >> first_level) + TILE - 1) / TILE, z = int(gl_WorkGroupID.z), slab = z / tiles;
-    int k = slab % DIRECTIONS;
-    work_in_volume(slab / DIRECTIONS);
-    filter_tile(ivec3(gl_WorkGroupID.xy, z % tiles), k);
-    if (level_count > TILE_LEVELS && ends_slab(slab, tiles * tiles * tiles)) filter_above_tiles(k);
-}
+#include "common/mipmap_tiles.glsl"
 #else
 void main() {
     int cells = volume_size >> first_level;

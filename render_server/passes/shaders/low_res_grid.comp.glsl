@@ -13,6 +13,20 @@ uniform sampler2D object_coverage;
 uniform ivec2 picture_pixels;
 uniform int scale;
 
+#ifdef QUADS
+// Of each quad in the texels that show an object, the pixel that stands for it; as ShownPixels.
+layout(std430) buffer Quads { uint quad_count; uint quad_pixels[]; };
+#include "common/quads.glsl"
+
+void append_quads(ivec2 texel) {
+    int edge = (scale + 1) / 2;
+    for (int i = 0; i < edge * edge; ++i) {
+        ivec2 pixel = first_of_quad(texel * scale / 2 + ivec2(i % edge, i / edge));
+        if (pixel.x >= 0) quad_pixels[atomicAdd(quad_count, 1u)] = packed_pixel(pixel);
+    }
+}
+#endif
+
 // Lists the `count` pixels of a texel that show an object.
 void append_shown(ivec2 texel, uint count) {
     uint place = count > 0u ? room_for_pixels(count) : 0u;
@@ -47,5 +61,8 @@ void main() {
     if (best.x < 0) best.xy = hidden;
     imageStore(sample_pixels_out, texel, best);
     if (best.z >= 0) append_texel(texel, low.x);
+#ifdef QUADS
+    if (best.z >= 0) append_quads(texel);
+#endif
     append_shown(texel, shown_here);
 }

@@ -1,6 +1,9 @@
 // FUSED steps of propagation: each cell gathers the light of its six neighbours through the faces between them, times
 // the transmittance of the geometry volume. A workgroup keeps a tile of one colour channel with a border of FUSED
 // cells in shared memory. No light enters from outside the volume.
+//
+// A step takes light from even cells (by the sum of their coordinates) to odd ones and from odd ones to even: two systems that never
+// meet. So a workgroup steps one after the other, and holds half of the cells at a time: borders of four fit 32 KB.
 #include "common/light_cells.glsl"
 #include "common/light_step.glsl"
 
@@ -16,58 +19,83 @@ uniform bool has_geometry;
 const int TILE = 8;
 const int THREADS = TILE * TILE * TILE;
 const int WIDE = TILE + 2 * FUSED;
-shared vec4 tile[WIDE * WIDE * WIDE];
+const int ROUNDS = ((WIDE - 2) * (WIDE - 2) * (WIDE - 2) / 2 + THREADS - 1) / THREADS;
+shared vec4 held[WIDE * WIDE * WIDE / 2];   // of the cells of one parity
 
-int tile_index(ivec3 c) { return (c.z * WIDE + c.y) * WIDE + c.x; }
+int parity(ivec3 c) { return (c.x + c.y + c.z) & 1; }
 
-ivec3 in_cube(int i, int edge) { return ivec3(i % edge, (i / edge) % edge, i / (edge * edge)); }
+int held_index(ivec3 c) { return ((c.z * WIDE + c.y) * WIDE + c.x) >> 1; }
+
+// Cell number i of those of a parity in a cube at `first`, of an even edge.
+ivec3 in_cube(int i, int edge, int first, int wanted) {
+    int half_edge = edge / 2, row = i / half_edge;
+    ivec3 c = ivec3(2 * (i % half_edge), row % edge, row / edge) + first;
+    c.x += parity(c) ^ wanted;
+    return c;
+}
 
 vec4 gathered(ivec3 c, uvec2 open) {
     vec4 xy = unpackUnorm4x8(open.x), z = unpackUnorm4x8(open.y);
-    vec4 sum = xy.x * along_x(tile[tile_index(c - ivec3(1, 0, 0))], 1.0);
-    sum += xy.y * along_x(tile[tile_index(c + ivec3(1, 0, 0))], -1.0);
-    sum += xy.z * along_y(tile[tile_index(c - ivec3(0, 1, 0))], 1.0);
-    sum += xy.w * along_y(tile[tile_index(c + ivec3(0, 1, 0))], -1.0);
-    sum += z.x * along_z(tile[tile_index(c - ivec3(0, 0, 1))], 1.0);
-    sum += z.y * along_z(tile[tile_index(c + ivec3(0, 0, 1))], -1.0);
+    vec4 sum = xy.x * along_x(held[held_index(c - ivec3(1, 0, 0))], 1.0);
+    sum += xy.y * along_x(held[held_index(c + ivec3(1, 0, 0))], -1.0);
+    sum += xy.z * along_y(held[held_index(c - ivec3(0, 1, 0))], 1.0);
+    sum += xy.w * along_y(held[held_index(c + ivec3(0, 1, 0))], -1.0);
+    sum += z.x * along_z(held[held_index(c - ivec3(0, 0, 1))], 1.0);
+    sum += z.y * along_z(held[held_index(c + ivec3(0, 0, 1))], -1.0);
     return sum;
 }
 
-const int ROUNDS = ((WIDE - 2) * (WIDE - 2) * (WIDE - 2) + THREADS - 1) / THREADS;
-
-void main() {
-    int tiles = cells / TILE, thread = int(gl_LocalInvocationIndex);
-    int channel = int(gl_WorkGroupID.z) / tiles;
-    ivec3 low = ivec3(gl_WorkGroupID.xy, int(gl_WorkGroupID.z) % tiles) * TILE;
-    for (int i = thread; i < WIDE * WIDE * WIDE; i += THREADS) {
-        ivec3 cell = low + in_cube(i, WIDE) - FUSED;
-        tile[i] = in_grid(cell, cells) ? imageLoad(state, in_channel(cell, channel, cells)) : vec4(0.0);
-    }
+// Lets the whole workgroup see what each of its invocations stored.
+void share() {
     memoryBarrierShared();
     barrier();
-    ivec3 own = ivec3(gl_LocalInvocationID), texel = in_channel(low + own, channel, cells);
-    vec4 sum = imageLoad(total, texel), mine = vec4(0.0);
-    for (int done = 1; done <= FUSED; ++done) {
-        int edge = WIDE - 2 * done;   // the part of the border that is still valid
-        vec4 results[ROUNDS];
-        for (int j = 0; j < ROUNDS; ++j) {
-            int i = thread + j * THREADS;
-            ivec3 c = in_cube(min(i, edge * edge * edge - 1), edge) + done, cell = low + c - FUSED;
-            bool inside = in_grid(cell, cells);
-            uvec2 open = has_geometry && inside ? texelFetch(transmitted, cell, 0).xy : uvec2(0xffffffffu);
-            results[j] = inside ? gathered(c, open) : vec4(0.0);
-        }
-        memoryBarrierShared();
-        barrier();
-        for (int j = 0; j < ROUNDS; ++j) {
-            int i = thread + j * THREADS;
-            if (i < edge * edge * edge) tile[tile_index(in_cube(i, edge) + done)] = results[j];
-        }
-        memoryBarrierShared();
-        barrier();
-        mine = tile[tile_index(own + FUSED)];
-        sum += mine;
+}
+
+void load(ivec3 low, int channel, int wanted) {
+    for (int i = int(gl_LocalInvocationIndex); i < WIDE * WIDE * WIDE / 2; i += THREADS) {
+        ivec3 c = in_cube(i, WIDE, 0, wanted), cell = low + c - FUSED;
+        held[held_index(c)] = in_grid(cell, cells) ? imageLoad(state, in_channel(cell, channel, cells)) : vec4(0.0);
     }
+    share();
+}
+
+// From cells of one parity to those of the other, `wanted`, in the part of the border that is valid after so many steps.
+void step_to(ivec3 low, int done, int wanted) {
+    int edge = WIDE - 2 * done, count = edge * edge * edge / 2;
+    vec4 results[ROUNDS];
+    for (int j = 0; j < ROUNDS; ++j) {
+        int i = int(gl_LocalInvocationIndex) + j * THREADS;
+        if (i >= count) continue;
+        ivec3 c = in_cube(i, edge, done, wanted), cell = low + c - FUSED;
+        bool inside = in_grid(cell, cells);
+        uvec2 open = has_geometry && inside ? texelFetch(transmitted, cell, 0).xy : uvec2(0xffffffffu);
+        results[j] = inside ? gathered(c, open) : vec4(0.0);
+    }
+    share();
+    for (int j = 0; j < ROUNDS; ++j) {
+        int i = int(gl_LocalInvocationIndex) + j * THREADS;
+        if (i < count) held[held_index(in_cube(i, edge, done, wanted))] = results[j];
+    }
+    share();
+}
+
+void main() {
+    int tiles = cells / TILE, channel = int(gl_WorkGroupID.z) / tiles;
+    ivec3 low = ivec3(gl_WorkGroupID.xy, int(gl_WorkGroupID.z) % tiles) * TILE;
+    ivec3 own = ivec3(gl_LocalInvocationID) + FUSED;
+    vec4 after[FUSED];   // each step
+    for (int first = 0; first < 2; ++first) {
+        load(low, channel, first);
+        for (int done = 1; done <= FUSED; ++done) {
+            int reached = (first + done) & 1;
+            step_to(low, done, reached);
+            if (parity(own) == reached) after[done - 1] = held[held_index(own)];
+        }
+        share();   // before the next system takes its place
+    }
+    ivec3 texel = in_channel(low + own - FUSED, channel, cells);
+    vec4 sum = imageLoad(total, texel);
+    for (int i = 0; i < FUSED; ++i) sum += after[i];
     imageStore(total, texel, sum);
-    imageStore(next_state, texel, mine);
+    imageStore(next_state, texel, after[FUSED - 1]);
 }

@@ -1,7 +1,7 @@
 // Direct light of the last frame in the texels that select_direct_texels listed, at the pixels that see the same surfaces
 // as then, and no edge of a shadow. Lists the texels that have others; and in turn one tile in `turns`, so that errors of
-// resampling do not add up. Where objects moved, lists apart those that keep all of their light without the objects, and
-// that no shadow reaches.
+// resampling do not add up. Where objects moved, these are also those that keep all of their light without the objects, and that
+// no shadow reaches: listed apart in software, where they would wait for the loop over lights of others.
 #include "common/light_reach.glsl"
 #include "common/reprojection.glsl"
 #include "common/work_list.glsl"
@@ -10,7 +10,9 @@ layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D direct_mu_out;
 layout(rgba16f) writeonly uniform image2D direct_rho_out;
 layout(std430) buffer Needed { uint needed_count; uint needed[]; };   // as Texels
+#ifdef SOFTWARE
 layout(std430) buffer Spared { uint spared_count; uint spared[]; };   // as Texels
+#endif
 uniform sampler2D last_direct_mu;
 uniform sampler2D last_direct_rho;
 uniform ivec2 low_resolution_size;
@@ -67,6 +69,14 @@ bool shadows_may_reach(Block b) {
     return shadow_may_reach_sphere(0.5 * (b.low + b.high), 0.5 * distance(b.low, b.high), shadow_bias(b.nearest));
 }
 
+void list_needed(uint texel) { needed[atomicAdd(needed_count, 1u)] = texel; }
+
+#ifdef SOFTWARE
+void list_spared(uint texel) { spared[atomicAdd(spared_count, 1u)] = texel; }
+#else
+void list_spared(uint texel) { list_needed(texel); }
+#endif
+
 void main() {
     ivec2 size = textureSize(real_surface_position, 0);
     for (uint i = first_item(); i < listed_count(); i += items_apart()) {
@@ -82,7 +92,7 @@ void main() {
             if (all(lessThan(pixel, size))) keep_unblocked(pixel, b);
         }
         bool is_spared = keeps_unblocked && b.kept && b.nearest < 1e30 && !shadows_may_reach(b);
-        if (is_spared) spared[atomicAdd(spared_count, 1u)] = texels[i];
-        else if (!has_history || !known) needed[atomicAdd(needed_count, 1u)] = texels[i];
+        if (is_spared) list_spared(texels[i]);
+        else if (!has_history || !known) list_needed(texels[i]);
     }
 }

@@ -10,7 +10,7 @@ uniform int turn;
 const float OFF_PLANE = 4.0;            // pixels at the surface's depth that it may lie off this pixel's plane,
 const float APART = 8.0;                // or away from this pixel's point
 const float LEAST_WEIGHT = 0.25;
-const int TILE = 8;                     // texels
+const int TURN_TILE = 8;                // texels
 const uint STALE_REAL = 1u, STALE_OBJECT = 2u;   // of a texel: where light must be computed
 
 // Position in the last picture (pixel centres at .5), far outside it for what was behind the camera.
@@ -43,6 +43,6 @@ float same_surface(ivec2 pixel, vec4 position, vec3 normal) {
 
 // Whether it is the turn of a texel's tile, one in `turns`.
 bool is_due(ivec2 texel) {
-    ivec2 tile = texel / TILE;
+    ivec2 tile = texel / TURN_TILE;
     return (tile.x + 3 * tile.y) % turns == turn;
 }

@@ -6,7 +6,9 @@ layout(std430) buffer ShownPixels { uint shown_count; uint shown_pixels[]; };
 // The place of the first of `count` pixels that are appended in a row.
 uint room_for_pixels(uint count) { return atomicAdd(shown_count, count); }
 
-void put_pixel(uint place, ivec2 pixel) { shown_pixels[place] = uint(pixel.y) << 16 | uint(pixel.x); }
+uint packed_pixel(ivec2 pixel) { return uint(pixel.y) << 16 | uint(pixel.x); }
+
+void put_pixel(uint place, ivec2 pixel) { shown_pixels[place] = packed_pixel(pixel); }
 #else
 layout(std430) readonly buffer ShownPixels { uint shown_count; uint shown_pixels[]; };
 
