@@ -251,7 +251,7 @@ class PictureBuffers:
         self._unmixing.run(self.coverage, scene, covered)
         if view.matting_px:
             if self._matting is None:
-                self._matting = Matting(self._gpu, view.size)
+                self._matting = Matting(self._gpu, view.size, averages=self.measured is not None)
             self._matting.run(
                 self.coverage,
                 self._unmixing,

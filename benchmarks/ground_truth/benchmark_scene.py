@@ -10,6 +10,7 @@ from jaxtyping import Float32
 
 from deltalight.benchmarks.ground_truth.lamps import Lamp
 from deltalight.benchmarks.ground_truth.parts import Matrix, MeshFolder, Triple
+from deltalight.benchmarks.ground_truth.render import MAX_DEPTH
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
 
@@ -78,8 +79,8 @@ class BenchmarkScene:
 
     `real` creates the Mitsuba shapes of the room without lights. `environment` is a latitude-longitude map (linear,
     row 0 up = +z, centre column looks along +x, +y is to its left, as render_server/lights/environment.py reads it);
-    a scene has either lamps or a map. `surfaces` is the document's `real.surfaces`. `world_from_camera` and every
-    object's poses have one entry per frame.
+    a scene has either lamps or a map. `max_depth` limits the truth's light paths, in segments. `surfaces` is the
+    document's `real.surfaces`. `world_from_camera` and every object's poses have one entry per frame.
     """
 
     name: str
@@ -93,6 +94,7 @@ class BenchmarkScene:
     camera: CameraModel = CAMERA
     board: BoardSpec = BOARD
     shadow_edges: tuple[ShadowEdge, ...] = ()
+    max_depth: int = MAX_DEPTH
     settings: dict[str, Any] = field(default_factory=dict)
     """Further settings of `method` that the scene needs (volume_edge_m)."""
 

@@ -28,21 +28,20 @@ mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()
 """
 
 MAX_DEPTH = 8
-"""Longest light path in segments: every bounce that is visible in an 8-bit picture."""
+"""Longest light path in segments: every bounce between matt surfaces that is visible in an 8-bit picture."""
 
 NEAR_CLIP_M = 0.01
 
-INTEGRATORS: dict[str, dict[str, Any]] = {
-    "color": {"type": "path", "max_depth": MAX_DEPTH},
-    "cover": {"type": "path", "max_depth": 1},  # directly visible light only
-    "distance": {"type": "aov", "aovs": "distance:depth"},
-}
-GUIDED: dict[str, Any] = {
-    "type": "aov",
-    "aovs": "albedo:albedo,normal:sh_normal",
-    "path": INTEGRATORS["color"],
-}
-"""Not among INTEGRATORS: truth, which is found again by a hash of those, is made without it."""
+
+def integrators(max_depth: int) -> dict[str, dict[str, Any]]:
+    """Return Mitsuba's integrators for paths of so many segments; truth is found again by a hash of them."""
+    return {
+        "color": {"type": "path", "max_depth": max_depth},
+        "cover": {"type": "path", "max_depth": 1},  # directly visible light only
+        "distance": {"type": "aov", "aovs": "distance:depth"},
+    }
+
+
 SUBPIXELS = 2
 """Supersampling of colour per axis, filtered here.
 
@@ -128,13 +127,15 @@ class RoomRenderer:
     With Mitsuba's LLVM variant the same seed gives the same picture, bit for bit.
     """
 
-    def __init__(self, scene: dict[str, Any], camera: CameraModel) -> None:
+    def __init__(self, scene: dict[str, Any], camera: CameraModel, *, max_depth: int = MAX_DEPTH) -> None:
         import mitsuba as mi
 
         self._camera = camera
         self._fine = camera.resized(SUBPIXELS * camera.width, SUBPIXELS * camera.height)
         self._scene = mi.load_dict(scene)
-        known = {**INTEGRATORS, "guided": GUIDED}
+        known = integrators(max_depth)
+        features = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
+        known["guided"] = {**features, "path": known["color"]}
         self._integrators = {name: mi.load_dict(what) for name, what in known.items()}
 
     def color(

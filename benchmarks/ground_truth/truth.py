@@ -19,7 +19,7 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
 from deltalight.benchmarks.ground_truth.content_hash import content_hash
 from deltalight.benchmarks.ground_truth.document import document_path, scene_document
 from deltalight.benchmarks.ground_truth.point_lamps import LENS_BLUR_PX, point_lamps
-from deltalight.benchmarks.ground_truth.render import INTEGRATORS, SUBPIXELS, choose_variant
+from deltalight.benchmarks.ground_truth.render import SUBPIXELS, choose_variant, integrators
 from deltalight.benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
 from deltalight.benchmarks.ground_truth.truth_pictures import Halves, TruthRenderer, coded_psnr
 from deltalight.benchmarks.ground_truth.truth_writer import (
@@ -178,7 +178,8 @@ def _determining(assembly: Assembly, camera: CameraModel) -> list[object]:
     lenses = [camera.to_dict(), fisheye.CAMERA.to_dict(), fisheye.EXPOSURES_S]
     sensors = [repr(ColorSensor()), repr(StereoDepthSensor())]
     blur = [LENS_BLUR_PX] if point_lamps(scene.lamps) else []
-    return [assembly.with_objects(0), poses, documents, lenses, sensors, INTEGRATORS, *blur]
+    traced = integrators(scene.max_depth)
+    return [assembly.with_objects(0), poses, documents, lenses, sensors, traced, *blur]
 
 
 def _render(

@@ -67,7 +67,7 @@ class TruthRenderer:
         """Render one frame. Seeds are the same in all frames, so what does not change in truth is exactly still."""
         pose = self.assembly.scene.world_from_camera[index]
         room = self._room(pose)
-        with_objects = RoomRenderer(self.assembly.with_objects(index), self.camera)
+        with_objects = self._traced(self.assembly.with_objects(index), self.camera)
         mask = RoomRenderer(self.assembly.mask(index), self.camera)
         color = self._color(with_objects, pose)
         covers = [mask.cover(pose, **self._half(half)) for half in (0, 1)]
@@ -76,18 +76,21 @@ class TruthRenderer:
 
     def fisheye(self) -> Float32[np.ndarray, "h w 3"]:
         """Render the empty room as the fish-eye camera sees it, with point lamps blurred by its lens."""
-        room = RoomRenderer(self.assembly.without(), fisheye.CAMERA)
+        room = self._traced(self.assembly.without(), fisheye.CAMERA)
         pose = world_from_fisheye(self.assembly)
         picture = room.color(pose, spp=FISHEYE_SAMPLES, seed=SEED, advance=self.advance)
         return with_point_lamps(
             picture, self.assembly.scene.lamps, room, EquidistantLens(fisheye.CAMERA), pose
         )
 
+    def _traced(self, scene: dict[str, Any], camera: CameraModel) -> RoomRenderer:
+        return RoomRenderer(scene, camera, max_depth=self.assembly.scene.max_depth)
+
     def _room(self, pose: Matrix) -> RoomPictures:
         """Render the room from a pose once: cameras on a tripod see the same room in every frame."""
         key = pose.tobytes()
         if key not in self._rooms:
-            room = RoomRenderer(self.assembly.without(), self.camera)
+            room = self._traced(self.assembly.without(), self.camera)
             color = self._color(room, pose)
             self._rooms[key] = RoomPictures(color, room.depth(pose, spp=DEPTH_SAMPLES, seed=SEED))
             self.advance()

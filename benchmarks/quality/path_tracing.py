@@ -72,13 +72,14 @@ def trace_in_time(case: SceneCase, frame_ms: float, *, is_denoised: bool = False
 def _trace(case: SceneCase, frame_ms: float, denoiser: Denoiser | None) -> Rendered:
     with tempfile.TemporaryDirectory(prefix="deltalight-path-") as folder:
         assembly = Assembly(case.scene, Path(folder))
-        camera = case.views[0].camera
-        without = RoomRenderer(assembly.without(), camera)
+        camera, max_depth = case.views[0].camera, case.scene.max_depth
+        without = RoomRenderer(assembly.without(), camera, max_depth=max_depth)
         pictures: list[Picture] = []
         times_ms: list[float] = []
         spp = 1
         for frame, pose in enumerate(case.scene.world_from_camera):
-            pair = _Pair(without, RoomRenderer(assembly.with_objects(frame), camera), denoiser)
+            room = RoomRenderer(assembly.with_objects(frame), camera, max_depth=max_depth)
+            pair = _Pair(without, room, denoiser)
             if frame == 0:
                 spp = _affordable_samples(pair, pose, frame_ms)
             started_s = time.perf_counter()

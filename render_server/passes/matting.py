@@ -7,6 +7,7 @@ from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing, ObjectCoverage
+from deltalight.render_server.passes.temporal_mean import TemporalMean
 from deltalight.render_server.view import Rectangle
 
 BLOCK = 4  # pixels an edge, at which nearest depths are kept
@@ -17,10 +18,11 @@ SIGHT_PER_REACH = 8
 class Matting:
     """Finds by colour which fraction of a pixel real things fill, within reach of their edges by depth.
 
-    Corrects the coverage and the unmixing of edges, which stay as they are where colours do not tell.
+    Corrects the coverage and the unmixing of edges, which stay as they are where colours do not tell. `averages`:
+    where nothing moves, colours are means over the last pictures, so that mattes flicker less.
     """
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], *, averages: bool = False) -> None:
         self._gpu, self._threads = gpu, list_threads(gpu)
         blocks = -(-size[0] // BLOCK), -(-size[1] // BLOCK)
         self._size = size
@@ -31,6 +33,7 @@ class Matting:
         self._estimate, self._contrast = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._kernel = Kernel(gpu, "matting", BLOCK=BLOCK, SURFACE_REACH=SURFACE_REACH)
         self._fusion = Kernel(gpu, "matte_fusion", SURFACE_REACH=SURFACE_REACH)
+        self._mean = TemporalMean(gpu, size) if averages else None
 
     def run(
         self,
@@ -51,6 +54,9 @@ class Matting:
             return
         own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}
         sight = SIGHT_PER_REACH * reach_px
+        if self._mean is not None:
+            met = self._rectangle_around(rectangle, sight)
+            scene = {**scene, "linear_picture": self._mean.add(scene["linear_picture"], met)}
         self._find_nearest(scene, rectangle, sight, -(-reach_px // BLOCK))
         self._band_kernel.run(
             rectangle[2:],
@@ -96,10 +102,15 @@ class Matting:
 
     def _blocks_around(self, rectangle: Rectangle, margin: int) -> Rectangle:
         """Returns the blocks within `margin` pixels of a rectangle of pixels."""
+        x, y, width, height = self._rectangle_around(rectangle, margin)
+        left, top = x // BLOCK, y // BLOCK
+        return left, top, -(-(x + width) // BLOCK) - left, -(-(y + height) // BLOCK) - top
+
+    def _rectangle_around(self, rectangle: Rectangle, margin: int) -> Rectangle:
+        """Returns the pixels of the picture within `margin` pixels of a rectangle."""
         x, y, width, height = rectangle
-        left, top = max(x - margin, 0) // BLOCK, max(y - margin, 0) // BLOCK
-        right = -(-min(x + width + margin, self._size[0]) // BLOCK)
-        bottom = -(-min(y + height + margin, self._size[1]) // BLOCK)
+        left, top = max(x - margin, 0), max(y - margin, 0)
+        right, bottom = min(x + width + margin, self._size[0]), min(y + height + margin, self._size[1])
         return left, top, right - left, bottom - top
 
     def release(self) -> None:
@@ -114,4 +125,5 @@ class Matting:
             self._band_kernel,
             self._kernel,
             self._fusion,
+            self._mean,
         )

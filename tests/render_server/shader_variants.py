@@ -254,7 +254,7 @@ def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
 
 def soft_mattes(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     """Compiles matting."""
-    Matting(gpu, (16, 16)).release()
+    Matting(gpu, (16, 16), averages=True).release()
 
 
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {

@@ -3,6 +3,7 @@
 `pytest -s` prints the errors in the band around the thing, beside those by depth alone and of OpenCV's guided filter.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -125,6 +126,63 @@ def test_noise_changes_pictures_little(
     )
     print(f"\n{pattern}: r.m.s. deviation {found:.2f} codes, of the camera's pictures {cameras:.2f}")
     assert found < most * cameras
+
+
+def moving_beside(thing: Thing, number: int) -> Thing:
+    """The thing, and at the left border a card that moves by a pixel from picture to picture."""
+    color, depth, valid = thing.color.copy(), thing.depth.depth_m.copy(), thing.depth.valid.copy()
+    card = np.s_[2:102, 2 + number : 14 + number]
+    color[card], depth[card], valid[card] = (40, 90, 160), NEAR_M, True
+    return replace(thing, color=color, depth=replace(thing.depth, depth_m=depth, valid=valid))
+
+
+def rendered_by(
+    gpu: GpuContext, document: SceneDocument, things: list[Thing]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Linear pictures of one camera in a row, and the fractions that the things fill."""
+    renderer, found = SceneRenderer(gpu, document, with_linear=True), []
+    for number, thing in enumerate(things):
+        view = thing.view(pose=ABOVE, frame_id=number, timestamp_ns=33_000_000 * number)
+        linear = renderer.render(view).linear
+        assert linear is not None
+        assert renderer.graph is not None
+        covered = array_of(renderer.graph["object surface"].coverage.texture)[..., 0]
+        found.append((linear, 1 - covered))
+    renderer.release()
+    return found
+
+
+def of_quality(document: SceneDocument, quality: str) -> SceneDocument:
+    return document.replaced(method=document.method.replaced(quality=quality))
+
+
+@pytest.mark.parametrize(("quality", "least", "most"), [("live", 0.0, 2.0), ("best", 4.0, 6.0)])
+def test_mattes_of_what_stands_still_settle_while_other_things_move(
+    gpu: GpuContext, stage: Stage, quality: str, least: float, most: float
+) -> None:
+    """Change from frame to frame in a hand's band before wood, by the camera's own; no ray meets the card."""
+    first, document = hand("wood", aside_px=45), of_quality(matted(unlit(glowing(stage))), quality)
+    things = [moving_beside(first.again(number), number) for number in range(7)]
+    band = first.band(REACH_PX)
+    pictures = [255 * coded(linear)[band] for linear, _ in rendered_by(gpu, document, things)]
+    cameras = [each.color.astype(float)[band] for each in things]
+    found, camera = (np.sqrt(np.mean(np.diff(each[-3:], axis=0) ** 2) / 2) for each in (pictures, cameras))
+    print(f"\n{quality}: r.m.s. deviation {found:.2f} codes, of the camera's pictures {camera:.2f}")
+    assert least * camera <= found < most * camera
+
+
+@pytest.mark.parametrize("pattern", ["plain", "wood"])
+@pytest.mark.parametrize("step_px", [1, 3])
+def test_means_over_time_leave_no_trail(gpu: GpuContext, stage: Stage, pattern: str, step_px: int) -> None:
+    """Of a slow hand, mattes with history are nowhere farther from the truth than those of single pictures."""
+    document = matted(unlit(glowing(stage)))
+    things = [hand(pattern, aside_px=step_px * number - 9).again(number) for number in range(5)]
+    live, best = (rendered_by(gpu, of_quality(document, quality), things) for quality in ("live", "best"))
+    for thing, (_, averaged), (_, alone) in zip(things, live, best, strict=True):
+        band = thing.band(REACH_PX)
+        rms = [float(np.sqrt(np.mean((each - thing.alpha)[band] ** 2))) for each in (averaged, alone)]
+        print(f"{pattern}, {step_px} px: r.m.s. {rms[0]:.4f}, of single pictures {rms[1]:.4f}")
+        assert rms[0] <= rms[1]
 
 
 @pytest.mark.parametrize("distortion", [0.0, -0.3])

@@ -345,6 +345,25 @@ def test_light_through_a_tinted_pane_counts_once(gpu: GpuContext, stage: Stage) 
     np.testing.assert_allclose(mapped.direct_mu[below], IRRADIANCE, rtol=2e-3)
 
 
+@pytest.mark.parametrize(("incidence_deg", "gap"), [(0, 0.0005), (50, 0.0005), (50, -0.0005)])
+def test_slanting_light_through_a_slab_that_lies_on_the_floor(
+    gpu: GpuContext, stage: Stage, incidence_deg: float, gap: float
+) -> None:
+    """Beams end where they start, and light the floor on both sides of that: (1 - R) / (1 + R) goes through.
+
+    So they do if noise of depth lifts the floor above the slab's lower face.
+    """
+    angle, thickness = np.radians(incidence_deg), 0.02
+    sun = directional((np.sin(angle), 0.0, -np.cos(angle)), IRRADIANCE)
+    slab = glass(stage, pane(thickness, 0.12, gap + thickness / 2))
+    _, found, light = rendered(gpu, stage.document([slab], [sun], floor()))
+    reflectance = 0.04 if incidence_deg == 0 else fresnel(np.array([np.cos(angle)]), 1 / IOR)[0]
+    expected = IRRADIANCE * np.cos(angle) * (1 - reflectance) / (1 + reflectance)
+    below = below_pane(found)
+    print(f"{incidence_deg} degrees, {1000 * gap} mm: {light[below].mean() / expected:.3f} of the light")
+    assert light[below].mean(axis=0) == pytest.approx(np.full(3, expected), rel=0.04)
+
+
 def test_transparent_walls_hide_less_natural_light(gpu: GpuContext, stage: Stage) -> None:
     """Voxels of a clear cube block what it reflects, those of a matt one all."""
     kept = []

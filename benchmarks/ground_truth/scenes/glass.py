@@ -13,6 +13,8 @@ from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import ball, block
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking
 
+MAX_DEPTH = 24
+"""Segments. From the camera to the table below the block and on to the lamp light meets up to ten faces."""
 GAP_M = 0.0005
 """Of air below the objects: faces that coincide with the table would be hit in either order."""
 LAMP = SphereLamp((-0.16, -0.28, 0.47), 1.0, 0.12, (1.0, 0.95, 0.88))
@@ -47,4 +49,5 @@ SCENE = BenchmarkScene(
         ),
     ),
     lamps=(LAMP, Ambient(0.22, (0.88, 0.95, 1.0))),
+    max_depth=MAX_DEPTH,
 )

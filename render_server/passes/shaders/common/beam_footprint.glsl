@@ -49,7 +49,9 @@ bool may_light(Beam beam, vec4 ball) {
 // Irradiance at (p, normal) in CAUSTIC_STEPS.
 ivec3 caustic_part(Beam beam, mat3 basis, vec3 p, vec3 normal) {
     vec3 away = (p - beam.from.xyz) * basis;
-    if (abs(away.z - beam.from.w) > LONGEST * beam.direction.w || away.z <= 0.0) return ivec3(0);
+    // Behind the start lies, of objects, what the beam leaves; real surfaces go on there, just below an object's foot.
+    bool behind = away.z <= 0.0 && beam.flux.a > 0.0;
+    if (abs(away.z - beam.from.w) > LONGEST * beam.direction.w || behind) return ivec3(0);
     float cosine = -dot(normal, beam.direction.xyz);
     float x2 = beam.across.x * away.x * away.x + 2.0 * beam.across.y * away.x * away.y + beam.across.z * away.y * away.y;
     if (cosine <= 0.0 || x2 > FOOTPRINT_CUT * FOOTPRINT_CUT) return ivec3(0);
