@@ -221,7 +221,13 @@ def test_tiles_leave_out_only_beams_that_light_nothing_there(
 
     def endless_balls(self: Caustics, shared: Bindings, scene: Bindings) -> None:
         balls = np.tile(np.array([0, 0, 0, 1e6], np.float32), self._balls.width * self._balls.height)
-        monkeypatch.setattr(self._find_balls, "run", lambda *_, **__: self._balls.write(balls.tobytes()))
+        find_tiles = self._find_tiles.run
+
+        def with_endless_balls(threads: tuple[int, int], *scene: Bindings) -> None:
+            self._balls.write(balls.tobytes())
+            find_tiles(threads, *scene)
+
+        monkeypatch.setattr(self._find_tiles, "run", with_endless_balls)
         gather(self, shared, scene)
 
     gather = Caustics._gather_wide
