@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cache
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
@@ -39,6 +40,17 @@ class DepthImage:
     valid: Bool[np.ndarray, "h w"]
     camera: CameraModel
     noise_sigma_m: float | None = None
+
+    def resized(self, width: int, height: int) -> "DepthImage":
+        """Return each pixel of another size from the pixel that its centre lies in.
+
+        A mean over an edge would be a surface where there is none.
+        """
+        depth_m, valid = (
+            cv2.resize(plane, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+            for plane in (self.depth_m, self.valid.view(np.uint8))
+        )
+        return DepthImage(depth_m, valid.view(bool), self.camera.resized(width, height), self.noise_sigma_m)
 
 
 @dataclass(frozen=True, eq=False)

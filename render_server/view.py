@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import DepthImage, ViewFrame
+from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.messages import MAX_CAMERAS, MAX_PART_BYTES
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.gpu.uniform_block import Block, Mat4, Vec2, Vec3, Vec4
@@ -213,17 +213,10 @@ def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
 
 def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
     """Resizes a frame: colour averaged over areas, depth from the nearest pixel."""
-    size = (width, height)
-    camera = frame.camera.resized(width, height)
-    depth = frame.depth
+    camera, depth = frame.camera.resized(width, height), frame.depth
     if depth is not None:
-        depth = DepthImage(
-            cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_NEAREST),
-            cv2.resize(depth.valid.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).view(bool),
-            camera,
-            depth.noise_sigma_m,
-        )
-    color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
+        depth = replace(depth.resized(width, height), camera=camera)
+    color = cv2.resize(frame.color, (width, height), interpolation=cv2.INTER_AREA)
     return replace(frame, color=color, camera=camera, depth=depth)
 
 

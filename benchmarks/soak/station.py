@@ -19,7 +19,7 @@ from deltalight.benchmarks.soak.profiles import Profile
 from deltalight.benchmarks.speed.motions import STANDING
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
@@ -195,9 +195,7 @@ def resized(frame: SensorFrame, size: tuple[int, int]) -> SensorFrame:
     camera, depth = frame.camera.resized(*size), frame.depth
     color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
     if depth is not None:
-        metres = cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_NEAREST)
-        valid = cv2.resize(depth.valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-        depth = DepthImage(metres, valid, camera, depth.noise_sigma_m)
+        depth = replace(depth.resized(*size), camera=camera)
     return replace(frame, color=color.astype(np.uint8), camera=camera, depth=depth, color_jpeg=None)
 
 

@@ -18,6 +18,7 @@ from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.view import LENSES_KEPT
 
 GRID_STEP_PX = 4
+SAMPLED = np.s_[GRID_STEP_PX // 2 :: GRID_STEP_PX, GRID_STEP_PX // 2 :: GRID_STEP_PX]  # the blocks' middles
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,15 @@ class FrameSamples:
 
     @cached_property
     def color_range(self) -> tuple[Float32[np.ndarray, "gh gw 3"], Float32[np.ndarray, "gh gw 3"]]:
-        """Least and greatest colour of each sample and its eight neighbours."""
-        kernel = np.ones((3, 3), np.uint8)
-        return np.asarray(cv2.erode(self.color, kernel)), np.asarray(cv2.dilate(self.color, kernel))
+        """Least and greatest colour of the blocks anywhere within each sample's block and its eight neighbours.
+
+        Blocks at every pixel: what is narrower than two blocks may fill one that another view's grid cuts out, and
+        none of this one's.
+        """
+        means = cv2.blur(_linear_color(self.frame), (GRID_STEP_PX, GRID_STEP_PX))
+        places = np.ones((2 * GRID_STEP_PX + 1, 2 * GRID_STEP_PX + 1), np.uint8)
+        low, high = (each[SAMPLED] for each in (cv2.erode(means, places), cv2.dilate(means, places)))
+        return np.ascontiguousarray(low), np.ascontiguousarray(high)
 
 
 class MotionDetector:
@@ -289,22 +296,31 @@ def _sample_rays(camera: CameraModel, shape: tuple[int, int]) -> Float64[np.ndar
     return np.ascontiguousarray(np.column_stack([rays, np.ones(len(rays))]).T)
 
 
-def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
-    """Returns linear colour averaged over blocks of 4 x 4 pixels."""
-    height, width = frame.color.shape[:2]
-    rows, columns = (max(length // GRID_STEP_PX, 1) for length in (height, width))
+def _grid_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Returns rows and columns of a picture's whole blocks of GRID_STEP_PX pixels; what is left over is ignored."""
+    return max(shape[0] // GRID_STEP_PX, 1), max(shape[1] // GRID_STEP_PX, 1)
+
+
+def _linear_color(frame: ViewFrame) -> Float32[np.ndarray, "h w 3"]:
+    """Returns linear colour of the whole blocks."""
+    rows, columns = _grid_shape(frame.color.shape)
     table = decode_lut(frame.response)[None] / np.float32(frame.exposure_scale)
-    linear = cv2.LUT(frame.color, table)
-    return np.asarray(cv2.resize(linear, (columns, rows), interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.LUT(frame.color[: GRID_STEP_PX * rows, : GRID_STEP_PX * columns], table))
+
+
+def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
+    """Returns linear colour averaged over blocks of GRID_STEP_PX pixels."""
+    rows, columns = _grid_shape(frame.color.shape)
+    return np.asarray(cv2.resize(_linear_color(frame), (columns, rows), interpolation=cv2.INTER_AREA))
 
 
 def _subsampled_inverse_depth(depth: DepthImage | None) -> Float32[np.ndarray, "gh gw"] | None:
-    """Returns 1/z of every fourth pixel, 0 where unknown."""
+    """Returns 1/z in the middle of each block, 0 where unknown."""
     if depth is None:
         return None
-    grid = np.s_[GRID_STEP_PX // 2 :: GRID_STEP_PX, GRID_STEP_PX // 2 :: GRID_STEP_PX]
-    metres = depth.depth_m[grid]
-    known = depth.valid[grid] & (metres > 0)
+    rows, columns = _grid_shape(depth.depth_m.shape)
+    metres = depth.depth_m[SAMPLED][:rows, :columns]
+    known = depth.valid[SAMPLED][:rows, :columns] & (metres > 0)
     inverse = np.zeros_like(metres, np.float32)
     np.divide(1, metres, out=inverse, where=known)
     return inverse

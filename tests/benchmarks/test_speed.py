@@ -33,7 +33,8 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import open_source
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
-from deltalight.render_server.view import output_size, resized_frame
+from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld
+from deltalight.render_server.view import output_size
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
 from deltalight.services.cli import run
 from deltalight.services.demo import RECORDING, demo_scene
@@ -52,15 +53,17 @@ def current(gpu: GpuContext) -> None:
 
 
 @pytest.fixture(scope="module")
-def take() -> Take:
-    """Two frames of the demo at rest and all of its swing, small."""
+def whole_take() -> Take:
+    """Two frames of the demo at rest and all of its swing."""
     source = open_source(RECORDING)
     builder = ViewFrameBuilder(source)
-    standing, swing = (
-        [resized_frame(builder(source[number]), *SIZE) for number in numbers]
-        for numbers in (STANDING[:2], SWING)
-    )
-    return Take(standing, swing)
+    return Take(*([builder(source[number]) for number in numbers] for numbers in (STANDING[:2], SWING)))
+
+
+@pytest.fixture(scope="module")
+def take(whole_take: Take) -> Take:
+    """The same, small."""
+    return whole_take.at(SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +109,17 @@ def test_a_larger_picture_is_taken_by_a_larger_camera(take: Take, scene: SceneDo
             == frame.color.shape[1::-1]
             == (64, 36)
         )
+
+
+@pytest.mark.parametrize("size", [None, (500, 375), (72, 54)])
+def test_a_scene_kept_from_any_frame_of_the_swing_explains_all(
+    whole_take: Take, size: tuple[int, int] | None
+) -> None:
+    """In pictures of any size: nothing in them moves."""
+    frames, kept = [FrameSamples(each) for each in whole_take.at(size).swing], KeptWorld()
+    for built_from in frames:
+        kept.built_from = built_from
+        assert all(kept.explains(each) for each in frames)
 
 
 def test_an_arm_reaches_further_into_colour_and_depth_and_back(take: Take, scene: SceneDocument) -> None:

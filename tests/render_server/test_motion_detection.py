@@ -123,3 +123,35 @@ def test_a_kept_world_tells_at_once_or_a_frame_late_what_it_explains() -> None:
     assert [late.explained_before(each) for each in (turned, away[0], away[1])] == [True, True, False]
     late.built_from = away[1]
     assert late.explained_before(away[0]), "what an earlier world did not explain says nothing of this one"
+
+
+def striped(size: tuple[int, int] = (160, 120), shift_px: int = 0) -> ViewFrame:
+    """A wall at 1 m with upright stripes narrower than two blocks of the samples' grid; the camera shifts aside."""
+    width, height = size
+    camera = CameraModel(width, height, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
+    bright = (np.arange(width) + shift_px) % 17 < 5
+    color = np.where(bright[None, :, None], np.uint8(230), np.uint8(60)) * np.ones((height, 1, 3), np.uint8)
+    pose = np.eye(4)
+    pose[0, 3] = shift_px / 150
+    depth = DepthImage(np.ones((height, width), np.float32), np.ones((height, width), bool), camera, SIGMA)
+    return ViewFrame(0, 0, color, camera, pose=BoardPose(pose), depth=depth)
+
+
+def explained(old: ViewFrame, new: ViewFrame) -> bool:
+    kept = KeptWorld()
+    kept.built_from = FrameSamples(old)
+    return kept.explains(FrameSamples(new))
+
+
+@pytest.mark.parametrize("size", [(160, 120), (163, 120), (160, 123), (163, 123), (161, 122)])
+@pytest.mark.parametrize("shift_px", range(1, 8))
+def test_narrow_stripes_are_known_from_elsewhere_in_a_picture_of_any_size(
+    size: tuple[int, int], shift_px: int
+) -> None:
+    assert explained(striped(size), striped(size, shift_px))
+
+
+def test_what_is_laid_on_stripes_is_new() -> None:
+    seen = striped(shift_px=3)
+    seen.color[40:64, 60:84] = (250, 30, 30)
+    assert not explained(striped(), seen)
