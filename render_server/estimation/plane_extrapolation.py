@@ -16,15 +16,15 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from deltalight.protocol.octahedral import octahedral_grid
 from deltalight.render_server.lights.lights import Lamp, Light, incident_light
 
-# Twice the planes of a room's corner: things have large faces too.
-MAX_PLANES = 6
-# A smaller fraction of the samples is a thing, or chance.
-MIN_FRACTION = 0.02
+# Four times the planes of a room's corner: faces of things may be larger than what the border leaves of a wall.
+MAX_PLANES = 12
+# A strip as wide as 1/400 of the picture; a smaller fraction of the samples, or fewer points, is chance.
+MIN_FRACTION = 0.0025
+MIN_POINTS = 12
 CANDIDATES = 200
 # Nearer to this plane than to one at a right angle: correlated noise of stereo turns normals by more than 15 degrees.
 NORMAL_COSINE = float(np.sqrt(0.5))
 PLANES_AT_ONCE = 16  # of hypotheses: their distances to all points stay in the processor's cache
-MIN_POINTS = 3
 REFINEMENTS = 3  # least-squares fits to the inliers; after that a plane hardly moves
 
 
@@ -116,6 +116,7 @@ def _fit_plane(
     return axis, float(middle @ axis)
 
 
+MAX_SLANT_ERROR = 0.05  # rad: moves a wall by a twentieth of how far it goes on
 # Fraction of the samples that noise may put behind a wall.
 MAX_STRAY_FRACTION = 0.005
 MIN_IRRADIANCE = 1e-6
@@ -187,7 +188,11 @@ def extrapolate_planes(
     `size` is the edge of the maps in texels. Nearer planes occlude farther ones.
     """
     directions = octahedral_grid(size).reshape(-1, 3)
-    bounds = [(plane, samples.only(plane.inliers)) for plane in planes if _bounds_room(plane, samples)]
+    bounds = [
+        (plane, samples.only(plane.inliers))
+        for plane in planes
+        if _bounds_room(plane, samples) and _has_certain_slant(samples.position[plane.inliers])
+    ]
     lamps = _lamps_inside([plane for plane, _ in bounds], lights)
     known_m = max((_longest_extent(np.vstack([seen.position, lamps])) for _, seen in bounds), default=0.0)
     layers = [
@@ -225,6 +230,12 @@ def _bounds_room(plane: DetectedPlane, samples: RealSamples) -> bool:
     """Whether nothing is visible behind a plane; faces of things have the room behind them, and end."""
     behind = samples.position @ plane.normal < plane.offset - 3 * samples.tolerance_m
     return bool(behind.mean() <= MAX_STRAY_FRACTION)
+
+
+def _has_certain_slant(position: Float64[np.ndarray, "k 3"]) -> bool:
+    """Whether the standard error of the normal of the plane through some points is small: a strip may be short."""
+    away_m, across_m, _ = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(position.T)), 0))
+    return bool(away_m <= MAX_SLANT_ERROR * across_m * np.sqrt(len(position)))
 
 
 def _lamps_inside(bounds: Sequence[DetectedPlane], lights: Sequence[Light]) -> Float64[np.ndarray, "n 3"]:

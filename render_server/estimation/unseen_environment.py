@@ -27,7 +27,7 @@ from deltalight.render_server.lights.octahedral import irradiance_map
 GROUND_SIZES = 2.0
 FACES_UP = 0.7  # cosine to the vertical
 
-PLANE_SAMPLES = 6000  # pixels used to detect planes: the smallest accepted plane still has a hundred
+PLANE_SAMPLES = 6000  # pixels used to detect planes: the smallest accepted plane still has 15
 FLATNESS = 0.01  # of the distance: tolerance of walls, tables and lenses
 
 

@@ -48,7 +48,7 @@ from deltalight.render_server.methods.voxel_volumes import DirectionalVoxels, jo
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.mesh_buffers import MeshBuffers
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers, ObjectBvh
 from deltalight.render_server.passes.shading import DirectLightPair
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
@@ -221,7 +221,12 @@ class SolutionDirectLight:
     pair: DirectLightPair
 
     def light_directly(
-        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap | None
+        self,
+        scene: Bindings,
+        grid: LowResGrid,
+        _caustics: Caustics | None,
+        _voxels: VoxelMipmap | None,
+        _objects: ObjectBvh,
     ) -> DirectLightPair:
         """Lights the real surfaces under each solution's own maps."""
         self.pair.run_both(self.lights.mu, self.lights.rho, grid, scene)

@@ -6,10 +6,11 @@ from dataclasses import replace
 import moderngl
 
 from deltalight.protocol.scene_method import DvctMethod
-from deltalight.render_server.frame import FrameResources
+from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels, dvct_paper
 from deltalight.render_server.methods.light_maps import bounced_later, light_stages
@@ -31,6 +32,7 @@ from deltalight.render_server.methods.voxel_volumes import DeltaVoxels, delta_vo
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones
 from deltalight.render_server.passes.distant import DistantChange
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import MOST_VOLUMES
 from deltalight.render_server.passes.voxel_light import NO_SUPPORT
@@ -59,6 +61,24 @@ class ExactCones:
         voxels = self._voxels
         self._real.run(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return self._fields
+
+    def refract(
+        self,
+        fields: ConeFields,
+        objects: GeometryState,
+        scene: Bindings,
+        grid: LowResGrid,
+        direct: DirectLight,
+        bvh: ObjectBvh,
+        seen: Observation,
+        marching: Bindings,
+    ) -> ConeFields:
+        """Bends the cones at real surfaces that meet transparent objects, if there are any."""
+        if objects.materials.transmits:
+            seen.image.build_levels()
+            lit = {**scene, **marching, "direct_mu": direct.light.mu, "direct_rho": direct.light.rho}
+            self._real.refract(fields, grid, self._voxels.rho, bvh, lit)
+        return fields
 
     def trace_objects(
         self, fields: ConeFields, scene: Bindings, grid: LowResGrid, marching: Bindings
@@ -142,7 +162,16 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     if settings.tier.distant_light:
         distant = DistantChange(g.gpu, shading.grid.size, march_defines(settings)).trace
     layers = shading_stages(
-        g, s, shading, lit, volume, trace, voxels=rho, marching=marching, find_distant=distant
+        g,
+        s,
+        shading,
+        lit,
+        volume,
+        trace,
+        voxels=rho,
+        marching=marching,
+        find_distant=distant,
+        refract=cones.refract,
     )
     unchanged = UnchangedCones(g.gpu, settings, voxels, shading.cones.mu.size)
     return replace(layers, cones_mu=g.stage("cones mu", unchanged.trace, "shading scene", layers.grid, mu))

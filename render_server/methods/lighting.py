@@ -238,11 +238,16 @@ class Shading:
         grid: LowResGrid,
         caustics: Caustics | None,
         voxels: VoxelMipmap | None,
+        bvh: ObjectBvh,
         *_kept: DirectLight,
     ) -> DirectLight:
-        """Computes the direct light on the real surfaces, except where the last frame's is reused."""
+        """Computes the direct light on the real surfaces, except where the last frame's is reused.
+
+        With transparent objects, rays find the penumbrae of lamps.
+        """
         joint = None if voxels is None else voxels.texture
-        self._direct.run(grid, scene, joint=joint, caustics=caustics)
+        traced = bvh if scene["TRANSMISSION"] else None
+        self._direct.run(grid, scene, joint=joint, caustics=caustics, objects=traced)
         return self._direct
 
     def light_unchanged(self, scene: Bindings, grid: LowResGrid) -> DirectLight:
@@ -394,11 +399,13 @@ def shading_stages(
     marching: Resource[dict[str, Binding]] | None = None,
     light_directly: Callable[..., DirectLight] | None = None,
     find_distant: Callable[..., moderngl.Texture] | None = None,
+    refract: Callable[..., ConeFields] | None = None,
 ) -> Layers:
     """Declares grid, cones (by `trace`), caustics, direct light, reflections, change of light, and objects.
 
     `voxels`: those of the `volume`, if the method has any; `marching`: bindings of what rays march through, if they
-    do. `light_directly` replaces that of `shading`. `find_distant` finds the change of light beyond the volumes.
+    do. `light_directly` replaces that of `shading`. `find_distant` finds the change of light beyond the volumes,
+    `refract` what transparent objects change of the cones' light.
     """
     shown: Resource[Any] = voxels or g.value("voxels", no_voxels, volume)
     marching = marching or g.value("marching", no_bindings, volume)
@@ -421,7 +428,10 @@ def shading_stages(
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     light = light_directly or shading.light_directly
-    direct = g.stage("direct light", light, scene, grid, caustics, shown, *kept)
+    direct = g.stage("direct light", light, scene, grid, caustics, shown, bvh, *kept)
+    if refract is not None:
+        traced = s.objects, scene, grid, direct, bvh, s.observation, marching
+        cones = g.stage("refracted cones", refract, cones, *traced)
     rays = RayInputs(s.objects, scene, direct, cones, bvh, s.observation, marching)
     reflection, change = _change_stages(g, shading, grid, rays, find_distant)
     radiance = _surface_stages(g, shading, grid, caustics, rays)

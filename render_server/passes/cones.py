@@ -9,6 +9,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
+from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.voxels import VoxelMipmap
 
 
@@ -130,17 +131,18 @@ class TraceRealCones:
     """Traces the cones of the exact operator at real surfaces, through mu and rho (docs/method.md 3 and 4.5).
 
     `size` is that of the reduced grid, `defines` are those of march.glsl. With `reuses`, only where the scene's
-    `stale_texels` say so.
+    `stale_texels` say so. `refract` bends those that meet transparent objects.
     """
 
     def __init__(
         self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
     ) -> None:
-        self._gpu = gpu
+        self._gpu, self._defines = gpu, defines
         self._mu, self._rho = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
         self._trace = Kernel(gpu, "trace_cones", REAL=1, **defines)
         self._filter = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
+        self._refract: Kernel | None = None
         self._texels = gpu.ctx.buffer(reserve=4)
 
     def run(
@@ -165,6 +167,33 @@ class TraceRealCones:
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
+        self._average(fields, grid, scene)
+
+    def refract(
+        self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, objects: ObjectBvh, scene: Bindings
+    ) -> None:
+        """Bends the cones that `run` traced where they meet transparent objects.
+
+        `scene` has the direct light; the picture needs its mip levels (`CameraImage.build_levels`).
+        """
+        if self._refract is None:
+            self._refract = Kernel(self._gpu, "refract_cones", REAL=1, **self._defines)
+        self._refract.run(
+            (list_threads(self._gpu, grid.texel_count),),
+            grid.bindings,
+            objects.bindings,
+            scene,
+            Texels=self._texels,
+            irradiance_rho=self._rho,
+            cone_mu=fields.mu,
+            cone_rho=fields.rho,
+            mipmap_rho=rho.texture,
+            Occupied=rho.occupied,
+        )
+        self._average(fields, grid, scene)
+
+    def _average(self, fields: ConeFields, grid: LowResGrid, scene: Bindings) -> None:
+        """Filters what each texel traced into the fields."""
         self._filter.run(
             grid.size,
             grid.bindings,
@@ -177,7 +206,7 @@ class TraceRealCones:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._mu, self._rho, self._select, self._trace, self._filter, self._texels)
+        release_all(self._mu, self._rho, self._select, self._trace, self._filter, self._refract, self._texels)
 
 
 class TraceVirtualCones:

@@ -15,6 +15,7 @@ from deltalight.render_server.gpu.textures import release_all, release_target, t
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.view import CameraView
 
 NOTHING_KEPT: Bindings = {"keeps_unblocked": False}
@@ -86,12 +87,17 @@ class DirectLight:
         *,
         joint: moderngl.Texture3D | None = None,
         caustics: Caustics | None = None,
+        objects: ObjectBvh | None = None,
     ) -> None:
-        """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho."""
+        """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho.
+
+        `objects`: transparent ones among them, so that rays find their shadows (shaders/common/ray_shadows.glsl).
+        """
         voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
         if not self._reuses:
             self.select(grid, self.texels, voxels, scene)
-        shared = voxels, _caustics_on(grid, caustics), scene
+        traced = {} if objects is None else objects.bindings
+        shared = voxels, _caustics_on(grid, caustics), traced, scene
         self._shade(grid, self.bindings, *shared)
         if self._spared is not None and scene["keeps_unblocked"]:
             listed: Bindings = {**self.bindings, **grid.bindings, "Texels": self.spared}

@@ -181,11 +181,12 @@ def test_absorption_follows_beers_law(gpu: GpuContext, stage: Stage, shading: st
     thickness, color, distance_m = 0.03, (0.2, 0.5, 0.9), 0.04
     lights = [ambient(0.0)]
     tint = {"attenuation_color": color, "attenuation_distance_m": distance_m}
+    below = shifted(floor(6.0), 0, 0, -2.0)  # so far that the pane does not tint its light
     clear, found, _ = rendered(
-        gpu, shaded_by(shading, stage.document([glass(stage, pane(thickness))], lights, floor()))
+        gpu, shaded_by(shading, stage.document([glass(stage, pane(thickness))], lights, below))
     )
     tinted, _, _ = rendered(
-        gpu, shaded_by(shading, stage.document([glass(stage, pane(thickness), **tint)], lights, floor()))
+        gpu, shaded_by(shading, stage.document([glass(stage, pane(thickness), **tint)], lights, below))
     )
     pixel = (58, 80)
     rays = np.append(frame().camera.rays()[pixel], 1.0) @ look_at().world_from_camera[:3, :3].T
@@ -365,12 +366,11 @@ def test_slanting_light_through_a_slab_that_lies_on_the_floor(
 
 
 def test_transparent_walls_hide_less_natural_light(gpu: GpuContext, stage: Stage) -> None:
-    """Voxels of a clear cube block what it reflects, those of a matt one all."""
+    """Voxels of a clear cube block what it reflects, those of a matt one all; thin walls, which bend no cones."""
     kept = []
     for transmission in (0.0, 1.0):
-        document = stage.document(
-            [glass(stage, cube(0.1), transmission=transmission)], [ambient(1.0)], floor()
-        )
+        item = glass(stage, cube(0.1), transmission=transmission, thin_walled=True)
+        document = stage.document([item], [ambient(1.0)], floor())
         _, found, _ = rendered(gpu, document)
         place = found.position
         beside = (place[..., 3] > 0) & (np.abs(place[..., 2]) < 1e-3) & (found.matte == 0)

@@ -18,7 +18,15 @@ layout(rgba16f) writeonly uniform image2D lobe_rho;
 // Whether direct_mu holds what the last frame found; a = 0: nothing.
 #pragma switch bool keeps_unblocked
 
-#ifdef SHADOW_CONES
+#if defined(TRANSMISSION) && !defined(SHADOW_CONES) && !defined(REAL_SHADOWS) && !defined(SPARED)
+#include "common/ray_shadows.glsl"
+
+vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) {
+    vec2 seen = visibility(light, p, n, bias, bias);
+    if (seen.y > 0.0 && seen.y < seen.x && !is_rectangle(light) && !is_image(light)) seen.y = seen.x * unblocked_fraction(light, p);
+    return seen;
+}
+#elif defined(SHADOW_CONES)
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }
 #elif defined(REAL_SHADOWS)
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return real_visibilities(light, p, n, bias); }

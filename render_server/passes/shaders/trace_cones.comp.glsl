@@ -29,10 +29,6 @@ vec3 with_further_bounces(vec3 e_mu, vec3 e_rho, vec3 q, vec3 n) {
 #endif
 #include "common/camera.glsl"
 
-// Four adjacent texels share four times as many directions, each cone half as wide as its own solid angle;
-// bilateral_cone_filter takes the mean.
-ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y & 1), 0.5, 0.0); }
-
 // Whether the irradiance must be traced, because nothing usable is kept of the last frame's.
 #ifdef REUSES
 uniform usampler2D stale_texels;

@@ -6,7 +6,9 @@
 #include "common/environment.glsl"
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
-#include "common/refraction.glsl"
+const int MOST_PENDING = 4;        // paths that are still to be traced
+const float LEAST_WEIGHT = 0.004;  // of a path that goes on: a step of 8-bit codes
+#include "common/refracted_paths.glsl"
 #include "common/shown_pixels.glsl"
 #include "common/walk.glsl"
 
@@ -18,20 +20,7 @@ uniform float pixel_size;      // m at 1 m depth
 
 const float NOWHERE = 1e30;        // distance of what a ray does not meet
 const int MOST_SURFACES = 24;      // that the paths of one ray may meet
-const int MOST_PENDING = 4;        // paths that are still to be traced
-const float LEAST_WEIGHT = 0.004;  // of a path that goes on: a step of 8-bit codes
 const float NARROWEST = 1e-3;      // rad: half-angle of the smallest lamp
-
-struct Path { vec3 from; vec3 direction; vec3 weight; int medium; };
-
-Path pending[MOST_PENDING];
-int pending_count;
-
-float greatest(vec3 c) { return max(max(c.r, c.g), c.b); }
-
-void push_path(vec3 from, vec3 direction, vec3 weight, int medium) {
-    if (pending_count < MOST_PENDING && greatest(weight) > LEAST_WEIGHT) pending[pending_count++] = Path(from, direction, weight, medium);
-}
 
 // Fraction of a cone around d that a disc of half-angle `radius` around l fills. Both are even discs, which overlap by a smooth step from
 // where one covers the other to where they part, of the same sum. Chords measure: on a sphere, a disc's area is PI times its chord's square.
@@ -72,22 +61,12 @@ vec3 outside(vec3 from, vec3 d, float spread, float object) {
     return seen.rgb + (1.0 - seen.a) * beyond;
 }
 
-// Splits a path at a surface into a transmitted and a reflected one. The reflected part of the path
-// from the camera is left out: it is the surface's own reflection already.
-void split_path(Interface i, Path path, bool first) {
-    bool inside = path.medium >= 0;
-    vec3 reflectance = interface_reflectance(i, path.direction, inside);
-    int beyond = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
-    vec3 back = mirrored(i, path.direction), through = refracted(i, path.direction, inside);
-    if (!first) push_path(leave(i, back), back, path.weight * reflectance, path.medium);
-    push_path(leave(i, through), through, path.weight * (1.0 - reflectance) * i.surface.passing, beyond);
-}
-
 // Radiance along all paths of a ray that meets a transparent surface first.
 vec3 trace_paths(Ray ray, MeshHit hit, float spread) {
     vec3 sum = vec3(0.0);
     pending_count = 0;
     float length_m = hit.distance;
+    // What the first surface reflects is left out: it is the object's own reflection already.
     split_path(interface_at(hit, ray, pixel_size * length_m), Path(ray.from, ray.direction, vec3(1.0), -1), true);
     for (int met = 0; met < MOST_SURFACES && pending_count > 0; ++met) {
         Path path = pending[--pending_count];

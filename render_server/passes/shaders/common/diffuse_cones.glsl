@@ -6,6 +6,10 @@ uniform int cone_count;
 // `width` (0..1) of its own solid angle wide, all rotated by `turn` (rad) about the normal.
 struct ConeSet { int parts; int part; float width; float turn; };
 
+// Four adjacent texels share four times as many directions, each cone half as wide as its own solid angle;
+// bilateral_cone_filter takes the mean.
+ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y & 1), 0.5, 0.0); }
+
 // Direction k about z, stratified over the projected solid angle (docs/method.md 4.5).
 vec3 cone_direction(int k, ConeSet set) {
     float number = float(set.parts * k + set.part);

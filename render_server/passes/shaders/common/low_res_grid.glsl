@@ -1,8 +1,7 @@
 // The picture pixel that represents each texel of the reduced grid.
 #include "common/geometry.glsl"
 
-uniform isampler2D sample_pixels;   // real x, y; virtual x, y; -1: none; below: hidden by objects
-#pragma texels rgba16i sample_pixels
+#include "common/sample_pixels.glsl"
 uniform ivec2 low_resolution_size;
 
 struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness; bool two_sided; };

@@ -182,16 +182,24 @@ bool may_be_far(vec3 q, int level) {
 // Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together. Loops test at
 // their end, because software renderers run the body of those that test at their beginning once more, for no lane.
 
+#ifdef ENDS_NEAR
+float near_end = ENDLESS;   // voxels: distance at which marches through the volume end
+
+bool in_near(vec3 at, Walk w) { return is_within(at, volume_size) && travelled(w) < near_end; }
+#else
+bool in_near(vec3 at, Walk w) { return is_within(at, volume_size); }
+#endif
+
 // Goes on to the next cell, from that at `at` on, that may hold anything; whether there is one.
 bool find_near(inout Walk w, inout vec3 at, float before, float ratio, vec3 low, vec3 high, inout bool differs) {
     bool met = false;
-    if (is_within(at, volume_size)) do {
+    if (in_near(at, w)) do {
         vec3 reach = vec3(1.5 * float(1 << w.level));
         differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
         met = may_be_near(at, w.level);
         if (!met) advance(w, ratio, before, volume_levels);
         at = sample_point(w);
-    } while (is_within(at, volume_size) && !met);
+    } while (in_near(at, w) && !met);
     return met;
 }
 

@@ -1,7 +1,6 @@
 // Joint bilateral upsampling from 1/scale of the picture: the 2 x 2 texels around a pixel, weighted by distance and
 // by how well their surface continues the pixel's.
-uniform isampler2D sample_pixels;
-#pragma texels rgba16i sample_pixels
+#include "common/sample_pixels.glsl"
 uniform int scale;
 #include "common/continuation.glsl"
 
