@@ -30,7 +30,8 @@ class QualityTier:
     `bounce_turns` frames; their shadows are in every one. One tile of the picture in `refresh_tiles` gets new light
     in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new light, and
     the real scene is built anew whenever the camera moves. `distant_light`: objects also take and add light at
-    surfaces beyond their volumes.
+    surfaces beyond their volumes. `glass_rays`: with transparent objects, rays find the penumbrae on real surfaces,
+    and cones bend.
     """
 
     cone_count: int = 64
@@ -42,12 +43,13 @@ class QualityTier:
     refresh_tiles: int = 0
     bounce_turns: int = 1
     distant_light: bool = True
+    glass_rays: bool = True
 
 
 BEST = QualityTier()
 TIERS: dict[Quality, QualityTier] = {
     "best": BEST,
-    "balanced": QualityTier(refresh_tiles=8, distant_light=False),
+    "balanced": QualityTier(refresh_tiles=8, distant_light=False, glass_rays=False),
     "live": QualityTier(
         cone_count=8,
         shadow_samples=8,
@@ -58,5 +60,6 @@ TIERS: dict[Quality, QualityTier] = {
         refresh_tiles=16,
         bounce_turns=3,
         distant_light=False,
+        glass_rays=False,
     ),
 }

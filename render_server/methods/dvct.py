@@ -127,7 +127,13 @@ class UnchangedCones:
 def _shading(gpu: GpuContext, setup: Setup[DvctMethod], lights: LightBuffers) -> Shading:
     settings, size = setup.settings, setup.picture_size
     shadow_cones = DIRECTIONS if settings.resolved_shadow == "cone" else None
-    direct = DirectLight(gpu, size, shadow_cones=shadow_cones, reuses=settings.tier.refresh_tiles > 0)
+    direct = DirectLight(
+        gpu,
+        size,
+        shadow_cones=shadow_cones,
+        ray_shadows=shadow_cones is None and settings.tier.glass_rays,
+        reuses=settings.tier.refresh_tiles > 0,
+    )
     options = ShadingOptions(
         tier=settings.tier,
         caustics=settings.caustics,
@@ -171,7 +177,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         voxels=rho,
         marching=marching,
         find_distant=distant,
-        refract=cones.refract,
+        refract=cones.refract if settings.tier.glass_rays else None,
     )
     unchanged = UnchangedCones(g.gpu, settings, voxels, shading.cones.mu.size)
     return replace(layers, cones_mu=g.stage("cones mu", unchanged.trace, "shading scene", layers.grid, mu))

@@ -241,10 +241,7 @@ class Shading:
         bvh: ObjectBvh,
         *_kept: DirectLight,
     ) -> DirectLight:
-        """Computes the direct light on the real surfaces, except where the last frame's is reused.
-
-        With transparent objects, rays find the penumbrae of lamps.
-        """
+        """Computes the direct light on the real surfaces, except where the last frame's is reused."""
         joint = None if voxels is None else voxels.texture
         traced = bvh if scene["TRANSMISSION"] else None
         self._direct.run(grid, scene, joint=joint, caustics=caustics, objects=traced)

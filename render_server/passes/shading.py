@@ -43,9 +43,10 @@ class DirectLight:
     """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
 
     With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
-    do. Without `objects_shadow` other passes do, and E_rho is E_mu. Pixels that objects do not reach are 0. `texels`
-    lists the blocks of pixels to shade; with `reuses`, LightHistory fills it beforehand, in software apart from
-    `spared` ones, whose light without the objects is known, and of which they block none.
+    do. With `ray_shadows`, rays find penumbrae where some objects are transparent. Without `objects_shadow` other
+    passes find shadows, and E_rho is E_mu. Pixels that objects do not reach are 0. `texels` lists the blocks of
+    pixels to shade; with `reuses`, LightHistory fills it beforehand, in software apart from `spared` ones, whose
+    light without the objects is known, and of which they block none.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class DirectLight:
         *,
         shadow_cones: int | None = None,
         objects_shadow: bool = True,
+        ray_shadows: bool = False,
         reuses: bool = False,
     ) -> None:
         self._gpu, self._size = gpu, size
@@ -63,7 +65,8 @@ class DirectLight:
         if not objects_shadow:
             defines = {"REAL_SHADOWS": 1}
         self.defines: Mapping[str, float | str] = defines
-        self._kernel = Kernel(gpu, "direct_light", **defines)
+        traced = {"RAY_SHADOWS": 1} if ray_shadows else {}
+        self._kernel = Kernel(gpu, "direct_light", **defines, **traced)
         self._spared = Kernel(gpu, "direct_light", SPARED=1) if reuses and gpu.is_software else None
         self._select = Kernel(gpu, "select_direct_texels", **defines)
         self._reuses = reuses
@@ -91,7 +94,7 @@ class DirectLight:
     ) -> None:
         """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho.
 
-        `objects`: transparent ones among them, so that rays find their shadows (shaders/common/ray_shadows.glsl).
+        `objects`: what the rays of `ray_shadows` meet (shaders/common/ray_shadows.glsl).
         """
         voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
         if not self._reuses:

@@ -18,7 +18,7 @@ layout(rgba16f) writeonly uniform image2D lobe_rho;
 // Whether direct_mu holds what the last frame found; a = 0: nothing.
 #pragma switch bool keeps_unblocked
 
-#if defined(TRANSMISSION) && !defined(SHADOW_CONES) && !defined(REAL_SHADOWS) && !defined(SPARED)
+#if defined(TRANSMISSION) && defined(RAY_SHADOWS)
 #include "common/ray_shadows.glsl"
 
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) {
