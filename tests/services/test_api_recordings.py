@@ -214,7 +214,7 @@ def test_a_video_without_pyav_is_one_sentence(tmp_path: Path, monkeypatch: pytes
         ({"duration_s": 0}, "duration_s"),
         ({"duration": 3}, "the nearest known key is `duration_s`"),
         ({"node": "a b"}, "node"),
-        ([], "dictionary"),
+        ([], "object with keys"),
     ],
 )
 def test_wrong_wishes_are_one_sentence(client: httpx.Client, body: object, expected: str) -> None:
