@@ -77,7 +77,7 @@ class ExactCones:
         if objects.materials.transmits:
             seen.image.build_levels()
             lit = {**scene, **marching, "direct_mu": direct.light.mu, "direct_rho": direct.light.rho}
-            self._real.refract(fields, grid, self._voxels.rho, bvh, lit)
+            return self._real.refract(fields, grid, self._voxels.rho, bvh, lit)
         return fields
 
     def trace_objects(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from copy import copy
 
 import moderngl
 
@@ -142,7 +143,7 @@ class TraceRealCones:
         self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
         self._trace = Kernel(gpu, "trace_cones", REAL=1, **defines)
         self._filter = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
-        self._refract: Kernel | None = None
+        self._refract: RefractCones | None = None  # made when objects are transparent
         self._texels = gpu.ctx.buffer(reserve=4)
 
     def run(
@@ -167,33 +168,6 @@ class TraceRealCones:
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
-        self._average(fields, grid, scene)
-
-    def refract(
-        self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, objects: ObjectBvh, scene: Bindings
-    ) -> None:
-        """Bends the cones that `run` traced where they meet transparent objects.
-
-        `scene` has the direct light; the picture needs its mip levels (`CameraImage.build_levels`).
-        """
-        if self._refract is None:
-            self._refract = Kernel(self._gpu, "refract_cones", REAL=1, **self._defines)
-        self._refract.run(
-            (list_threads(self._gpu, grid.texel_count),),
-            grid.bindings,
-            objects.bindings,
-            scene,
-            Texels=self._texels,
-            irradiance_rho=self._rho,
-            cone_mu=fields.mu,
-            cone_rho=fields.rho,
-            mipmap_rho=rho.texture,
-            Occupied=rho.occupied,
-        )
-        self._average(fields, grid, scene)
-
-    def _average(self, fields: ConeFields, grid: LowResGrid, scene: Bindings) -> None:
-        """Filters what each texel traced into the fields."""
         self._filter.run(
             grid.size,
             grid.bindings,
@@ -204,9 +178,60 @@ class TraceRealCones:
             irradiance_rho=fields.rho,
         )
 
+    def refract(
+        self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, objects: ObjectBvh, scene: Bindings
+    ) -> ConeFields:
+        """Returns `fields` with the cones that `run` traced bent where they meet transparent objects.
+
+        `scene` has the direct light; the picture needs its mip levels (`CameraImage.build_levels`).
+        """
+        if self._refract is None:
+            self._refract = RefractCones(self._gpu, grid.size, self._defines)
+        lit = {**scene, "Texels": self._texels, "traced_mu": self._mu, "traced_rho": self._rho}
+        return self._refract.run(fields, grid, rho, objects, lit)
+
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self._mu, self._rho, self._select, self._trace, self._filter, self._refract, self._texels)
+
+
+class RefractCones:
+    """Bends cones at real surfaces that meet transparent objects (docs/method.md 4.11), in a field of its own."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
+        self._gpu = gpu
+        self._change, self._rho = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
+        self._target = gpu.ctx.framebuffer([self._change])
+        self._refract = Kernel(gpu, "refract_cones", REAL=1, **defines)
+        self._filter = Kernel(gpu, "bilateral_cone_filter", REAL=1, BENT=1)
+
+    def run(
+        self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, objects: ObjectBvh, lit: Bindings
+    ) -> ConeFields:
+        """Returns the fields with another E_rho; `lit` has the scene, what the cones traced, and the list of them."""
+        self._target.use()
+        self._target.clear()
+        self._refract.run(
+            (list_threads(self._gpu, grid.texel_count),),
+            grid.bindings,
+            objects.bindings,
+            lit,
+            cone_change=self._change,
+            cone_mu=fields.mu,
+            cone_rho=fields.rho,
+            mipmap_rho=rho.texture,
+            Occupied=rho.occupied,
+        )
+        bent: dict[str, Binding] = {"irradiance_mu": fields.mu, "irradiance_rho": self._rho}
+        self._filter.run(grid.size, bent, grid.bindings, lit, traced_change=self._change)
+        found = copy(fields)
+        found.rho = self._rho
+        return found
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_target(self._target)
+        release_all(self._change, self._rho, self._refract, self._filter)
 
 
 class TraceVirtualCones:

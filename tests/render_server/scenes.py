@@ -225,7 +225,8 @@ def fields_of(renderer: SceneRenderer) -> Fields:
     """What the graph of the newest frame holds."""
     graph = renderer.graph
     assert graph is not None
-    direct, cones, real = graph["direct light"], graph["cones"], graph["real surface"].surface
+    cones = graph["refracted cones" if "refracted cones" in graph else "cones"]
+    direct, real = graph["direct light"], graph["real surface"].surface
     cones_rho = array_of(cones.rho)
     return Fields(
         array_of(direct.light.mu)[..., :3],

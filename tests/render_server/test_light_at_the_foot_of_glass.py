@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float64
 
 from deltalight.protocol.frames import decode_lut
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.methods.dvct import ExactCones
+from deltalight.render_server.passes.cones import ConeFields
 from tests.render_server.scenes import COARSE, GREY, Fields, Stage, ambient, ball, floor, plain, sphere_light
 from tests.render_server.test_transparent_objects import IOR, fresnel, glass, pane, rendered
 
@@ -107,6 +109,24 @@ def test_a_ball_bends_light_from_all_around(gpu: GpuContext, stage: Stage) -> No
         expected = kept_by_rays(np.array([away[ring].mean(), 0.0, 0.0]), ground, rng)
         print(f"{place} m: {kept:.3f}, by rays {expected:.3f}, {ring.sum()} pixels")
         assert kept == pytest.approx(expected, abs=0.01)
+
+
+def test_cones_that_are_bent_again_are_the_same(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stage leaves what the cones traced as it was: if it alone runs again, nothing adds up."""
+    document = stage.document([clear_ball(stage)], [ambient(1.0)], floor())
+    _, once, _ = rendered(gpu, document, plain(60))
+    refract = ExactCones.refract
+
+    def twice(self: ExactCones, *inputs: Any) -> ConeFields:  # noqa: ANN401
+        refract(self, *inputs)
+        return refract(self, *inputs)
+
+    monkeypatch.setattr(ExactCones, "refract", twice)
+    _, again, _ = rendered(gpu, document, plain(60))
+    assert np.array_equal(once.cones_rho, again.cones_rho)
+    assert not np.array_equal(once.cones_rho, once.cones_mu)
 
 
 @pytest.mark.parametrize(

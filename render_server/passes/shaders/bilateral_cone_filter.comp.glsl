@@ -7,6 +7,10 @@
 #include "common/pixel_group.glsl"
 uniform sampler2D traced_rho;
 #pragma texels rgba16f traced_rho
+#ifdef BENT
+uniform sampler2D traced_change;   // of what was traced, by transparent objects (refract_cones.comp.glsl)
+#pragma texels rgba16f traced_change
+#endif
 layout(rgba16f) writeonly uniform image2D irradiance_rho;
 #ifdef REAL
 uniform sampler2D traced_mu;                        // a: 1 where traced
@@ -19,6 +23,14 @@ uniform usampler2D stale_texels;   // the others hold means already
 #include "common/camera.glsl"
 
 float tent(ivec2 o) { return float((2 - abs(o.x)) * (2 - abs(o.y))); }
+
+vec4 rho_of(ivec2 texel) {
+    vec4 rho = texelFetch(traced_rho, texel, 0);
+#ifdef BENT
+    rho.rgb = max(rho.rgb + texelFetch(traced_change, texel, 0).rgb, vec3(0.0));
+#endif
+    return rho;
+}
 
 bool traced(ivec2 texel) {
     if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, low_resolution_size))) return false;
@@ -39,7 +51,7 @@ void average(ivec2 texel, inout vec3 mu, inout vec3 rho) {
         SurfacePoint other = surface_point(at);
         float w = tent(o) * continuation(s.position, s.normal, other.position, other.normal, near);
         total += w;
-        rho += w * texelFetch(traced_rho, at, 0).rgb;
+        rho += w * rho_of(at).rgb;
 #ifdef REAL
         mu += w * texelFetch(traced_mu, at, 0).rgb;
 #endif
@@ -51,7 +63,7 @@ void average(ivec2 texel, inout vec3 mu, inout vec3 rho) {
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
-    vec4 rho = texelFetch(traced_rho, texel, 0), mu = vec4(0.0);
+    vec4 rho = rho_of(texel), mu = vec4(0.0);
 #ifdef REAL
     mu = texelFetch(traced_mu, texel, 0);
 #endif

@@ -14,7 +14,7 @@ const float LEAST_WEIGHT = 0.02;     // of a path that goes on
 #include "common/refracted_paths.glsl"
 
 layout(local_size_x = 64) in;
-layout(rgba16f) uniform image2D irradiance_rho;   // rgb E_rho before its filter
+layout(rgba16f) writeonly uniform image2D cone_change;   // rgb change of E_rho, before its filter
 #include "common/camera.glsl"
 
 const int MOST_SURFACES = 8;   // that the paths of one cone meet
@@ -105,9 +105,7 @@ void refract_cones(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     enter_volume(s.position);
     if (!inside_volume(volume_coordinate(s.position))) return;
-    vec3 change = change_of_cones(s, cones_of(texel));
-    vec4 before = imageLoad(irradiance_rho, texel);
-    if (change != vec3(0.0)) imageStore(irradiance_rho, texel, vec4(max(before.rgb + change, vec3(0.0)), before.a));
+    imageStore(cone_change, texel, vec4(change_of_cones(s, cones_of(texel)), 0.0));
 }
 
 // The texels that select_cone_texels listed.
