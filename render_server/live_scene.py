@@ -114,9 +114,8 @@ class LiveScene:
             self._notify(sentence)
         self._state_lamps(scene.objects, method)
         if before is not None and scene.lights == self._plan.scene.lights:
-            return _Plan(
-                scene, method, before
-            )  # reading them anew takes a tenth of a millisecond of each drag
+            # Reading them anew takes a tenth of a millisecond of each drag.
+            return _Plan(scene, method, before)
         known = before if method.keeps_world else None
         return _Plan(scene, method, LightEstimator(scene.lights, self._notify, known, waits=self._waits))
 

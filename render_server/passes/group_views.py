@@ -10,9 +10,7 @@ from jaxtyping import Float64
 from deltalight.render_server.lights.lights import Light
 from deltalight.render_server.passes.shadow_maps import LightView, light_views
 
-MOST_GROUP_VIEWS = (
-    8  # of all lights together, where groups need more than one view each light: maps take memory
-)
+MOST_GROUP_VIEWS = 8  # of all lights together: each is a map, and maps take memory
 
 Points = Float64[np.ndarray, "n 3"]
 
