@@ -404,8 +404,8 @@ def test_a_short_soak_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     figures = {each.what: each.is_met for each in report.figures}
     assert figures["scene equal by pixels"]
     objects = [each for each in report.courses["GL objects"]["render server"] if each is not None]
-    # Of all servers that were started: one that starts slowly may meet states that need kernels of their own.
-    assert max(objects) <= 1.05 * median(objects)
+    # Of all servers that were started. On a loaded machine one may have six objects more than the others (372).
+    assert max(objects) <= 1.02 * median(objects)
     assert of["nonsense"]["sent"] > 100
     assert of["kill-recorder"]["frames"] > 0
     written = SoakReport.model_validate(json.loads((tmp_path / "soak.json").read_text()))
