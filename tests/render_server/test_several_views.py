@@ -297,11 +297,15 @@ def test_a_frame_that_is_not_shown_lights_the_room_and_one_left_out_does_not(
 
 
 def test_the_gpu_holds_what_the_cameras_of_the_newest_frame_need(made: Callable[..., SceneRenderer]) -> None:
-    """But for timer queries, of which those of the longest frames stay for the next ones."""
+    """But for timer queries, of which those of the longest frames stay for the next ones.
+
+    The first round is not counted: the first frames of a process hold less.
+    """
     renderer, held = made("depth"), []
-    for poses in ((BEHIND, FACING), (BEHIND,)) * 2:
+    for poses in ((BEHIND, FACING), (BEHIND,)) * 3:
         for number in range(2):
             renderer.render_views([seen_room(pose, number) for pose in poses])
         held.append(sum(number for kind, number in count_gl_objects().items() if kind != "Query"))
+    held = held[2:]
     assert held[1] < held[0]
     assert held[2:] == held[:2], "nothing is kept for cameras that left"
