@@ -236,11 +236,11 @@ def _require_memory(gpu: GpuContext) -> None:
         DeltalightError: the host or the GPU has too little free memory, or its driver does not tell.
     """
     if free_host_memory() < NEEDED_BYTES:
-        raise DeltalightError("The host lacks the memory for a second renderer.")
+        raise DeltalightError("The host has too little memory for a second renderer.")
     _, free = device_memory(gpu.ctx.extensions, gl_integers(), is_software=gpu.is_software)
     if not gpu.is_software and (free is None or free < NEEDED_DEVICE_BYTES):
         raise DeltalightError(
-            "The GPU lacks the memory for a second renderer, or does not tell how much it has."
+            "The GPU has too little memory for a second renderer, or does not report how much it has."
         )
 
 
