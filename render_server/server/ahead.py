@@ -26,7 +26,7 @@ from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.gpu.device_memory import device_memory, free_host_memory, gl_integers
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.cameras import RoomCameras, Taken
-from deltalight.render_server.server.frames import FrameSource
+from deltalight.render_server.server.frames import FrameReceiver
 from deltalight.render_server.server.pace import CalledError, IsCalled, Pace
 from deltalight.render_server.server.process import RECEIVE_TIMEOUT_S, ServerSettings
 from deltalight.render_server.server.session import needs_depth
@@ -206,7 +206,7 @@ class Ahead:
         """
         ends_s = time.monotonic() + LISTEN_S
         taken: tuple[Taken, ...] = ()
-        with closing(FrameSource(self._settings.subscribe, self._keys)) as source:
+        with closing(FrameReceiver(self._settings.subscribe, self._keys)) as source:
             while len(taken) < len(self._settings.subscribe) and time.monotonic() < ends_s:
                 if self._is_called(0.0):
                     return ()
