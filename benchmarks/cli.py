@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.commands.options import writable
+from deltalight.services.commands.options import Device, writable
 
 if TYPE_CHECKING:
     from deltalight.benchmarks.speed.measure import SpeedJob
@@ -22,7 +22,6 @@ VIEWS_METHODS = "exact,exact:caustics=false,paper,dlpv"
 DEFAULT_MOTIONS = "camera,object,arm,lamps,still"
 
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default: the demo's.")]
-Device = Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")]
 ReportFile = Annotated[
     Path | None, typer.Option("--out", "-o", callback=writable, help="File for the report as JSON.")
 ]

@@ -47,7 +47,7 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
     buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size)
     for light in (direct.light, direct.lobes):
         light.clear()  # none without objects, and none with them
-    shading = lighting.Shading(g.gpu, size, setup.resolved, buffers, direct, lighting.ShadingOptions())
+    shading = lighting.SurfaceShading(g.gpu, size, setup.resolved, buffers, direct, lighting.ShadingOptions())
 
     def place(lights: "LightSet") -> "LightBuffers":
         """Gives the lamps to the shaders; without points to shine on they get no shadow maps."""
@@ -78,7 +78,8 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
     placed = g.value("volume", lambda _: volume, s.surfaces)
     g.own(volume)
     lit = LitScene(buffers, lamps, lamps, lamps)
-    return lighting.shading_stages(g, s, shading, lit, placed, gather, light_directly=lambda *_: direct)
+    own = lighting.MethodStages(placed, gather, light_directly=lambda *_: direct)
+    return lighting.shading_stages(g, s, shading, lit, own)
 
 
 def _resolve(_settings: RasterMethod, _defaults: ResolvedSettings) -> ResolvedSettings:

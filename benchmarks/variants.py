@@ -172,7 +172,7 @@ def _parse(text: str, known: Collection[str]) -> Variant:
     others = [key for key in settings if _part(key) not in ("method", *OTHER_PARTS)]
     if others:
         raise DeltalightError(
-            f"`{others[0]}` in '{text}' is no setting; write one of the method, output.KEY or shading.KEY."
+            f"`{others[0]}` in '{text}' is not a setting; write one of the method, output.KEY or shading.KEY."
         )
     return Variant(text, f"{name} with {changes.replace(',', ', ')}", kind, settings)
 
@@ -186,5 +186,5 @@ def _part(key: str) -> str:
 def _setting(pair: str, variant: str) -> dict[str, Any]:
     key, equals, value = pair.partition("=")
     if not equals:
-        raise DeltalightError(f"'{pair}' in '{variant}' is no setting; write KEY=VALUE.")
+        raise DeltalightError(f"'{pair}' in '{variant}' is not a setting; write KEY=VALUE.")
     return parse_mapping(f"{key.strip()}: {value}", f"--methods {variant}", is_json=False)

@@ -128,7 +128,7 @@ def clock_exchange(
         reply = request(question, timeout_s)
         t1, t2 = reply.payload.get("received_ns"), reply.payload.get("sent_ns")
         if not isinstance(t1, int) or not isinstance(t2, int):
-            raise DeltalightError(f"the server does not tell its time ({reply.error}); update it.")
+            raise DeltalightError(f"the server does not report its time ({reply.error}); update it.")
         if not (0 <= t1 <= LATEST_NS and 0 <= t2 <= LATEST_NS):
             raise DeltalightError("the server's clock is centuries off; set it.")
         return t1, t2

@@ -166,7 +166,7 @@ class DatasetReader:
         path = self.path / "calibration" / "rgb.yaml"
         if not path.is_file():
             raise DeltalightError(
-                f"{self.path} has no calibration/rgb.yaml and pictures do not tell their camera; "
+                f"{self.path} has no calibration/rgb.yaml and no picture says which camera took it; "
                 "write that file as ROS camera_info (image_width, image_height, camera_matrix, "
                 "distortion_coefficients)."
             )

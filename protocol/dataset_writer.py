@@ -103,7 +103,7 @@ class DatasetWriter:
         )
         if frame.camera != self._first.camera or not same_response:
             raise DeltalightError(
-                f"frame {frame.frame_id} has another camera or response than the first; write two folders."
+                f"frame {frame.frame_id} has a different camera or response from the first; write two folders."
             )
 
     def _add_color(self, frame: SensorFrame) -> None:

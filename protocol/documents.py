@@ -98,7 +98,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         doubled = next(key for key in found if sum(key == other for other, _ in pairs) > 1)
-        raise ValueError(f"`{doubled[:LONGEST_WORD]}` comes twice")
+        raise ValueError(f"`{doubled[:LONGEST_WORD]}` appears twice")
     return found
 
 

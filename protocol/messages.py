@@ -357,7 +357,7 @@ class CompositeMessage(MessageBase):
     def _views_differ(self) -> Self:
         views = [self.view, *(other.view for other in self.others)]
         if len(set(views)) < len(views):
-            raise ValueError("a view must come once")
+            raise ValueError("each view may appear only once")
         return self
 
     @model_validator(mode="after")
@@ -396,7 +396,7 @@ class CamerasMessage(MessageBase):
     @model_validator(mode="after")
     def _nodes_differ(self) -> Self:
         if len({camera.node for camera in self.cameras}) < len(self.cameras):
-            raise ValueError("a node must come once")
+            raise ValueError("each node may appear only once")
         return self
 
 

@@ -144,6 +144,6 @@ class FisheyeTrack:
             ) from error
         if picture.shape[:2] != size:
             raise DeltalightError(
-                f"{self._name} has a fish-eye picture of another size than its lens; record it again."
+                f"{self._name} has a fish-eye picture whose size differs from its lens's; record it again."
             )
         return picture

@@ -128,7 +128,7 @@ class RecordingReader:
             raise DeltalightError(f"{name} is damaged; leave it out of the range of frames.") from error
         color, camera = decode_rgb(data, name), self._camera(record)
         if color.shape[:2] != (camera.height, camera.width):
-            raise DeltalightError(f"{name} has a picture of another size than its camera; leave it out.")
+            raise DeltalightError(f"{name} has a picture whose size differs from its camera's; leave it out.")
         pose = record.world_from_camera
         return SensorFrame(
             frame_id=record.frame_id,
@@ -326,7 +326,7 @@ def _depth_image(record: DepthRecord, data: bytes) -> DepthImage:
     kind = "<f4" if record.scale is None else "<u2"
     values = np.frombuffer(image.data, kind).reshape(image.height, image.width)
     if values.shape != (camera.height, camera.width):
-        raise ValueError("the depth image has another size than its camera")
+        raise ValueError("the depth image's size differs from its camera's")
     if record.scale is not None:
         return depth_from_steps(values.astype(np.uint16), record.scale, camera, record.noise_sigma_m)
     depth_m = values.astype(np.float32)

@@ -64,7 +64,7 @@ def _unique_mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any
     doubled = next((key for index, key in enumerate(keys) if key in keys[:index]), None)
     if doubled is not None:
         raise yaml.constructor.ConstructorError(
-            None, None, f"`{doubled[:MAX_KEY_SHOWN]}` comes twice", node.start_mark
+            None, None, f"`{doubled[:MAX_KEY_SHOWN]}` appears twice", node.start_mark
         )
     return loader.construct_mapping(node, deep=True)
 

@@ -10,7 +10,8 @@ from jaxtyping import Float64, Int32, UInt8
 from deltalight.protocol.frames import LUMINANCE, RadianceMap, ViewFrame
 from deltalight.protocol.hemisphere import hemisphere_direction
 from deltalight.protocol.sky_lights import Region
-from deltalight.render_server.lights.lights import IncidentLight, LightSet, incident_light
+from deltalight.render_server.lights.light_models import IncidentLight, incident_light
+from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import solid_angle_mean
 
 OUTLINE_POINTS = 24  # per edge of a region: a lens bends straight lines

@@ -103,7 +103,7 @@ class FrameResources:
     This module's stages compute the rest. `observation` changes only when something moved, so a new picture of a
     scene at rest relights nothing. `measured` is the observation that lights the real scene's voxels and maps: the
     same, or, where the world is kept while the camera moves, that of `measurement`; of several cameras in one room,
-    that of all of them together (`together`), and `own_measured` this camera's part of it. `geometry` holds the
+    the joint one of all (`join_measurements`), and `own_measured` this camera's part of it. `geometry` holds the
     bindings of both surfaces; `lit_area` requests light in a part of the picture, whatever the objects reach (for
     estimation).
     """
@@ -348,10 +348,10 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
     )
 
 
-def together(
+def join_measurements(
     graph: Graph, frames: Sequence[FrameResources], views: Sequence[CameraView]
 ) -> list[FrameResources]:
-    """Declares what several cameras measure of one room, and lights its voxels and maps by all of them."""
+    """Declares the joint measurement of a room's cameras, from which its voxels and maps are lit."""
     if len(frames) == 1:
         return list(frames)
     joint = JointMeasurement(graph.gpu, [view.size for view in views])

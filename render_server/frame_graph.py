@@ -18,7 +18,7 @@ from deltalight.render_server.frame import (
     PictureBuffers,
     Scan,
     declare_frame,
-    together,
+    join_measurements,
 )
 from deltalight.render_server.gpu.clearing import clear_used_up
 from deltalight.render_server.gpu.context import GpuContext
@@ -413,7 +413,7 @@ def frame_graphs(
                 buffers.append(PictureBuffers(gpu, view, keeps_world=method.keeps_world))
                 graph.own(buffers[-1])
                 resources.append(declare_frame(graph, buffers[-1]))
-        parts = zip(buffers, together(graph, resources, views), strict=True)
+        parts = zip(buffers, join_measurements(graph, resources, views), strict=True)
         for number, (held, measured) in enumerate(parts):
             with graph.of_view(number):
                 made.append(FrameGraph(graph, held, measured, method, precomputed))

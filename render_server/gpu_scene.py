@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
-from deltalight.render_server.lights.lights import Light
+from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.voxelize import Chosen, VoxelizedMesh
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS

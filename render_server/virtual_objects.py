@@ -14,7 +14,7 @@ from deltalight.protocol.scene_objects import Animation, AnyMaterial, SceneObjec
 from deltalight.protocol.scene_objects import Material as MaterialDocument
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import DrawnMesh, GeometryState, ObjectExtent, PlacedObject
-from deltalight.render_server.lights.lights import Light
+from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf
 from deltalight.render_server.scene.gltf_animation import Clip

@@ -22,10 +22,10 @@ COLORS = 192  # beside the line's white; GIF has 256
 
 
 def divided(
-    before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"], share: float
+    before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"], position: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return `before` left of a white line at a share of the width, and `after` right of it."""
-    column = round(share * before.shape[1])
+    """Return `before` left of a white line at this fraction of the width, and `after` right of it."""
+    column = round(position * before.shape[1])
     picture = after.copy()
     picture[:, :column] = before[:, :column]
     picture[:, max(column - LINE_PX // 2, 0) : column + LINE_PX // 2] = 255

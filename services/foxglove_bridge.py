@@ -74,7 +74,7 @@ class FoxgloveServer:
             )
         except RuntimeError as error:
             raise DeltalightError(
-                f"{host} port {port} cannot be listened on ({error}); choose another with --port."
+                f"cannot listen on {host} port {port} ({error}); choose another with --port."
             ) from error
 
     @property

@@ -37,7 +37,7 @@ def require_replaceable(folder: Path) -> None:
         kind = None
     if kind != REPORT_KIND:
         raise DeltalightError(
-            f"'{folder}' is no older report of this command; name another folder with --out."
+            f"'{folder}' is not an earlier report of this command; name another folder with --out."
         )
 
 

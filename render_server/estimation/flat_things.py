@@ -203,8 +203,8 @@ def _overlap(one: FlatThing, other: FlatThing) -> bool:
     """Returns whether the middle of a sheet lies on another."""
     outline = other.outline
     edges = np.stack([outline[1] - outline[0], outline[3] - outline[0]])
-    share = (edges @ (one.outline.mean(axis=0) - outline[0])) / (edges**2).sum(axis=1)
-    return bool(((share >= 0) & (share <= 1)).all())
+    along = (edges @ (one.outline.mean(axis=0) - outline[0])) / (edges**2).sum(axis=1)
+    return bool(((along >= 0) & (along <= 1)).all())
 
 
 def _area_m2(thing: FlatThing) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from deltalight.protocol.octahedral import octahedral_grid
-from deltalight.render_server.lights.lights import Lamp, Light, incident_light
+from deltalight.render_server.lights.light_models import Lamp, Light, incident_light
 
 # Four times the planes of a room's corner: faces of things may be larger than what the border leaves of a wall.
 MAX_PLANES = 12

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Float32, Float64
 from deltalight.protocol.frames import LUMINANCE
 from deltalight.render_server.estimation.samples import bounced_light, sample_light
 from deltalight.render_server.frame_graph import FrameGraph
-from deltalight.render_server.lights.lights import DirectionalLight, LightSet
+from deltalight.render_server.lights.light_models import DirectionalLight
+from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import solid_angle_mean
 from deltalight.render_server.scene.albedo import MIN_PIXELS
 

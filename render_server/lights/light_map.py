@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral, texel_solid_angles
-from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE, Light, LightSet, incident_light
+from deltalight.render_server.lights.light_models import Light, incident_light
+from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE, LightSet
 from deltalight.render_server.lights.octahedral import harmonics
 
 ORDER = 3

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from deltalight.render_server.lights.lights import DirectionalLight, Light
+from deltalight.render_server.lights.light_models import DirectionalLight, Light
 from deltalight.render_server.scene.declared_surfaces import PLANE, SurfaceTable
 
 # Of planes. From this roughness on, a lobe blurs a light's image so much that cones represent it.

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from deltalight.render_server.lights.lights import Lamp, LightRecord
+from deltalight.render_server.lights.light_models import Lamp, LightRecord
 
 LEAST_BLEND = 0.001  # between the cosines of a spot's cones, as the extension says
 

@@ -13,15 +13,8 @@ from deltalight.protocol.light_cutter import LightCutter
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
 from deltalight.render_server.lights.light_distance import fit_distance, paper_light
-from deltalight.render_server.lights.lights import (
-    AMBIENT_SIZE,
-    DirectionalLight,
-    Light,
-    LightSet,
-    SphereLight,
-    build_lights,
-    light_set,
-)
+from deltalight.render_server.lights.light_models import DirectionalLight, Light, SphereLight
+from deltalight.render_server.lights.lights import AMBIENT_SIZE, LightSet, build_lights, light_set
 from deltalight.render_server.lights.octahedral import above_horizon, irradiance
 from deltalight.render_server.lights.shading_distance import distance_by_shading
 

@@ -16,7 +16,13 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import light_stages
-from deltalight.render_server.methods.lighting import Layers, Shading, ShadingOptions, shading_stages
+from deltalight.render_server.methods.lighting import (
+    Layers,
+    MethodStages,
+    ShadingOptions,
+    SurfaceShading,
+    shading_stages,
+)
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.occlusion_fields import (
@@ -260,7 +266,7 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     options = ShadingOptions(caustics=settings.caustics, screen_space=settings.screen_space)
-    shading = Shading(g.gpu, size, resolved, lit.buffers, DirectLight(g.gpu, size), options)
+    shading = SurfaceShading(g.gpu, size, resolved, lit.buffers, DirectLight(g.gpu, size), options)
     own = FieldShading(g.gpu, settings, resolved.volume_size, shading.cones)
     objects = FieldObjects(g.gpu, setup.fields, field_settings(settings))
     g.section("occlusion fields")
@@ -276,7 +282,7 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
         reflecting = g.stage("object bounce light", own.reflect, changed, scene)
         return g.stage("cones", own.write_fields, changed, reflecting, scene, grid, hidden)
 
-    return shading_stages(g, s, shading, lit, volume, trace, voxels=shown)
+    return shading_stages(g, s, shading, lit, MethodStages(volume, trace, shown))
 
 
 def resolve(settings: AroofMethod, defaults: ResolvedSettings) -> ResolvedSettings:

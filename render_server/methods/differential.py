@@ -20,7 +20,8 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.lights.lights import Light, LightSet
+from deltalight.render_server.lights.light_models import Light
+from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import (
     LitScene,
     object_extent,
@@ -30,8 +31,9 @@ from deltalight.render_server.methods.light_maps import (
 from deltalight.render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
-    Shading,
+    MethodStages,
     ShadingOptions,
+    SurfaceShading,
     shading_stages,
     surfel_scene,
 )
@@ -287,7 +289,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
         is_everywhere=True,
         texel_m=lights.rho.real_texel_m,
     )
-    shading = Shading(g.gpu, size, resolved, lights.rho, direct.pair, options)
+    shading = SurfaceShading(g.gpu, size, resolved, lights.rho, direct.pair, options)
     cones = SolutionCones(g.gpu, settings, voxels, shading.cones)
     marching = g.value("marching", cones.marching, lit_voxels)
 
@@ -297,17 +299,8 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     lit = LitScene(lights.rho, environment, rho_maps, mu_maps)
     volume = g.value("volume", placed_volume, "voxelize real")
     joint = g.value("joint voxels", joint_voxels, lit_voxels)
-    return shading_stages(
-        g,
-        s,
-        shading,
-        lit,
-        volume,
-        trace,
-        voxels=joint,
-        marching=marching,
-        light_directly=direct.light_directly,
-    )
+    own = MethodStages(volume, trace, joint, marching, light_directly=direct.light_directly)
+    return shading_stages(g, s, shading, lit, own)
 
 
 def state_memory(settings: DifferentialMethod, resolved: ResolvedSettings) -> str:

@@ -14,7 +14,13 @@ from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels, dvct_paper
 from deltalight.render_server.methods.light_maps import bounced_later, light_stages
-from deltalight.render_server.methods.lighting import Layers, Shading, ShadingOptions, shading_stages
+from deltalight.render_server.methods.lighting import (
+    Layers,
+    MethodStages,
+    ShadingOptions,
+    SurfaceShading,
+    shading_stages,
+)
 from deltalight.render_server.methods.method import (
     RelightingMethod,
     ResolvedSettings,
@@ -124,7 +130,7 @@ class UnchangedCones:
         release_all(*(self._made or ()))
 
 
-def _shading(gpu: GpuContext, setup: Setup[DvctMethod], lights: LightBuffers) -> Shading:
+def _shading(gpu: GpuContext, setup: Setup[DvctMethod], lights: LightBuffers) -> SurfaceShading:
     settings, size = setup.settings, setup.picture_size
     shadow_cones = DIRECTIONS if settings.resolved_shadow == "cone" else None
     direct = DirectLight(
@@ -141,7 +147,7 @@ def _shading(gpu: GpuContext, setup: Setup[DvctMethod], lights: LightBuffers) ->
         mirror_gather="gather" if settings.reflections == "rays" else None,
         march=march_defines(settings),
     )
-    return Shading(gpu, size, setup.resolved, lights, direct, options)
+    return SurfaceShading(gpu, size, setup.resolved, lights, direct, options)
 
 
 def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
@@ -167,18 +173,9 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     distant: Callable[..., moderngl.Texture] | None = None
     if settings.tier.distant_light:
         distant = DistantChange(g.gpu, shading.grid.size, march_defines(settings)).trace
-    layers = shading_stages(
-        g,
-        s,
-        shading,
-        lit,
-        volume,
-        trace,
-        voxels=rho,
-        marching=marching,
-        find_distant=distant,
-        refract=cones.refract if settings.tier.glass_rays else None,
-    )
+    refract = cones.refract if settings.tier.glass_rays else None
+    own = MethodStages(volume, trace, rho, marching, find_distant=distant, refract=refract)
+    layers = shading_stages(g, s, shading, lit, own)
     unchanged = UnchangedCones(g.gpu, settings, voxels, shading.cones.mu.size)
     return replace(layers, cones_mu=g.stage("cones mu", unchanged.trace, "shading scene", layers.grid, mu))
 

@@ -16,13 +16,14 @@ from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages
 from deltalight.render_server.methods.lighting import (
     Layers,
-    Shading,
+    MethodStages,
     ShadingOptions,
+    SurfaceShading,
     shading_stages,
     surfel_scene,
 )
 from deltalight.render_server.methods.method import Setup
-from deltalight.render_server.methods.per_volume import PerVolume, Several
+from deltalight.render_server.methods.per_volume import PerVolume, VolumePool
 from deltalight.render_server.methods.volume_lights import VolumeLights, volume_light_stages
 from deltalight.render_server.methods.volume_placement import Placements
 from deltalight.render_server.methods.voxel_sets import VoxelSet, make_room, voxel_placements
@@ -53,7 +54,7 @@ class InjectedVoxels:
     def __init__(self, gpu: GpuContext, size: int) -> None:
         self.delta, self.rho = (VoxelMipmap(gpu, size, self.directions) for _ in range(2))
         self.real, self.objects = (VoxelSet(gpu, size, [self.delta, self.rho]) for _ in range(2))
-        self._albedo = Several(lambda: RealAlbedo(gpu))
+        self._albedo = VolumePool(lambda: RealAlbedo(gpu))
         self._inject = SplitInjection(gpu)
         self._resolve = ResolveInjection(gpu)
         self._filter = FilterIsotropic(gpu)
@@ -85,7 +86,7 @@ class InjectedVoxels:
     ) -> PerVolume[RealAlbedo]:
         """Computes the real scene's albedo as seen from the lights."""
         seen.image.build_levels()
-        found = self._albedo.of(len(lights))
+        found = self._albedo.resized(len(lights))
         for volume, (each, own) in enumerate(zip(found, lights, strict=True)):
             each.run(own, {**surfel_scene(seen, own, albedo), **placed.volume.bindings}, volume)
         return PerVolume(found)
@@ -215,7 +216,7 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     shadow_cones = voxels.directions if settings.resolved_shadow == "cone" else None
     tier = settings.tier
     direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones, reuses=tier.refresh_tiles > 0)
-    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions(tier))
+    shading = SurfaceShading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions(tier))
     cones = PaperCones(g.gpu, shading.cones, resolved.volume_size)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
@@ -224,5 +225,5 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
 
     volume = g.value("volume", placed_volume, "voxelize real")
     joint = g.value("joint voxels", joint_voxels, injected)
-    layers = shading_stages(g, s, shading, lit, volume, trace, voxels=joint)
+    layers = shading_stages(g, s, shading, lit, MethodStages(volume, trace, joint))
     return replace(layers, error=g.resource("delta error"))

@@ -15,7 +15,8 @@ from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.lights.lights import Light, LightSet
+from deltalight.render_server.lights.light_models import Light
+from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.mirror_lights import mirror_lights
 from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.methods.object_groups import points_of_groups

@@ -133,7 +133,7 @@ class Layers:
     transmit: Callable[[Resource[moderngl.Texture]], Resource[moderngl.Texture]] | None = None
 
 
-class Shading:
+class SurfaceShading:
     """Shades the visible surfaces: cones at reduced resolution, direct light and objects at full resolution.
 
     The method's own stages fill `cones`. Arguments `marching` are the bindings that its cones march with.
@@ -384,28 +384,36 @@ class RayInputs(NamedTuple):
     marching: Resource[dict[str, Binding]]
 
 
-def shading_stages(
-    g: Graph,
-    s: FrameResources,
-    shading: Shading,
-    lit: LitScene,
-    volume: Resource[PlacedVolume],
-    trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]],
-    *,
-    voxels: Resource[VoxelMipmap] | None = None,
-    marching: Resource[dict[str, Binding]] | None = None,
-    light_directly: Callable[..., DirectLight] | None = None,
-    find_distant: Callable[..., moderngl.Texture] | None = None,
-    refract: Callable[..., ConeFields] | None = None,
-) -> Layers:
-    """Declares grid, cones (by `trace`), caustics, direct light, reflections, change of light, and objects.
+@dataclass(frozen=True, eq=False)
+class MethodStages:
+    """What a method brings to the shared shading.
 
-    `voxels`: those of the `volume`, if the method has any; `marching`: bindings of what rays march through, if they
-    do. `light_directly` replaces that of `shading`. `find_distant` finds the change of light beyond the volumes,
-    `refract` what transparent objects change of the cones' light.
+    Attributes:
+        volume: where its light is stored.
+        trace: declares the stages that fill the cones, given the shading scene and the grid.
+        voxels: those of the `volume`; None if it has none.
+        marching: bindings of what rays march through; None if they march through nothing.
+        light_directly: computes the direct light; None: `SurfaceShading` does.
+        find_distant: finds the change of light beyond the volume.
+        refract: changes the cones' light where it passes through transparent objects.
     """
-    shown: Resource[Any] = voxels or g.value("voxels", no_voxels, volume)
-    marching = marching or g.value("marching", no_bindings, volume)
+
+    volume: Resource[PlacedVolume]
+    trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]]
+    voxels: Resource[VoxelMipmap] | None = None
+    marching: Resource[dict[str, Binding]] | None = None
+    light_directly: Callable[..., DirectLight] | None = None
+    find_distant: Callable[..., moderngl.Texture] | None = None
+    refract: Callable[..., ConeFields] | None = None
+
+
+def shading_stages(
+    g: Graph, s: FrameResources, shading: SurfaceShading, lit: LitScene, own: MethodStages
+) -> Layers:
+    """Declares grid, cones, caustics, direct light, reflections, change of light, and objects."""
+    volume = own.volume
+    voxels: Resource[Any] = own.voxels or g.value("voxels", no_voxels, volume)
+    marching = own.marching or g.value("marching", no_bindings, volume)
     g.section("shading")
     scene = plain = g.value(
         "shading scene", shading.scene, s.geometry, s.objects, s.view, volume, s.lit_area, *lit.all, s.lights
@@ -416,33 +424,35 @@ def shading_stages(
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     kept: list[Resource[Any]] = []
     if shading.reuses_light:
-        states = _light_states(g, s, lit, volume, shown, marching, beams)
+        state = _light_state(g, s, lit, volume, voxels, marching, beams)
         outputs = "reusing scene", "kept light"
         scene, *kept = g.stages(
-            "light reuse", shading.reuse_light, scene, grid, states, s.view, outputs=outputs
+            "light reuse", shading.reuse_light, scene, grid, state, s.view, outputs=outputs
         )
-    direct_mu = None if light_directly else g.stage("direct light mu", shading.light_unchanged, plain, grid)
-    cones = trace(scene, grid)
+    direct_mu = None
+    if own.light_directly is None:
+        direct_mu = g.stage("direct light mu", shading.light_unchanged, plain, grid)
+    cones = own.trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
-    light = light_directly or shading.light_directly
-    direct = g.stage("direct light", light, scene, grid, caustics, shown, bvh, *kept)
-    if refract is not None:
+    light = own.light_directly or shading.light_directly
+    direct = g.stage("direct light", light, scene, grid, caustics, voxels, bvh, *kept)
+    if own.refract is not None:
         traced = s.objects, scene, grid, direct, bvh, s.observation, marching
-        cones = g.stage("refracted cones", refract, cones, *traced)
+        cones = g.stage("refracted cones", own.refract, cones, *traced)
     rays = RayInputs(s.objects, scene, direct, cones, bvh, s.observation, marching)
-    reflection, change = _change_stages(g, shading, grid, rays, find_distant)
+    reflection, change = _change_stages(g, shading, grid, rays, own.find_distant)
     radiance = _surface_stages(g, shading, grid, caustics, rays)
 
-    def transmit(own: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
-        return g.stage("transmitted light", shading.add_transmitted, own, *rays)
+    def transmit(opaque: Resource[moderngl.Texture]) -> Resource[moderngl.Texture]:
+        return g.stage("transmitted light", shading.add_transmitted, opaque, *rays)
 
-    layers = Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
+    layers = Layers(direct, cones, grid, change, radiance, reflection, voxels, volume, lit.real_maps)
     return replace(layers, direct_mu=direct_mu, transmit=transmit)
 
 
 def _change_stages(
     g: Graph,
-    shading: Shading,
+    shading: SurfaceShading,
     grid: Resource[LowResGrid],
     rays: RayInputs,
     find_distant: Callable[..., moderngl.Texture] | None,
@@ -458,7 +468,7 @@ def _change_stages(
 
 def _surface_stages(
     g: Graph,
-    shading: Shading,
+    shading: SurfaceShading,
     grid: Resource[LowResGrid],
     caustics: Resource[Caustics | None],
     rays: RayInputs,
@@ -470,9 +480,7 @@ def _surface_stages(
     return g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
 
 
-def _light_states(
-    g: Graph, s: FrameResources, lit: LitScene, *bounces: Resource[Any]
-) -> Resource[LightState]:
+def _light_state(g: Graph, s: FrameResources, lit: LitScene, *bounces: Resource[Any]) -> Resource[LightState]:
     """Declares what light at real surfaces depends on besides the camera: a new value whenever any of it changes."""
     shared: tuple[Resource[Any], ...] = (s.surfaces, s.lit_area, s.lights, lit.environment)
     unblocked = g.value("unblocked light state", _new_object, *shared, lit.real_maps, *lit.mirrored)

@@ -18,14 +18,15 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages, object_extent
 from deltalight.render_server.methods.lighting import (
     Layers,
-    Shading,
+    MethodStages,
     ShadingOptions,
+    SurfaceShading,
     shading_stages,
 )
 from deltalight.render_server.methods.lpv_cells import cell_stages, release_held
 from deltalight.render_server.methods.lpv_memory import PrintedSizes, affordable_count, state_memory
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
-from deltalight.render_server.methods.per_volume import OfEach, PerVolume, several
+from deltalight.render_server.methods.per_volume import ForEachVolume, PerVolume, volume_pool
 from deltalight.render_server.methods.volume_placement import SizeOf, outside_fractions, volume_placements
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
@@ -306,15 +307,15 @@ def difference_stages(
 ) -> LitCells:
     """V_mu is subtracted from V_rho."""
     size = settings.volume_size
-    each = several(g, "volumes", partial(DifferenceVolumes, g.gpu, settings, size))
-    propagate_mu = OfEach(each, DifferenceVolumes.propagate_mu)
-    propagate_rho = OfEach(each, DifferenceVolumes.propagate_rho)
+    pool = volume_pool(g, "volumes", partial(DifferenceVolumes, g.gpu, settings, size))
+    propagate_mu = ForEachVolume(pool, DifferenceVolumes.propagate_mu)
+    propagate_rho = ForEachVolume(pool, DifferenceVolumes.propagate_rho)
     mu = g.stage("propagate mu", propagate_mu, "inject real", "geometry volume real")
     c = cell_stages(g, s, lit, settings, cubes, size)
     first = g.stage("propagate rho", propagate_rho, c.real_light, c.change, c.through)
     surfels = g.value("surfels", both_surfels, c.real, c.objects)
     names = "bounces", "reflected light"
-    bounce = OfEach(each, DifferenceVolumes.bounce, outputs=len(names))
+    bounce = ForEachVolume(pool, DifferenceVolumes.bounce, outputs=len(names))
     bounced = first, mu, surfels, c.real_light, c.change, c.joint, c.through
     rho, reflected = g.stages("bounces", bounce, *bounced, outputs=names)
     sources = exchanged(g, s, cubes, c.change, c.covered, reflected)
@@ -346,24 +347,27 @@ def printed_stages(
 ) -> LitCells:
     """The change alone is propagated, direct light after and apart from the indirect one ([P2] 4.3)."""
     sizes = PrintedSizes.of(settings)
-    each = several(g, "volumes", partial(PrintedVolumes, g.gpu, settings, sizes))
+    pool = volume_pool(g, "volumes", partial(PrintedVolumes, g.gpu, settings, sizes))
     stages = {n: cell_stages(g, s, lit, settings, cubes, n) for n in sizes.counts}
     own, indirect, direct = stages[sizes.objects], stages[sizes.indirect], stages[sizes.direct]
     rho = g.stage(
         "propagate rho",
-        OfEach(each, PrintedVolumes.propagate_rho),
+        ForEachVolume(pool, PrintedVolumes.propagate_rho),
         own.real_light,
         own.change,
         own.through,
     )
     delta = g.stage(
-        "propagate delta", OfEach(each, PrintedVolumes.propagate_delta), indirect.change, indirect.through
+        "propagate delta",
+        ForEachVolume(pool, PrintedVolumes.propagate_delta),
+        indirect.change,
+        indirect.through,
     )
     injected = g.stage(
-        "inject direct", OfEach(each, PrintedVolumes.inject_direct), direct.joint, lit.object_maps
+        "inject direct", ForEachVolume(pool, PrintedVolumes.inject_direct), direct.joint, lit.object_maps
     )
     after = g.stage(
-        "propagate direct", OfEach(each, PrintedVolumes.propagate_direct), injected, direct.through
+        "propagate direct", ForEachVolume(pool, PrintedVolumes.propagate_direct), injected, direct.through
     )
     sources = exchanged(g, s, cubes, indirect.change, indirect.covered)
     all_rho, all_delta = joined(g, "light rho", rho), joined(g, "light delta", delta)
@@ -403,14 +407,14 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     )
     reuses = settings.tier.refresh_tiles > 0
     direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map", reuses=reuses)
-    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
+    shading = SurfaceShading(g.gpu, size, resolved, lit.buffers, direct, options)
     fields = LpvFields(g.gpu, settings, shading.cones)
     marching = g.value("marching", fields.marching, cells.rho, cells.rho_volume, cells.sources)
 
     def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         return cells.read(fields, scene, grid)
 
-    return shading_stages(g, s, shading, lit, cells.volume, read, voxels=cells.shown, marching=marching)
+    return shading_stages(g, s, shading, lit, MethodStages(cells.volume, read, cells.shown, marching))
 
 
 def resolve(settings: DlpvMethod, defaults: ResolvedSettings) -> ResolvedSettings:

@@ -17,7 +17,7 @@ from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.cast_beams import casts_caustics
 from deltalight.render_server.methods.light_maps import LitScene
 from deltalight.render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, surfel_scene
-from deltalight.render_server.methods.per_volume import OfEach, PerVolume, several
+from deltalight.render_server.methods.per_volume import ForEachVolume, PerVolume, volume_pool
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import (
     LpvCoverFaces,
@@ -193,21 +193,25 @@ def cell_stages(
 ) -> CellStages:
     """Declares placement, injection and blocking of `size`^3 cells that fill each of the `cubes`."""
     suffix = "" if size == settings.volume_size else f" {size}"
-    each = several(g, f"cells{suffix}", partial(LpvCells, g.gpu, settings, size))
-    volume = g.value(f"cells{suffix}", OfEach(each, LpvCells.place), cubes)
-    real = g.stage(f"voxelize real{suffix}", OfEach(each, LpvCells.voxelize_real), s.real, volume)
+    pool = volume_pool(g, f"cells{suffix}", partial(LpvCells, g.gpu, settings, size))
+    volume = g.value(f"cells{suffix}", ForEachVolume(pool, LpvCells.place), cubes)
+    real = g.stage(f"voxelize real{suffix}", ForEachVolume(pool, LpvCells.voxelize_real), s.real, volume)
     inputs = (s.measured, s.albedo, volume, s.lights, lit.environment, lit.real_maps)
-    scene = g.value(f"inject scene{suffix}", OfEach(each, LpvCells.real_scene), *inputs)
-    inject_real = OfEach(each, LpvCells.inject_real)
+    scene = g.value(f"inject scene{suffix}", ForEachVolume(pool, LpvCells.real_scene), *inputs)
+    inject_real = ForEachVolume(pool, LpvCells.inject_real)
     real_light = g.stage(f"inject real{suffix}", inject_real, real, scene, lit.real_maps)
-    through_real = g.stage(f"geometry volume real{suffix}", OfEach(each, LpvCells.cover_real), real, volume)
-    objects = g.stage(f"voxelize objects{suffix}", OfEach(each, LpvCells.voxelize_objects), s.objects, volume)
-    joint_scene = OfEach(each, LpvCells.joint_scene)
+    through_real = g.stage(
+        f"geometry volume real{suffix}", ForEachVolume(pool, LpvCells.cover_real), real, volume
+    )
+    objects = g.stage(
+        f"voxelize objects{suffix}", ForEachVolume(pool, LpvCells.voxelize_objects), s.objects, volume
+    )
+    joint_scene = ForEachVolume(pool, LpvCells.joint_scene)
     joint = g.value(f"inject scene joint{suffix}", joint_scene, scene, s.objects, lit.object_maps)
     changed = (objects, joint, lit.object_maps, real_light)
-    change = g.stage(f"inject change{suffix}", OfEach(each, LpvCells.inject_change), *changed)
+    change = g.stage(f"inject change{suffix}", ForEachVolume(pool, LpvCells.inject_change), *changed)
     blocking = (objects, s.objects, volume, through_real)
     names = f"geometry volume{suffix}", f"covered by objects{suffix}"
-    cover = OfEach(each, LpvCells.cover_joint, outputs=len(names))
+    cover = ForEachVolume(pool, LpvCells.cover_joint, outputs=len(names))
     through, covered = g.stages(names[0], cover, *blocking, outputs=names)
     return CellStages(real, objects, joint, real_light, change, through, covered)

@@ -1,4 +1,4 @@
-"""Stages that run for each of several volumes, one after the other."""
+"""Stages that run once for each of a scene's volumes, one after the other."""
 
 from collections.abc import Callable
 from functools import update_wrapper
@@ -17,56 +17,59 @@ class PerVolume(tuple[T, ...]):
     __slots__ = ()
 
 
-class Several(Generic[Item]):
-    """As many items as there are volumes: made when more are wanted, freed when fewer are."""
+class VolumePool(Generic[Item]):
+    """An item for each volume, such as its buffers: made when volumes are added, freed when they are removed."""
 
     def __init__(self, make: Callable[[], Item]) -> None:
-        self._make, self._made = make, [make()]
+        self._make, self._items = make, [make()]
 
-    def of(self, count: int) -> list[Item]:
+    def resized(self, count: int) -> list[Item]:
         """Returns `count` items."""
-        self._made += [self._make() for _ in range(count - len(self._made))]
-        release_all(*self._made[count:])
-        del self._made[count:]
-        return self._made
+        self._items += [self._make() for _ in range(count - len(self._items))]
+        release_all(*self._items[count:])
+        del self._items[count:]
+        return self._items
 
     def release(self) -> None:
-        """Frees them all."""
-        release_all(*self._made)
+        """Frees all items."""
+        release_all(*self._items)
 
 
-class OfEach(Generic[Item, T]):
-    """A stage that calls a method of each item. Of inputs for each volume, everyone gets its own.
+class ForEachVolume(Generic[Item, T]):
+    """A stage's function that calls a method of every item in a pool.
 
-    Of a method that returns several `outputs`, it returns each for all volumes.
+    Each item gets its own volume's value of inputs that are `PerVolume`, and all other inputs as they are. A method
+    with several `outputs` returns them as a tuple; the stage then returns a `PerVolume` for each output.
     """
 
-    def __init__(self, items: Several[Item], method: Callable[..., T], *, outputs: int = 1) -> None:
-        self._items, self._method, self._outputs = items, method, outputs
-        update_wrapper(self, method)  # reports of the graph tell what it does
+    def __init__(self, pool: VolumePool[Item], method: Callable[..., T], *, outputs: int = 1) -> None:
+        self._pool, self._method, self._outputs = pool, method, outputs
+        update_wrapper(self, method)  # reports of the graph quote the method's docstring
 
     def __call__(self, *inputs: Any) -> PerVolume[T] | tuple[PerVolume[Any], ...]:  # noqa: ANN401 (a stage's)
         """Returns what the method returns for each volume."""
-        count = next(len(each) for each in inputs if isinstance(each, PerVolume))
-        found = [
-            self._method(item, *(each[index] if isinstance(each, PerVolume) else each for each in inputs))
-            for index, item in enumerate(self._items.of(count))
+        count = next(len(value) for value in inputs if isinstance(value, PerVolume))
+        results = [
+            self._method(item, *(value[index] if isinstance(value, PerVolume) else value for value in inputs))
+            for index, item in enumerate(self._pool.resized(count))
         ]
         if self._outputs == 1:
-            return PerVolume(found)
-        return tuple(PerVolume(each) for each in zip(*cast(Any, found), strict=True))
+            return PerVolume(results)
+        return tuple(PerVolume(output) for output in zip(*cast(Any, results), strict=True))
 
     def __eq__(self, other: object) -> bool:
-        """Whether both do the same: views share such stages."""
-        return isinstance(other, OfEach) and self._items is other._items and self._method == other._method
+        """Whether both call the same method of the same pool: views share such stages."""
+        return (
+            isinstance(other, ForEachVolume) and self._pool is other._pool and self._method == other._method
+        )
 
     def __hash__(self) -> int:
-        """Returns a hash of what both are told apart by."""
-        return hash((id(self._items), self._method))
+        """Returns a hash of the pool and the method."""
+        return hash((id(self._pool), self._method))
 
 
-def several(g: Graph, name: str, make: Callable[[], Item]) -> Several[Item]:
-    """Returns what the graph's volumes share, which it frees with itself."""
-    made = g.shared(name, lambda: Several(make))
-    g.own(made)
-    return made
+def volume_pool(g: Graph, name: str, make: Callable[[], Item]) -> VolumePool[Item]:
+    """Returns the pool of this name, which all views of the graph share and which the graph frees."""
+    pool = g.shared(name, lambda: VolumePool(make))
+    g.own(pool)
+    return pool

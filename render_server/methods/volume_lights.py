@@ -11,7 +11,8 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.lights.lights import DirectionalLight, Light, LightSet
+from deltalight.render_server.lights.light_models import DirectionalLight, Light
+from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import (
     LightStages,
     LitScene,

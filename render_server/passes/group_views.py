@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.render_server.lights.lights import Light
+from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.passes.shadow_maps import LightView, light_views
 
 MOST_GROUP_VIEWS = 8  # of all lights together: each is a map, and maps take memory

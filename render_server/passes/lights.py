@@ -13,7 +13,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
-from deltalight.render_server.lights.lights import DirectionalLight, Light, RectangleLight
+from deltalight.render_server.lights.light_models import DirectionalLight, Light, RectangleLight
 from deltalight.render_server.lights.mirror_lights import MirrorLight
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.passes.group_views import views_of_groups

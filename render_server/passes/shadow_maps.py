@@ -15,7 +15,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
-from deltalight.render_server.lights.lights import DirectionalLight, Lamp, Light
+from deltalight.render_server.lights.light_models import DirectionalLight, Lamp, Light
 from deltalight.render_server.lights.mirror_lights import MirrorLight
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.passes.volumes import MOST_VOLUMES

@@ -1,8 +1,8 @@
 """Bloom: light that the lens scatters around bright things ([P1] 4.2), of what relighting changes alone.
 
-The camera's picture has the bloom of the real room already. So only the change of radiance is scattered: a share of
-it leaves its place and arrives around it, negative where an object hides a lamp. What arrives is what left. What an
-object hides is taken as it is around there: the object itself gets the bloom of the room, and no trace of what is
+The camera's picture already has the bloom of the real room, so only the change of radiance is scattered: a fraction
+of it leaves its pixel and arrives around it, negative where an object hides a lamp. The sum stays the same. What an
+object hides is assumed to be like its surroundings: the object gets the bloom of the room, and no trace of what is
 behind it.
 """
 
@@ -41,14 +41,14 @@ def bloomed(
     linear: Float32[np.ndarray, "h w 3"],
     coverage: Float32[np.ndarray, "h w"],
     frame: ViewFrame,
-    share: float,
+    fraction: float,
     *,
     tone: Tone = "camera",
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Returns a relit picture with bloom of its change; where none arrives it is the same to the bit.
 
-    `linear` is the picture in camera units, beyond white where objects are, `coverage` what they cover; `share`
-    0..1 is the part of the light that is scattered. `tone` is the curve that `color` was made with.
+    `linear` is the picture in camera units, beyond white where objects are, `coverage` what they cover; `fraction`
+    (0..1) of the light is scattered. `tone` is the curve that `color` was made with.
     """
     camera = linear_color(frame, frame.color)
     differs = color != frame.color if tone == "camera" else np.abs(linear - camera) > ROUNDING * camera
@@ -60,6 +60,6 @@ def bloomed(
     around = scattered(camera) / scattered(np.ones_like(camera))
     change = np.where(changed, linear - camera + hidden * (camera - around), 0).astype(np.float32)
     before = np.where(changed, linear * scale, lut[color, np.arange(3)])
-    after = before + share * scale * (scattered(change) - change)
+    after = before + fraction * scale * (scattered(change) - change)
     codes = [np.interp(after[..., c], lut[:, c], np.arange(256)) for c in range(3)]
     return np.asarray(np.rint(np.stack(codes, axis=-1)), np.uint8)

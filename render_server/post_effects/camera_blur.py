@@ -22,8 +22,8 @@ PIXEL_VARIANCE = 1 / 12
 LEAST_EDGES = 8
 NO_MOTION = np.zeros(2)
 NARROW_PX = np.linspace(0.01, 1.0, 100)
-SOLID, LEAST_SHARE = 0.99, 1 / 512
-TINY_SHARE = 1e-6
+SOLID, LEAST_COVERAGE = 0.99, 1 / 512
+TINY_COVERAGE = 1e-6
 LEAST_MOTION_PX, LEAST_SHIFT_PX = 0.25, 0.05
 SIGNIFICANT = 3.0
 """Standard errors by which red or blue must differ in size from green."""
@@ -89,11 +89,12 @@ def blur_kernels(
     sigma = _kernel_sigma(lacks)
     radius = int(np.ceil(3 * sigma + length / 2 + apart + 1))
     steps = 8 * int(np.ceil(length)) + 1
-    share = (np.arange(steps) + 0.5) / steps - 0.5
+    moments = (np.arange(steps) + 0.5) / steps - 0.5
     kernels = []
     for shift in shifts:
         columns, rows = (
-            _integrals(share * moved + at, sigma, radius) for moved, at in zip(motion_px, shift, strict=True)
+            _integrals(moments * moved + at, sigma, radius)
+            for moved, at in zip(motion_px, shift, strict=True)
         )  # a row for each moment of the exposure
         kernels.append(np.einsum("tr,tc->rc", rows, columns))
     return np.asarray([kernel / kernel.sum() for kernel in kernels])
@@ -159,16 +160,16 @@ def blurred_in_parts(
     codes, cover = color[box], np.clip(coverage[box], 0, 1)
     lut = decode_lut(response)
     linear = lut[codes, np.arange(3)].astype(np.float32)
-    share, own, behind = _together(
+    covering, own, behind = _merged(
         [_blurred_part(linear, cover, kernels, weight[box]) for kernels, weight in parts],
         [_by_channel(cover[..., None], kernels) for kernels, _ in parts if len(parts) > 1],
     )
-    mixed = own + (1 - share) * behind
+    mixed = own + (1 - covering) * behind
     coded = [np.rint(np.interp(mixed[..., c], lut[:, c], np.arange(256))) for c in range(3)]
-    touched = (share.max(axis=-1) > LEAST_SHARE) | (cover > 0)
+    touched = (covering.max(axis=-1) > LEAST_COVERAGE) | (cover > 0)
     result, covered = color.copy(), coverage.copy()
     result[box] = np.where(touched[..., None], np.stack(coded, axis=-1), codes).astype(np.uint8)
-    covered[box] = np.where(touched, share[..., 1], 0)
+    covered[box] = np.where(touched, covering[..., 1], 0)
     return result, covered
 
 
@@ -184,20 +185,20 @@ def _blurred_part(
     return _by_channel(part, kernels), _by_channel(part * objects, kernels), behind
 
 
-def _together(
+def _merged(
     parts: Sequence[tuple[Layer, Layer, Layer]], wholes: Sequence[Layer]
 ) -> tuple[Layer, Layer, Layer]:
-    """Returns the same of all parts; `wholes`: how much all objects cover in the blur of each part, if more do.
+    """Merges parts that were blurred differently; `wholes`: the coverage of all objects in the blur of each part.
 
-    Where parts meet, their shares do not sum to 1, although nothing shows between them. So light is mixed by shares,
-    and what is covered is the blurred whole, by the blurs of the parts there.
+    Where parts meet, their coverages do not sum to 1, although nothing shows between them. So light is averaged with
+    the coverages as weights, and so is the coverage of all objects.
     """
     if len(parts) == 1:
         return parts[0]
-    total = np.maximum(sum(share for share, _, _ in parts), TINY_SHARE)
-    whole = sum(share * each for (share, _, _), each in zip(parts, wholes, strict=True)) / total
+    total = np.maximum(sum(cover for cover, _, _ in parts), TINY_COVERAGE)
+    whole = sum(cover * each for (cover, _, _), each in zip(parts, wholes, strict=True)) / total
     own = sum(own for _, own, _ in parts) * whole / total
-    return whole, np.asarray(own), np.asarray(sum(share * behind for share, _, behind in parts) / total)
+    return whole, np.asarray(own), np.asarray(sum(cover * behind for cover, _, behind in parts) / total)
 
 
 def _by_channel(picture: Float32[np.ndarray, "h w c"], kernels: Float64[np.ndarray, "3 k k"]) -> Layer:
@@ -219,6 +220,6 @@ def continued(
     """Returns a picture where `known`, and elsewhere the mean of what is known nearby; far from that, as it is."""
     weight = known.astype(np.float32)
     size = (2 * (width // 2) + 1,) * 2
-    share = cv2.GaussianBlur(weight, size, 0)[..., None]
-    mean = cv2.GaussianBlur(picture * weight[..., None], size, 0) / np.maximum(share, 1e-6)
-    return np.where(known[..., None] | (share < 1e-4), picture, mean).astype(np.float32)
+    total = cv2.GaussianBlur(weight, size, 0)[..., None]
+    mean = cv2.GaussianBlur(picture * weight[..., None], size, 0) / np.maximum(total, 1e-6)
+    return np.where(known[..., None] | (total < 1e-4), picture, mean).astype(np.float32)

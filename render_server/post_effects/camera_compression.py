@@ -69,9 +69,9 @@ def find_compression(color: Color) -> Compression | None:
         [_change(luma, uneven, each) for each in range(QUALITIES[0], QUALITIES[-1] + FINER + 1)]
     )
     finer = np.min([change[step : step + len(QUALITIES)] for step in range(1, FINER + 1)], axis=0)
-    share = (change[: len(QUALITIES)] + ROUNDED) / (finer + ROUNDED)
-    best = int(share.argmin())
-    if share[best] > MOST_RESIDUAL:
+    ratio = (change[: len(QUALITIES)] + ROUNDED) / (finer + ROUNDED)
+    best = int(ratio.argmin())
+    if ratio[best] > MOST_RESIDUAL:
         return None
     best -= int(change[max(best - FINER, 0) : best + 1][::-1].argmin())  # coarse tables hardly differ
     chroma = cv2.cvtColor(part.astype(np.float32), cv2.COLOR_RGB2YCrCb)[..., 1:]

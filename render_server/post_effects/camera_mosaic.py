@@ -25,7 +25,7 @@ COLORED = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
 GREEN = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
 KERNELS = (COLORED, GREEN, COLORED)
 NOISE_KEPT = np.array([9, 10, 9]) / 16
-"""Share of independent noise's variance that interpolation leaves, R G B: the mean of the phases' sums of squares."""
+"""Fraction of independent noise's variance left by interpolation, R G B: the mean of the phases' sums of squares."""
 GREEN_VARIANCE = 1 / 4
 """Of green's blur by interpolation, along rows and along columns, px^2: 1/2 in half of the pixels, none in others."""
 EXAMINED_PX = 256
@@ -75,9 +75,9 @@ def find_mosaic(color: Color, response: Float32[np.ndarray, "256 3"] | None) -> 
     telling = following >= LEAST_CHANGE
     if np.count_nonzero(telling) < LEAST_BLOCKS:
         return None
-    share = np.log((changes[best] + ROUNDED) / (following + ROUNDED))[telling]
-    error = share.std(ddof=1) / np.sqrt(len(share))
-    is_sure = share.mean() < min(np.log(MOST_RESIDUAL), -SIGNIFICANT * error)
+    log_ratio = np.log((changes[best] + ROUNDED) / (following + ROUNDED))[telling]
+    error = log_ratio.std(ddof=1) / np.sqrt(len(log_ratio))
+    is_sure = log_ratio.mean() < min(np.log(MOST_RESIDUAL), -SIGNIFICANT * error)
     return MOSAICS[best] if is_sure else None
 
 

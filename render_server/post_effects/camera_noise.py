@@ -24,11 +24,11 @@ BLOCK_PX = 16
 STILL_SIGMAS = 4.0
 """A block has moved if its mean changed by more, in standard errors."""
 MOST_SHIFTED = 0.1
-"""A block has moved if a shift of the picture explains more of its change than this, as a share."""
+"""A block has moved if a shift of the picture explains more than this fraction of its change."""
 LEAST_STILL = 0.5
-"""Share of the blocks that must not have moved."""
-UNSEEN_SHIFT_PX, UNSEEN_SHARE = 0.2, 0.05
-"""A shift that small may go unseen: pixels whose variance it would raise by more than that share are too steep."""
+"""Fraction of the blocks that must not have moved."""
+UNSEEN_SHIFT_PX, UNSEEN_FRACTION = 0.2, 0.05
+"""A shift that small may go unseen: pixels whose variance it would raise by more than that fraction are too steep."""
 MOST_PAIRS = 16
 GAUSSIAN = 1.4826
 """Standard deviation over median absolute deviation."""
@@ -66,7 +66,7 @@ class NoiseModel:
         return np.stack(curves, axis=-1)
 
     def before_filter(self, kept: Float64[np.ndarray, " 3"]) -> "NoiseModel":
-        """Returns the independent noise that becomes this in a filter that keeps such shares of variance, R G B."""
+        """Returns the independent noise that a filter keeping these fractions of variance, R G B, turns into this."""
         return NoiseModel(self.variances / kept, (0.0, 0.0))
 
 
@@ -124,7 +124,7 @@ class _Change:
         """The pixels that a shift too small to be seen would hardly change."""
         columns, rows = (cv2.GaussianBlur(each, (0, 0), 1.0) for each in self.gradients)
         by_shift = UNSEEN_SHIFT_PX**2 * (columns**2 + rows**2)
-        return np.asarray((by_shift <= UNSEEN_SHARE * self.variance) | (self.variance == 0))
+        return np.asarray((by_shift <= UNSEEN_FRACTION * self.variance) | (self.variance == 0))
 
     @property
     def _shifted(self) -> Plane:
@@ -225,7 +225,7 @@ def add_noise(
 ) -> Color:
     """Returns a picture with noise where virtual objects cover it; other pixels are the same to the bit.
 
-    The real part of an edge's pixel has its own share of noise; what is added completes its variance. Equal frame ids
+    The real part of an edge's pixel has noise already; what is added completes its variance. Equal frame ids
     give equal noise.
     """
     rows, columns = np.nonzero(coverage > 0)

@@ -69,13 +69,13 @@ class CameraSharpening:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Least squares of one edge: its power, what it shares with the halo of an unsharp mask, and that one's power.
+    """Least squares of one edge: its power, its correlation with the halo of an unsharp mask, and the halo's power.
 
     All without what a soft step, its shift, and slopes on both sides explain; for all VARIANCES and RADII_PX.
     """
 
     power: Table
-    shared: Table
+    correlation: Table
     halo: Table
 
 
@@ -84,24 +84,24 @@ def _best(fits: Sequence[_Fit]) -> Sharpening | None:
 
     None if there are few edges, or if the amount is within its error or hardly overshoots.
     """
-    powers, shares, halos = (
-        np.stack([getattr(fit, name) for fit in fits]) for name in ("power", "shared", "halo")
+    powers, correlations, halos = (
+        np.stack([getattr(fit, name) for fit in fits]) for name in ("power", "correlation", "halo")
     )
     least = powers[..., 0].min(axis=1)
     kept = least <= OUTLIER_POWER * np.median(least)
     kept &= powers[..., 0].argmin(axis=1) < len(VARIANCES) - 1
     if kept.sum() < LEAST_EDGES:
         return None
-    powers, shares, halos = powers[kept], shares[kept], halos[kept]
-    misfits = [powers - amount * (2 * shares - amount * halos) for amount in AMOUNTS]
+    powers, correlations, halos = powers[kept], correlations[kept], halos[kept]
+    misfits = [powers - amount * (2 * correlations - amount * halos) for amount in AMOUNTS]
     sums = np.array([each.min(axis=1).sum(axis=0) for each in misfits])
     explained = sums[0] - sums.min(axis=0)
     column = int(explained[:MASKS].argmax())
     step = int(sums[:, column].argmin())
     blurs = misfits[step][..., column].argmin(axis=1)
-    shared, halo = (each[np.arange(len(blurs)), blurs, column] for each in (shares, halos))
-    amount = float(shared.sum() / halo.sum())
-    error = np.sqrt(((shared - amount * halo) ** 2).sum()) / halo.sum()
+    correlation, halo = (each[np.arange(len(blurs)), blurs, column] for each in (correlations, halos))
+    amount = float(correlation.sum() / halo.sum())
+    error = np.sqrt(((correlation - amount * halo) ** 2).sum()) / halo.sum()
     sharp, middle = np.quantile(VARIANCES[blurs], [0.25, 0.5]) + PIXEL_VARIANCE
     found = Sharpening(amount, float(RADII_PX[column]), float(middle))
     sure = amount > SIGNIFICANT * error and explained[column] >= ENOUGH * explained.max()
@@ -191,7 +191,7 @@ def _at(tables: Float64[np.ndarray, "*v g"], x: Float64[np.ndarray, "*v n"]) -> 
 
 
 def sharpened(color: Color, coverage: Coverage, sharpening: Sharpening) -> Color:
-    """Returns a picture whose virtual part is sharpened, with halos around it; `coverage` is its share of pixels.
+    """Returns a picture whose virtual part, which covers `coverage` of each pixel, is sharpened, with its halos.
 
     The camera's own picture is sharpened already, so what it would get without objects is left out: the detail of
     what is behind them, which continues the picture around. Pixels that no halo changes stay as they are, to the bit.

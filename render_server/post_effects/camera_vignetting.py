@@ -17,7 +17,7 @@ MOST_FRAMES, LEAST_FRAMES = 24, 5
 LEAST_STEP = 0.03
 """Of the picture's half diagonal: how far the paper must have moved in it for another frame to count."""
 LATTICE = np.linspace(0.1, 0.9, 5)
-"""Where a patch is read, as shares of its edges."""
+"""Where a patch is read, as fractions of its edges."""
 CODES = (4, 251)
 MOST_SPREAD = 0.1
 """Of a patch's mean, standard deviation: something else is on it."""
@@ -164,8 +164,8 @@ def vignetted(
     if not covered.any():
         return color
     lut = decode_lut(frame.response)
-    share = 1 + np.clip(coverage[covered], 0, 1)[:, None] * (factors[covered][:, None] - 1)
-    light = lut[color[covered], np.arange(3)] * share
+    factor = 1 + np.clip(coverage[covered], 0, 1)[:, None] * (factors[covered][:, None] - 1)
+    light = lut[color[covered], np.arange(3)] * factor
     result = color.copy()
     coded = [np.interp(light[:, channel], lut[:, channel], np.arange(256)) for channel in range(3)]
     result[covered] = np.rint(np.stack(coded, axis=-1))

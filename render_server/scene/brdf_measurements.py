@@ -63,7 +63,7 @@ def read_brdf(path: Path) -> BrdfMeasurements:
         )
     if wavelengths[0] > 450 or wavelengths[-1] < 650:
         raise DeltalightError(
-            f"{path.name} was measured from {wavelengths[0]:g} to {wavelengths[-1]:g} nm, which tells no colour; "
+            f"{path.name} was measured from {wavelengths[0]:g} to {wavelengths[-1]:g} nm, which gives no colour; "
             "it needs 450 to 650 nm."
         )
     table = rows.reshape(-1, 4 + count)

@@ -121,9 +121,9 @@ def _bound_grid(
     camera: CameraModel, most: int
 ) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"], Float64[np.ndarray, "a b 3"]]:
     """Returns rows and columns of a grid of at most so many pixels, and points at a depth of 1 on their rays."""
-    share = min(1.0, math.sqrt(most / (camera.width * camera.height)))
+    scale = min(1.0, math.sqrt(most / (camera.width * camera.height)))
     rows, columns = (
-        np.linspace(0, length - 1, max(1, int(share * length))).round().astype(np.int64)
+        np.linspace(0, length - 1, max(1, int(scale * length))).round().astype(np.int64)
         for length in (camera.height, camera.width)
     )
     rays = camera.rays()[np.ix_(rows, columns)]

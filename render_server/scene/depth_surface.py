@@ -28,7 +28,7 @@ SHIFTS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 MIN_SUPPORT = 0.01
 # What a box of windows with gaps costs beside its pixels, as so many of them.
 BOX_COST_PX = 16384
-# Beyond this share of the picture, taking every window for one with gaps costs less, so many rows at a time.
+# Beyond this fraction of the picture, taking every window for one with gaps costs less, so many rows at a time.
 MOST_GAPPY = 0.7
 CACHED_ROWS = 120
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.render_server.lights.lights import DirectionalLight, Light
+from deltalight.render_server.lights.light_models import DirectionalLight, Light
 from deltalight.render_server.lights.punctual_light import PunctualLight
 from deltalight.render_server.scene.asset_check import LIGHTS_EXTENSION
 from deltalight.render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeTree

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.render_server.lights.lights import Light
+from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.scene.asset_check import left_out, read_gltf
 from deltalight.render_server.scene.gltf_animation import Clip, read_clips
 from deltalight.render_server.scene.gltf_document import (

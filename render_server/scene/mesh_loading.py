@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene_objects import GLTF_SUFFIXES
-from deltalight.render_server.lights.lights import Light
+from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.scene.asset_check import check_mesh_file
 from deltalight.render_server.scene.gltf_meshes import GltfAsset, load_gltf
 from deltalight.render_server.scene.materials import Material

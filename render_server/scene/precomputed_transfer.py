@@ -180,7 +180,7 @@ def _ray_starts(surface: TransferSurface, radius: float) -> Float32[np.ndarray, 
 def _weights_of_hits(
     hits: RayHits, cosine: Float32[np.ndarray, "p d"], solid_angle: float, triangles: int
 ) -> "csr_array":
-    """Returns the share of each triangle's radiance in each vertex's irradiance; backs reflect nothing."""
+    """Returns the weight of each triangle's radiance in each vertex's irradiance; backs reflect nothing."""
     from scipy.sparse import csr_array
 
     front = ~hits.behind

@@ -112,7 +112,7 @@ def read_texture_stack(folder: Path) -> TextureStack:
         cosines = cosines_of(pictures) if angles is None else np.cos(np.radians(angles))
     except ValueError as error:
         raise DeltalightError(
-            f"{folder}: pictures that are black or equally bright do not tell their light's angle; give `angles_deg`."
+            f"{folder}: pictures that are black or equally bright do not show their light's angle; give `angles_deg`."
         ) from error
     return TextureStack(stack_of(pictures, cosines), *coat)
 

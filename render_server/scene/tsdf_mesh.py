@@ -248,7 +248,7 @@ class TsdfScene:
         if not known:
             return False
         if not self.volumes:
-            self.volumes = [TsdfVolume(place) for place in place_volumes(known)]
+            self.volumes = [TsdfVolume(place) for place in place_tsdf_volumes(known)]
             self._meshed = [volume.known_distance() for volume in self.volumes]
         for frame in known:
             self._integrate(frame, is_first=frame is frames[0])
@@ -305,7 +305,7 @@ class _SeenPoints(NamedTuple):
         return _SeenPoints(*(values[chosen] for values in self))
 
 
-def place_volumes(frames: Sequence[PosedSurface]) -> tuple[TsdfPlacement, TsdfPlacement]:
+def place_tsdf_volumes(frames: Sequence[PosedSurface]) -> tuple[TsdfPlacement, TsdfPlacement]:
     """Places a cube around the near points of the cameras' frames, and a coarser one around all of them."""
     shown = _all_seen_points(frames)
     near = shown.z <= NEAR_MEDIANS * np.median(shown.z)

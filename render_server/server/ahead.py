@@ -26,7 +26,7 @@ from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.gpu.device_memory import device_memory, free_host_memory, gl_integers
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.cameras import RoomCameras, Taken
-from deltalight.render_server.server.frames import FrameSource
+from deltalight.render_server.server.frames import FrameReceiver
 from deltalight.render_server.server.pace import CalledError, IsCalled, Pace
 from deltalight.render_server.server.process import RECEIVE_TIMEOUT_S, ServerSettings
 from deltalight.render_server.server.session import needs_depth
@@ -206,7 +206,7 @@ class Ahead:
         """
         ends_s = time.monotonic() + LISTEN_S
         taken: tuple[Taken, ...] = ()
-        with closing(FrameSource(self._settings.subscribe, self._keys)) as source:
+        with closing(FrameReceiver(self._settings.subscribe, self._keys)) as source:
             while len(taken) < len(self._settings.subscribe) and time.monotonic() < ends_s:
                 if self._is_called(0.0):
                     return ()
@@ -236,11 +236,11 @@ def _require_memory(gpu: GpuContext) -> None:
         DeltalightError: the host or the GPU has too little free memory, or its driver does not tell.
     """
     if free_host_memory() < NEEDED_BYTES:
-        raise DeltalightError("The host lacks the memory for a second renderer.")
+        raise DeltalightError("The host has too little memory for a second renderer.")
     _, free = device_memory(gpu.ctx.extensions, gl_integers(), is_software=gpu.is_software)
     if not gpu.is_software and (free is None or free < NEEDED_DEVICE_BYTES):
         raise DeltalightError(
-            "The GPU lacks the memory for a second renderer, or does not tell how much it has."
+            "The GPU has too little memory for a second renderer, or does not report how much it has."
         )
 
 

@@ -48,7 +48,7 @@ class SourceRequest(StrictModel):
     endpoints: tuple[str, ...] | None = Field(min_length=1, max_length=MAX_ENDPOINTS)
 
 
-class FrameSource:
+class FrameReceiver:
     """Receives the streams of the `configured` endpoints until `use` selects others.
 
     `keys` are required if an endpoint leaves the host.

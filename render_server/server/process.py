@@ -39,7 +39,7 @@ from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.renderer import SceneRenderer
-from deltalight.render_server.server.frames import FrameSource, PairingSettings
+from deltalight.render_server.server.frames import FrameReceiver, PairingSettings
 from deltalight.render_server.server.renderer import Renderer
 from deltalight.render_server.server.session import RenderedFrame, RenderSession, SourceInUse
 
@@ -279,7 +279,7 @@ def serve(
         stack.callback(publisher.close, LAST_WORDS_MS)
         sender = Sender(publisher, settings.jpeg_quality)
         stack.callback(sender.close)
-        source = FrameSource(settings.subscribe, keys)
+        source = FrameReceiver(settings.subscribe, keys)
         stack.callback(source.close)
         commands = CommandQueue()
         replies = ReplyServer(settings.control, commands.ask, node=settings.name, keys=keys)
@@ -308,7 +308,7 @@ def serve(
             raise
 
 
-def _use_source(source: FrameSource, sender: Sender, endpoints: Sequence[str] | None) -> SourceInUse:
+def _use_source(source: FrameReceiver, sender: Sender, endpoints: Sequence[str] | None) -> SourceInUse:
     """Reads other endpoints; pictures of the old ones that wait to be sent are discarded."""
     is_another = source.use(endpoints)
     if is_another:
@@ -316,7 +316,7 @@ def _use_source(source: FrameSource, sender: Sender, endpoints: Sequence[str] | 
     return SourceInUse(source.endpoints, is_another)
 
 
-def _drops(source: FrameSource, sender: Sender, replies: ReplyServer) -> dict[str, int]:
+def _drops(source: FrameReceiver, sender: Sender, replies: ReplyServer) -> dict[str, int]:
     """Returns the number of messages that were dropped, by topic or reason."""
     refused = {"commands_not_allowed": replies.not_allowed} if replies.not_allowed else {}
     return {"send": sender.dropped, **source.drops, **refused}
@@ -351,7 +351,7 @@ def _patience_s(session: RenderSession) -> float:
     return SHORT_TIMEOUT_S if session.is_waiting else RECEIVE_TIMEOUT_S
 
 
-def _loop(session: RenderSession, source: FrameSource, sender: Sender, commands: CommandQueue) -> None:
+def _loop(session: RenderSession, source: FrameReceiver, sender: Sender, commands: CommandQueue) -> None:
     stats_due_s = time.monotonic()
     while not session.stopping:
         for multipart in (source.latest(_patience_s(session)) or {}).values():

@@ -58,5 +58,5 @@ class FisheyeSettings(StrictModel):
         default=3,
         ge=0,
         le=30,
-        description="Frames left out after an exposure was changed, where the camera does not tell its own.",
+        description="Frames left out after an exposure was changed, where the camera does not report its own.",
     )

@@ -43,7 +43,7 @@ class TrackedCamera(AccompaniedCamera):
         lens = None if sample is None else tracked_lens(sample, self._camera.camera)
         if lens is None:
             raise DeltalightError(
-                "The tracker does not tell the lens (pinholeFocalLength and activeSensorPhysicalDimensions); let it"
+                "The tracker does not send the lens (pinholeFocalLength and activeSensorPhysicalDimensions); let it"
                 " send them, or set lens = false in [node.tracking] and calibrate the camera."
             )
         self.camera = lens

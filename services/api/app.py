@@ -14,6 +14,7 @@ from starlette.middleware import Middleware
 from deltalight import __version__
 from deltalight.protocol.keys import Keys
 from deltalight.services.api.auth import AuthMiddleware, AuthRules
+from deltalight.services.api.context import Context
 from deltalight.services.api.credentials import SecretToken
 from deltalight.services.api.host_names import HostNames
 from deltalight.services.api.metrics import Meter
@@ -128,13 +129,6 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         await context.whep.close()
         await run_in_threadpool(all_rooms.close)
 
-    rules = AuthRules(
-        needs_token=settings.leaves_host,
-        host_names=HostNames(on_loopback=not settings.leaves_host, allowed=settings.allowed_hosts),
-        requests_per_s=settings.requests_per_s,
-        upload_limit_bytes=settings.upload_limit_mb << 20,
-        recording_limit_bytes=settings.recording_limit_mb << 20,
-    )
     app = _App(
         title="Deltalight",
         version=__version__,
@@ -145,19 +139,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         lifespan=lifespan,
         separate_input_output_schemas=False,
         generate_unique_id_function=lambda route: route.name,
-        middleware=[
-            Middleware(RoomPaths),
-            Middleware(Meter, metrics=context.metrics),
-            Middleware(
-                AuthMiddleware,
-                rules=rules,
-                tokens=store.tokens,
-                tickets=context.tickets,
-                problems=context.problems,
-                streams=context.streams,
-                secrets=_secret_tokens(settings),
-            ),
-        ],
+        middleware=_middleware(settings, store, context),
     )
     app.state.context, app.state.contexts, app.state.rooms = context, contexts, all_rooms
     context.problems.install(app)
@@ -165,6 +147,27 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         app.include_router(router, prefix=PREFIX, responses=responses(*ANYWHERE))
     app.router.default = StaticPage(app.router.not_found)
     return app
+
+
+def _middleware(settings: ApiSettings, store: Store, context: Context) -> list[Middleware]:
+    """Return what every request passes through, outermost first."""
+    rules = AuthRules(
+        needs_token=settings.leaves_host,
+        host_names=HostNames(on_loopback=not settings.leaves_host, allowed=settings.allowed_hosts),
+        requests_per_s=settings.requests_per_s,
+        upload_limit_bytes=settings.upload_limit_mb << 20,
+        recording_limit_bytes=settings.recording_limit_mb << 20,
+    )
+    auth = Middleware(
+        AuthMiddleware,
+        rules=rules,
+        tokens=store.tokens,
+        tickets=context.tickets,
+        problems=context.problems,
+        streams=context.streams,
+        secrets=_secret_tokens(settings),
+    )
+    return [Middleware(RoomPaths), Middleware(Meter, metrics=context.metrics), auth]
 
 
 def _secret_tokens(settings: ApiSettings) -> list[SecretToken]:

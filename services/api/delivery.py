@@ -13,7 +13,7 @@ WAIT_S = 4.0
 WAITERS = 8  # of the 40 threads that handle requests
 
 SILENT = "The render server does not answer; the scene is shown as soon as it does."
-BUSY = "The render server is still busy; the event `picture` tells when it has taken this."
+BUSY = "The render server is still busy; the event `picture` says when it has applied this."
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from deltalight.protocol.fisheye_lens import calibration_of
 from deltalight.protocol.messages import Message, RadianceMessage
 
 if TYPE_CHECKING:
-    from deltalight.render_server.lights.lights import IncidentLight
+    from deltalight.render_server.lights.light_models import IncidentLight
 
 PICTURE_PART = 2  # of a radiance message (SPEC.md, section 3)
 OUTLINE_POINTS = 16
@@ -65,7 +65,7 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
 
 def _shown(message: RadianceMessage, described: Mapping[str, Any]) -> list[FisheyeLight]:
     """Return a light, or nothing where the picture does not show it."""
-    from deltalight.render_server.lights.lights import LIGHT_TYPES, incident_light
+    from deltalight.render_server.lights.light_models import LIGHT_TYPES, incident_light
 
     if described.get("type") == ENVIRONMENT:
         return []

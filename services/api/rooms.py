@@ -17,6 +17,7 @@ from deltalight.services.api.limits import StreamLimits
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.metrics import Metrics
 from deltalight.services.api.models import ProcessAnswer
+from deltalight.services.api.playback_client import Position
 from deltalight.services.api.pools import make_pools
 from deltalight.services.api.problems import Problems
 from deltalight.services.api.recording_session import RecordingSession, RecordingSessions
@@ -190,11 +191,11 @@ class _Builder:
         store: Store,
         control: str | None,
         endpoints: Sequence[str],
-        beside: str,
+        server: str,
         *,
         playback: str | None = None,
     ) -> Context:
-        """`beside`: an endpoint of the host that replays are started for; `playback`: as for `ReplayControl`."""
+        """Build the context of a room; `server` and `playback` are as for `ReplayControl`."""
         events, watch = EventHub(), ProcessWatch()
         link = RenderLink(
             store,
@@ -204,16 +205,7 @@ class _Builder:
             chooses_source=self._settings.jobs,
         )
         live_hub = LiveHub(link.watch, on_failure=lambda reason: events.publish("notice", {"text": reason}))
-        replay = ReplayControl(
-            link,
-            beside,
-            publish=lambda position: events.publish(
-                "replay", recordings.replay_answer(position).model_dump()
-            ),
-            notice=lambda text: events.publish("notice", {"text": text}),
-            keys=self._keys,
-            playback=playback,
-        )
+        replay = self._replay(link, events, server, playback)
         return Context(
             store=store,
             link=link,
@@ -237,6 +229,15 @@ class _Builder:
             room=room,
             server_name=RENDER_SERVER if control is not None else room,
         )
+
+    def _replay(self, link: RenderLink, events: EventHub, server: str, playback: str | None) -> ReplayControl:
+        def publish(position: Position | None) -> None:
+            events.publish("replay", recordings.replay_answer(position).model_dump())
+
+        def notice(text: str) -> None:
+            events.publish("notice", {"text": text})
+
+        return ReplayControl(link, server, publish, notice, keys=self._keys, playback=playback)
 
     def _recording_sessions(self, room: str, endpoints: Sequence[str], events: EventHub) -> RecordingSessions:
         def publish(session: RecordingSession, is_growing: bool) -> None:

@@ -125,7 +125,7 @@ def listening(host: str, port: int) -> socket.socket:
         listener = socket.create_server((host, port), family=family, backlog=128)
     except OSError as fault:
         raise DeltalightError(
-            f"{host} port {port} cannot be listened on ({fault.strerror}); stop the program that uses it, or choose "
+            f"cannot listen on {host} port {port} ({fault.strerror}); stop the program that uses it, or choose "
             "others with --host and --port."
         ) from fault
     # Connections inherit it. asyncio sets it only on sockets that it creates, and without it the body of each

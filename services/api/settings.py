@@ -103,7 +103,9 @@ class ApiSettings(StrictModel):
     def _check_names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
             if not HOST_NAME.fullmatch(name):
-                raise ValueError(f"{name!r:.80} is no host name; write it without scheme, port and wildcard.")
+                raise ValueError(
+                    f"{name!r:.80} is not a host name; write it without scheme, port and wildcard."
+                )
         return tuple(name.lower().removesuffix(".") for name in names)
 
     @property

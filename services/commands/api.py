@@ -156,7 +156,7 @@ def revoke(
     """Revoke a token; it is refused from the next request on, without a restart."""
     with _store(data, database) as store:
         store.tokens.revoke(name)
-    typer.echo(f"The token `{name}` is no longer taken.")
+    typer.echo(f"The token `{name}` is no longer accepted.")
 
 
 def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:

@@ -59,6 +59,7 @@ OneCamera = Annotated[
         help="Camera whose pictures to use, by the name of its node, if a room has several.",
     ),
 ]
+Device = Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")]
 Data = Annotated[
     Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
 ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deltalight.services.commands.options import Quality, View
+from deltalight.services.commands.options import Device, Quality, View
 
 if TYPE_CHECKING:
     from deltalight.services.offline import RenderSummary
@@ -41,9 +41,7 @@ def render(
             metavar="WxH", help="Size of the pictures, such as 640x480; default: as the scene says."
         ),
     ] = None,
-    device: Annotated[
-        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
-    ] = None,
+    device: Device = None,
     view: Annotated[View | None, typer.Option(help="View to render; default: as the scene says.")] = None,
     method: Annotated[
         str | None,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from deltalight.services.commands.options import ConfigFile, NodeName
+from deltalight.services.commands.options import ConfigFile, Device, NodeName
 from deltalight.services.uncollected import uncollected
 from deltalight.services.warm_spare import this_spare
 
@@ -39,9 +39,7 @@ def server(
     epoch: Annotated[
         int | None, typer.Option(min=1, help="Number of this start among those of its room's render server.")
     ] = None,
-    device: Annotated[
-        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
-    ] = None,
+    device: Device = None,
     allow_software: Annotated[
         bool | None, typer.Option("--allow-software", help="Render without a GPU if there is none.")
     ] = None,

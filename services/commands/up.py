@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.commands.options import ConfigFile, Data, NodeName, data_folder
+from deltalight.services.commands.options import ConfigFile, Data, Device, NodeName, data_folder
 from deltalight.services.ports import (
     COMPOSITE_PORT,
     CONTROL_PORT,
@@ -52,9 +52,7 @@ def up(
         int, typer.Option(min=1, max=65535, help="Port of the relit pictures.")
     ] = COMPOSITE_PORT,
     control_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the commands.")] = CONTROL_PORT,
-    device: Annotated[
-        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
-    ] = None,
+    device: Device = None,
     allow_software: Annotated[
         bool, typer.Option("--allow-software", help="Render without a GPU if there is none.")
     ] = False,

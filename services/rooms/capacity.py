@@ -91,7 +91,7 @@ def find_device_apart(device: int | None) -> "FoundDevice":
         said = (getattr(fault, "stderr", None) or str(fault)).strip().splitlines()
         where = "the first EGL device" if device is None else f"EGL device {device}"
         raise DeltalightError(
-            f"{where} cannot be asked ({said[-1] if said else 'it said nothing'}); see `deltalight doctor`."
+            f"{where} cannot be queried ({said[-1] if said else 'it said nothing'}); see `deltalight doctor`."
         ) from fault
 
 
@@ -109,7 +109,7 @@ def slots_of(figures: RoomFigures, found: "FoundDevice", frames_per_s: float) ->
     by_time = max(1, int(1000.0 / frames_per_s / figures.frame_ms))
     if found.memory_bytes is None:
         raise DeltalightError(
-            f"the driver of {found.name} does not tell its memory; give `slots` as a number."
+            f"the driver of {found.name} does not report its memory; give `slots` as a number."
         )
     by_memory = int(found.memory_bytes * USED_SHARE / figures.room_bytes)
     if by_memory < 1:

@@ -360,7 +360,7 @@ def _digest_of(session: Session, place: str, asset: str) -> str:
     digests = list(session.scalars(query))
     if len(digests) > 1:
         raise DeltalightError(
-            f"`{place}` names {asset!r:.200} and several assets are called so; name one as {DIGEST_PREFIX}..."
+            f"`{place}` names {asset!r:.200} but several assets have this name; name one as {DIGEST_PREFIX}..."
         )
     return digests[0] if digests else ""
 

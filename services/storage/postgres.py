@@ -134,7 +134,7 @@ class PostgresDatabase(Database):
             raise
         except DataError as fault:
             raise DeltalightError(
-                f"The database cannot keep this ({_first_line(fault)}); leave characters of number 0 out of texts."
+                f"The database cannot keep this ({_first_line(fault)}); remove NUL characters from its texts."
             ) from fault
         except DBAPIError as fault:
             if not _is_gone(fault):

@@ -31,7 +31,7 @@ def check_recording(path: Path, out: str, limit: str) -> Facts:
         raise DeltalightError(f"{path} is neither an .mcap recording nor a .zip of a dataset folder.")
     recording = _imported(path, Path(out), int(limit)) if is_zip else path
     if not describe_recording(recording)["is_finished"]:
-        raise DeltalightError(f"{path} was cut off; `deltalight recordings recover` mends it.")
+        raise DeltalightError(f"{path} was cut off; `deltalight recordings recover` repairs it.")
     reader = RecordingReader(recording)
     for index in {0, len(reader) - 1}:
         _ = reader[index]

@@ -15,7 +15,8 @@ from deltalight.protocol.frames import LUMINANCE, ViewFrame
 from deltalight.protocol.scene_lights import Lights
 from deltalight.protocol.scene_lights import SphereLight as GivenSphere
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.lights import IncidentLight, LightSet, SphereLight, incident_light
+from deltalight.render_server.lights.light_models import IncidentLight, SphereLight, incident_light
+from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.sources import FisheyeSource
 from deltalight.render_server.renderer import SceneRenderer
 

@@ -182,7 +182,7 @@ def test_a_server_without_a_clock_is_named() -> None:
     server = ReplyServer("tcp://127.0.0.1:0", lambda _: {})
     client = RequestClient(server.endpoint)
     try:
-        with pytest.raises(DeltalightError, match="does not tell its time"):
+        with pytest.raises(DeltalightError, match="does not report its time"):
             clock_exchange(client.request, "desk")()
     finally:
         client.close()

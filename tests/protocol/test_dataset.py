@@ -328,7 +328,7 @@ def test_writing_keeps_jpeg_bytes_and_refuses_what_does_not_fit(tmp_path: Path) 
         writer.add(SensorFrame(0, 5, first.color, first.camera, color_jpeg=jpeg))
         with pytest.raises(DeltalightError, match="not later"):
             writer.add(SensorFrame(1, 5, first.color, first.camera))
-        with pytest.raises(DeltalightError, match="another camera or response"):
+        with pytest.raises(DeltalightError, match="a different camera or response"):
             writer.add(second)
     frame = open_dataset(tmp_path / "a")[0]
     assert frame.color_jpeg == jpeg

@@ -11,7 +11,8 @@ from scipy.optimize import curve_fit
 
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.lights import RectangleLight, SpotLight, build_lights
+from deltalight.render_server.lights.light_models import RectangleLight, SpotLight
+from deltalight.render_server.lights.lights import build_lights
 from deltalight.render_server.passes.shadow_maps import light_views
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (

@@ -22,7 +22,8 @@ from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.sky_lights import SkyLights
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.lights import DirectionalLight, LightSet, SphereLight
+from deltalight.render_server.lights.light_models import DirectionalLight, SphereLight
+from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.sources import FisheyeSource, TrackedSource
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.sensor_node.frame_messages import Stamps, lights_multipart

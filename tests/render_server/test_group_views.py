@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from deltalight.render_server.lights.lights import DirectionalLight, Light, SphereLight
+from deltalight.render_server.lights.light_models import DirectionalLight, Light, SphereLight
 from deltalight.render_server.passes.group_views import MOST_GROUP_VIEWS, views_of_groups
 from deltalight.render_server.passes.shadow_maps import LightView, light_views
 

@@ -22,7 +22,8 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.lights.environment import load_environment
 from deltalight.render_server.lights.light_map import irradiance_coefficients, light_map
-from deltalight.render_server.lights.lights import DirectionalLight, LightSet, SphereLight, build_lights
+from deltalight.render_server.lights.light_models import DirectionalLight, SphereLight
+from deltalight.render_server.lights.lights import LightSet, build_lights
 from deltalight.render_server.lights.octahedral import even_directions, harmonics, irradiance
 from deltalight.render_server.passes.image_based import SurroundingLight
 from deltalight.render_server.renderer import SceneRenderer

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deltalight.render_server.lights.lights import (
+from deltalight.render_server.lights.light_models import (
     DirectionalLight,
     Light,
     RectangleLight,

@@ -148,7 +148,7 @@ WHOLE = brdf_text(PAINT)
         (WHOLE.replace(" 0.", " nan ", 1), "not finite"),
         (WHOLE.replace(" 0.", " 1e300 ", 1), "beyond 1e"),
         (WHOLE.replace("400 410", "410 400"), "is not a complete .brdf file"),
-        ("2\n400 500\n" + "0.1 0 0.2 0 1 1\n" * 200, "from 400 to 500 nm, which tells no colour"),
+        ("2\n400 500\n" + "0.1 0 0.2 0 1 1\n" * 200, "from 400 to 500 nm, which gives no colour"),
         (
             "2\n400 700\n" + "0.1 0 0.2 0 1 1\n" * 9,
             "has 9 samples above the surface; a fit needs at least 100",

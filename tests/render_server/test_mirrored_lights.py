@@ -10,7 +10,7 @@ import trimesh
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_objects import Surface
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight
+from deltalight.render_server.lights.light_models import DirectionalLight, RectangleLight, SphereLight
 from deltalight.render_server.lights.mirror_lights import MIRROR_ROUGHNESS, mirror_lights
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable, build_surface_table

@@ -20,7 +20,7 @@ from deltalight.render_server.estimation.plane_extrapolation import (
     extrapolate_planes,
 )
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.lights import DirectionalLight, Light, SphereLight
+from deltalight.render_server.lights.light_models import DirectionalLight, Light, SphereLight
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, floor, frame, look_at, plain, shifted
 

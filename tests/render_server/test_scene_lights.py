@@ -22,7 +22,8 @@ from deltalight.render_server.lights.environment import (
     pixel_solid_angles,
     split_environment,
 )
-from deltalight.render_server.lights.lights import DirectionalLight, SphereLight, build_lights
+from deltalight.render_server.lights.light_models import DirectionalLight, SphereLight
+from deltalight.render_server.lights.lights import build_lights
 from deltalight.render_server.lights.octahedral import irradiance, irradiance_map, prefilter, solid_angle_mean
 
 SHAPE = (256, 512)

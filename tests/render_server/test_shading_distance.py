@@ -9,7 +9,7 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
 from deltalight.protocol.scene_lights import LightCut, Lights
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
-from deltalight.render_server.lights.lights import DirectionalLight, SphereLight
+from deltalight.render_server.lights.light_models import DirectionalLight, SphereLight
 from deltalight.render_server.lights.shading_distance import distance_by_shading
 from deltalight.render_server.lights.sources import FisheyeSource
 

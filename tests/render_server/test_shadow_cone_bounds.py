@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
-from deltalight.render_server.lights.lights import DirectionalLight, Light, SphereLight
+from deltalight.render_server.lights.light_models import DirectionalLight, Light, SphereLight
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 

@@ -269,7 +269,7 @@ def described(**changes: object) -> Callable[[Path], object]:
                 described(angles_deg=None)(folder),
                 (folder / "0.png").write_bytes((folder / "1.png").read_bytes()),
             ],
-            "equally bright do not tell their light's angle; give `angles_deg`",
+            "equally bright do not show their light's angle; give `angles_deg`",
         ),
         (lambda folder: (folder / "2.png").write_bytes(b"\x89PNG"), "2.png cannot be read as a picture"),
         (lambda folder: (folder / "2.png").unlink(), "2.png cannot be read as a picture"),

@@ -241,7 +241,7 @@ def test_a_spare_that_can_build_nothing_ahead_takes_over_all_the_same(
 ) -> None:
     station = station_of(WITHOUT_MEMORY)
     station.wait_for_spare_to_say("nothing is built ahead")
-    assert "lacks the memory for a second renderer" in station._heard
+    assert "too little memory for a second renderer" in station._heard
     station.kill()
     station.wait_for(lambda: station.picture().scene_revision == 7)
     assert station._heard.count("nothing is built ahead") == 1

@@ -58,7 +58,7 @@ def test_memory_and_time_both_limit_the_slots() -> None:
     ("found", "sentence"),
     [
         (card(GIB), "no room fits"),
-        (card(None), "does not tell its memory"),
+        (card(None), "does not report its memory"),
         (card(name="llvmpipe"), "are for NVIDIA RTX A4000/PCIe/SSE2, and this host renders on llvmpipe"),
     ],
 )

@@ -53,8 +53,8 @@ BOMB = "a0: &a0 [x]\n" + "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)
             "nodes: {a: {source: s}}\nrooms: {hall: {nodes: [b]}}",
             "shows the unknown node b; write a instead.",
         ),
-        ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a]}, hall: {nodes: [a]}}", "`hall` comes twice"),
-        ("nodes: {a: {source: s}, a: {source: t}}\nrooms: {hall: {nodes: [a]}}", "`a` comes twice"),
+        ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a]}, hall: {nodes: [a]}}", "`hall` appears twice"),
+        ("nodes: {a: {source: s}, a: {source: t}}\nrooms: {hall: {nodes: [a]}}", "`a` appears twice"),
         ("nodes: {a: {source: s}}\nrooms: {a: {nodes: [a]}}", "a is both a node and a room"),
         ("nodes: {a: {source: s}}\nrooms: {hall: {nodes: [a, a]}}", "the room hall names a node twice"),
         ("nodes: {a: {}}\nrooms: {hall: {nodes: [a]}}", "give either the source of a node here"),
@@ -95,7 +95,7 @@ def test_doubled_keys_of_json_are_refused_too(tmp_path: Path) -> None:
     path.write_text(
         '{"nodes": {"a": {"source": "s"}}, "rooms": {"h": {"nodes": ["a"]}, "h": {"nodes": ["a"]}}}'
     )
-    with pytest.raises(DeltalightError, match="`h` comes twice"):
+    with pytest.raises(DeltalightError, match="`h` appears twice"):
         load_rooms(path)
 
 

@@ -361,7 +361,7 @@ def _newest_fisheye(shared: Shared) -> tuple[RadianceMessage, bytes]:
     newest = shared.fisheye.newest
     if newest is None:
         raise NotFoundError(
-            "no node has sent light of a fish-eye camera; docs/fisheye.md tells how to set one up."
+            "no node has sent light of a fish-eye camera; docs/fisheye.md says how to set one up."
         )
     return newest
 

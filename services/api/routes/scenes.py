@@ -162,7 +162,7 @@ def list_revisions(
     before: Annotated[
         int | None, Query(ge=1, lt=1 << 63, description="Only revisions below this one.")
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=MAX_ENTRIES, description="At most so many.")] = 50,
+    limit: Annotated[int, Query(ge=1, le=MAX_ENTRIES, description="The most entries to return.")] = 50,
 ) -> list[RevisionEntry]:
     """List the changes of a scene, newest first."""
     return [RevisionEntry.of(each) for each in shared.store.scenes.history(scene_id, before, limit)]

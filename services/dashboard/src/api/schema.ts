@@ -12269,7 +12269,7 @@ export interface operations {
             readonly query?: {
                 /** @description Only revisions below this one. */
                 readonly before?: number | null;
-                /** @description At most so many. */
+                /** @description The most entries to return. */
                 readonly limit?: number;
             };
             readonly header?: never;
