@@ -25,7 +25,12 @@ IDLE_S = 60.0  # without work; what it has imported takes 100 MB and more
 REQUEST_BYTES = 1 << 16
 MESH_LOADERS = ("deltalight.render_server.scene.asset_check", "deltalight.render_server.scene.mesh_loading")
 # What the functions of tasks import when they are called.
-IMPORTED_LATE = {"mesh": MESH_LOADERS, "shelf": (*MESH_LOADERS, "trimesh.creation")}
+IMPORTED_LATE = {
+    "mesh": MESH_LOADERS,
+    "map": ("deltalight.protocol.radiance_files",),
+    "material": ("deltalight.render_server.scene.material_file",),
+    "shelf": (*MESH_LOADERS, "trimesh.creation"),
+}
 GLTF = {".glb", ".gltf"}  # trimesh, which takes longest to import, loads all others
 
 

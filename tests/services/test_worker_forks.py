@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(not asset_sandbox.CAN_FORK, reason="only Linux f
 @pytest.fixture
 def forks(monkeypatch: pytest.MonkeyPatch) -> Iterator[WorkerForks]:
     """Of this test alone."""
-    made = WorkerForks(WORKER, {})
+    made = WorkerForks(WORKER, asset_sandbox._ENVIRONMENT)
     monkeypatch.setattr(asset_sandbox, "_forks", made)
     yield made
     made.close()
