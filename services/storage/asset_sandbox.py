@@ -16,9 +16,9 @@ WORKER = "deltalight.services.storage.asset_worker"  # by name: its imports must
 # An 8192 x 4096 map takes 1.6 GB while it is checked, a mesh of 10 M triangles 2 GB.
 MEMORY_LIMIT_BYTES = 3 << 30
 TIME_LIMIT_S = 60
-_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each thread's buffers count as memory
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each thread's buffers count as memory
 CAN_FORK = sys.platform.startswith("linux")  # elsewhere each worker is a process that imports all anew
-_forks = WorkerForks(WORKER, _ENVIRONMENT)
+_forks = WorkerForks(WORKER, ONE_THREAD)
 
 Task = Literal[
     "mesh",
@@ -70,7 +70,7 @@ def _said_by_process(words: Sequence[str], timeout_s: float) -> str:
         text=True,
         timeout=timeout_s,
         check=False,
-        env={**os.environ, **_ENVIRONMENT},
+        env={**os.environ, **ONE_THREAD},
     ).stdout
 
 

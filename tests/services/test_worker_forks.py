@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from deltalight.services.storage import asset_sandbox, asset_worker
-from deltalight.services.storage.asset_sandbox import WORKER, probe, run_limited
+from deltalight.services.storage.asset_sandbox import ONE_THREAD, WORKER, probe, run_limited
 from deltalight.services.storage.faults import RejectedAssetError
 from deltalight.services.storage.worker_forks import WorkerForks
 from tests.services.storage_samples import TETRAHEDRON
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(not asset_sandbox.CAN_FORK, reason="only Linux f
 @pytest.fixture
 def forks(monkeypatch: pytest.MonkeyPatch) -> Iterator[WorkerForks]:
     """Of this test alone."""
-    made = WorkerForks(WORKER, asset_sandbox._ENVIRONMENT)
+    made = WorkerForks(WORKER, ONE_THREAD)
     monkeypatch.setattr(asset_sandbox, "_forks", made)
     yield made
     made.close()
@@ -34,6 +34,18 @@ def forks(monkeypatch: pytest.MonkeyPatch) -> Iterator[WorkerForks]:
 def forking(forks: WorkerForks) -> psutil.Process:
     assert forks._process is not None
     return psutil.Process(forks._process.pid)
+
+
+@pytest.mark.parametrize("can_fork", [True, False])
+def test_a_worker_tells_what_it_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, can_fork: bool
+) -> None:
+    monkeypatch.setattr(asset_sandbox, "CAN_FORK", can_fork)
+    (tmp_path / "cup.obj").write_bytes(TETRAHEDRON)
+    (tmp_path / "bad.obj").write_text("v 1 2 nonsense")
+    assert probe(tmp_path / "cup.obj", "mesh", "cup.obj")["triangles"] == 4
+    with pytest.raises(RejectedAssetError, match=r"^bad\.obj "):
+        probe(tmp_path / "bad.obj", "mesh", "bad.obj")
 
 
 def test_workers_read_files_where_their_caller_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
