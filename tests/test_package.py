@@ -10,11 +10,14 @@ import sysconfig
 import tomllib
 import venv
 import zipfile
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from deltalight.services.storage.asset_sandbox import probe
+from deltalight.services.storage import asset_sandbox
+from deltalight.services.storage.asset_sandbox import ONE_THREAD, WORKER, probe
+from deltalight.services.storage.worker_forks import WorkerForks
 from tests.services.storage_samples import TETRAHEDRON
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -111,14 +114,18 @@ def test_an_installed_wheel_works_in_any_folder(installed: Path, foreign: Path) 
     assert (foreign / "out" / "000000.jpg").is_file()
 
 
+@pytest.mark.parametrize("is_forked", [asset_sandbox.CAN_FORK, False])
 def test_the_process_that_checks_assets_imports_nothing_from_the_folder(
-    foreign: Path, monkeypatch: pytest.MonkeyPatch
+    foreign: Path, monkeypatch: pytest.MonkeyPatch, *, is_forked: bool
 ) -> None:
     path = foreign / "tetrahedron.obj"
     path.write_bytes(TETRAHEDRON)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.chdir(foreign)
-    assert probe(path, "mesh", path.name)["triangles"] == 4
+    monkeypatch.setattr(asset_sandbox, "CAN_FORK", is_forked)
+    with closing(WorkerForks(WORKER, ONE_THREAD)) as forks:  # which imports all here
+        monkeypatch.setattr(asset_sandbox, "_forks", forks)
+        assert probe(path, "mesh", path.name)["triangles"] == 4
 
 
 def _names(requirements: list[str]) -> set[str]:

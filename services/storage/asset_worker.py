@@ -1,17 +1,37 @@
 """The process that handles an untrusted file within limits; started by `asset_sandbox`.
 
 Run as `python -m deltalight.services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`;
-prints one JSON object.
+prints one JSON object. Without arguments it forks such workers (`worker_forks`), which need not import again what it
+has imported for their task; it opens no file of theirs itself.
 """
 
 import json
+import os
 import resource
+import select
+import signal
+import socket
 import sys
 from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.services.storage.asset_kinds import Facts
+from deltalight.services.uncollected import uncollected
+
+IDLE_S = 60.0  # without work; what it has imported takes 100 MB and more
+REQUEST_BYTES = 1 << 16
+MESH_LOADERS = ("deltalight.render_server.scene.asset_check", "deltalight.render_server.scene.mesh_loading")
+# What the functions of tasks import when they are called.
+IMPORTED_LATE = {
+    "mesh": MESH_LOADERS,
+    "map": ("deltalight.protocol.radiance_files",),
+    "material": ("deltalight.render_server.scene.material_file",),
+    "shelf": (*MESH_LOADERS, "trimesh.creation"),
+}
+GLTF = {".glb", ".gltf"}  # trimesh, which takes longest to import, loads all others
 
 
 def _limit(memory_bytes: int, time_s: int, output_bytes: int) -> None:
@@ -81,5 +101,49 @@ def _main(task: str, path: str, memory_bytes: str, time_s: str, output_bytes: st
     print(json.dumps(facts))
 
 
+def _fork_workers(requests: socket.socket) -> None:
+    """Fork a worker for each request until there has been none for a while, or nobody can send any more."""
+    while True:
+        if not select.select([requests], [], [], IDLE_S)[0]:
+            requests.shutdown(socket.SHUT_RD)  # what was sent before is received all the same
+        request, files, *_ = socket.recv_fds(requests, REQUEST_BYTES, 1)
+        if not request:
+            return
+        folder, *words = json.loads(request)
+        _prepare(words[0], Path(words[1]))
+        if os.fork() == 0:
+            requests.close()
+            _run_forked(folder, words, files[0])
+        os.close(files[0])
+
+
+def _prepare(task: str, path: Path) -> None:
+    with uncollected(), suppress(ImportError, DeltalightError):  # the worker says it
+        _task(task)
+        for name in IMPORTED_LATE.get(task, ()):
+            import_module(name)
+        if task in {"mesh", "mesh-thumbnail"} and path.suffix not in GLTF:
+            import_module("trimesh")
+
+
+def _run_forked(folder: str, words: list[str], answer: int) -> None:
+    try:
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        signal.alarm(int(words[3]))  # ends it: whoever has asked waits no longer
+        os.open(os.devnull, os.O_RDONLY)  # standard input was the socket
+        os.dup2(answer, sys.stdout.fileno())
+        os.close(answer)
+        os.chdir(folder)
+        _main(*words)
+        sys.stdout.flush()
+    finally:
+        os._exit(0)
+
+
 if __name__ == "__main__":
-    _main(*sys.argv[1:])
+    if sys.argv[1:]:
+        _main(*sys.argv[1:])
+    else:
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for workers
+        with socket.socket(fileno=sys.stdin.fileno()) as asked:
+            _fork_workers(asked)

@@ -275,7 +275,7 @@ def test_other_media_types_and_names_are_refused(api: RunningApi) -> None:
 
 def test_a_file_that_needs_more_memory_than_allowed_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "map.hdr"
-    path.write_bytes(hdr(64, 32))
-    assert probe(path, "map", "map.hdr") == {"width": 64, "height": 32}
+    path.write_bytes(hdr(2048, 1024))
+    assert probe(path, "map", "map.hdr") == {"width": 2048, "height": 1024}
     with pytest.raises(RejectedAssetError, match=r"map\.hdr"):
         probe(path, "map", "map.hdr", memory_bytes=200 << 20)
