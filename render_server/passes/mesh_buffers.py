@@ -111,7 +111,8 @@ class MeshBuffers:
         self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
         if self.triangle_count:
             self._vertices.write(vertices)
-            if not np.array_equal(self.triangles, self._held_triangles):  # of an object that moves they stay
+            held = self._held_triangles  # of an object that moves they stay
+            if self.triangles is not held and not np.array_equal(self.triangles, held):
                 self._indices.write(self.triangles)
         self._held_triangles = self.triangles
         self._write_placement(mesh.placement)
