@@ -15,6 +15,7 @@ import trimesh
 
 from deltalight.benchmarks.glb_builder import GlbBuilder
 from deltalight.render_server.scene.gltf_meshes import load_gltf
+from deltalight.render_server.scene.moved_meshes import transformed
 from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
 
 JOINTS = 40
@@ -60,7 +61,7 @@ def row(path: Path) -> str:
     asset = load_gltf(path)
     clip = asset.clips[0]
     pose_ms, meshes = timed(lambda: asset.meshes(asset.pose(clip, 0.3)))
-    place_ms, placed = timed(lambda: [mesh.transformed(np.diag([2.0, 2, 2, 1])) for mesh in meshes])
+    place_ms, placed = timed(lambda: [transformed(mesh, np.diag([2.0, 2, 2, 1])) for mesh in meshes])
     merge_ms, merged = timed(lambda: merge_for_gpu(placed))
     counts = f"{len(merged.vertices):>8} {len(merged.triangles):>9}"
     steps = (pose_ms, place_ms, merge_ms)

@@ -25,8 +25,10 @@ def bounds(points: Array[Scalar]) -> tuple[Array[Scalar], Array[Scalar]]:
 
 def boxes(corners: Array[Scalar]) -> tuple[Array[Scalar], Array[Scalar]]:
     """Returns the least and the greatest coordinates (m, k) of the corners of each polygon (m, c, k)."""
-    each = [corners[:, corner] for corner in range(corners.shape[1])]
-    return reduce(np.minimum, each), reduce(np.maximum, each)
+    count, corner_count, axes = corners.shape
+    columns = np.ascontiguousarray(corners.reshape(count, corner_count * axes).T)
+    columns = columns.reshape(corner_count, axes, count)
+    return columns.min(axis=0).T, columns.max(axis=0).T
 
 
 def greatest(values: Array[Scalar]) -> Array[Scalar]:

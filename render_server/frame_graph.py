@@ -264,8 +264,9 @@ class FrameGraph:
 
     def set_lights(self, lights: LightSet) -> None:
         """Sets other lights for the same frame."""
-        assert self._inputs is not None
-        self.set_inputs(replace(self._inputs, lights=lights))
+        self._inputs = replace(self.inputs, lights=lights)
+        self.resources.lights.write(lights, is_)
+        self.resources.lit_area.write(NOWHERE, eq)
 
     def renew_albedo(self) -> None:
         """Marks the contents of the albedo texture as changed."""

@@ -289,6 +289,9 @@ class Graph:
                 stage.inputs = tuple(self._read(stage, name) for name in names)
             self._order = in_order(self._stages)
             complete_clocks(self._order)
+            read = {item for stage in self._order for item in stage.inputs}
+            for stage in self._order:
+                stage.is_read = not read.isdisjoint(stage.outputs)
         return self._order
 
     def _read(self, stage: Stage, name: str) -> Resource[Any]:
@@ -386,12 +389,8 @@ class Graph:
         Stages whose results no stage reads are left out: they serve estimates of light.
         """
         last_ms = {} if self.timers is None else self.timers.last_ms
-        read = {item for stage in self._stages for item in stage.inputs}
-        kept = (
-            stage for stage in self._stages if stage.seen is not None and not read.isdisjoint(stage.outputs)
-        )
-        names = [stage.name for stage in kept if stage.name not in ran]
-        return {name: last_ms[name] for name in names if name in last_ms}
+        kept = [stage.name for stage in self._sorted() if stage.is_read and stage.seen is not None]
+        return {name: last_ms[name] for name in kept if name in last_ms and name not in ran}
 
     def invalidate(self) -> None:
         """Makes every stage run again with the next run that needs it."""

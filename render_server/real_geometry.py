@@ -19,6 +19,7 @@ from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, BOUND_
 from deltalight.render_server.scene.depth_surface import noise_sigma
 from deltalight.render_server.scene.depth_views import PosedSurface
 from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.render_server.scene.moved_meshes import transformed
 from deltalight.render_server.scene.seen_depth import Grazing, SeenDepth
 from deltalight.render_server.scene.threads import submit
 from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
@@ -78,7 +79,7 @@ class RealGeometry:
 
     def _load_model(self, model: ModelGeometry) -> list[TriangleMesh]:
         matrix = model.pose.matrix()
-        return [mesh.transformed(matrix) for mesh in load_mesh(Path(model.model))]
+        return [transformed(mesh, matrix) for mesh in load_mesh(Path(model.model))]
 
     @property
     def has_unseen(self) -> bool:
@@ -164,7 +165,7 @@ class RealGeometry:
 
     def _build_from_tsdf(self) -> None:
         fine, coarse = (
-            [mesh.transformed(self._world_from_tsdf) for mesh in meshes] for meshes in self._tsdf_meshes
+            [transformed(mesh, self._world_from_tsdf) for mesh in meshes] for meshes in self._tsdf_meshes
         )
         if not any(len(mesh.triangles) for mesh in coarse):
             self.state = None

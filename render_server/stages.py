@@ -59,6 +59,7 @@ class Stage:
         view: number of the view that declared it.
         seen: versions of the inputs when it last ran; None: it never ran, or must run again.
         ran_in: number of the graph's run in which it last ran.
+        is_read: whether a stage reads what it writes (known once the graph has run).
     """
 
     name: str
@@ -71,6 +72,7 @@ class Stage:
     view: int = 0
     seen: tuple[int, ...] | None = None
     ran_in: int = 0
+    is_read: bool = False
 
     @property
     def clocks(self) -> frozenset[Clock]:

@@ -1,7 +1,7 @@
 """The scene document's objects as one set of triangles in the world, animated to a frame's capture time."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,8 @@ from deltalight.render_server.scene.gltf_posing import Pose
 from deltalight.render_server.scene.material_file import read_material
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import Asset, load_asset
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of, merge_for_gpu
+from deltalight.render_server.scene.moved_meshes import TurnedMesh, merged_again, turned
+from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of
 
 MARKER_FRAME = "marker:"
 CORNER_PICKS = np.array(
@@ -86,6 +87,34 @@ def clip_of(item: SceneObject, asset: GltfAsset | None) -> Clip | None:
     raise DeltalightError(f"object `{item.id}`: {item.asset} has no clip {playing.clip!r}; it has {names}.")
 
 
+@dataclass(frozen=True, eq=False)
+class _PlacedMeshes:
+    """An object's meshes in the world, and the same to be placed elsewhere (`turned`)."""
+
+    item: PlacedObject
+    turned: Sequence[TurnedMesh]
+    meshes: Sequence[TriangleMesh]
+
+    @classmethod
+    def of(cls, item: PlacedObject, before: "_PlacedMeshes | None") -> "_PlacedMeshes":
+        """Places an object's meshes; of those `before` it takes what still holds."""
+        matrix = item.world_from_asset
+        if before is None or not before._is_turned_alike(item):
+            meshes = _with_material(item.meshes, item.material)
+            parts: Sequence[TurnedMesh] = [turned(mesh, matrix[:3, :3]) for mesh in meshes]
+        elif np.array_equal(before.item.world_from_asset, matrix):
+            return before
+        else:
+            parts = before.turned
+        return cls(item, parts, [part.at(matrix[:3, 3]) for part in parts])
+
+    def _is_turned_alike(self, item: PlacedObject) -> bool:
+        """Whether an object differs by its place alone."""
+        own = self.item
+        is_same = own.meshes == item.meshes and own.material is item.material
+        return is_same and np.array_equal(own.world_from_asset[:3, :3], item.world_from_asset[:3, :3])
+
+
 class VirtualObjects:
     """Loads assets once; moves them with the document and their clips."""
 
@@ -98,7 +127,8 @@ class VirtualObjects:
         self._shown: tuple[SceneObject, ...] = ()
         self._board: BoardSpec | None = None
         self._moving: dict[str, AnimatedObject] = {}
-        self._standing: dict[str, list[TriangleMesh]] = {}
+        self._standing: dict[str, _PlacedMeshes] = {}
+        self._kept_merged: tuple[Sequence[TriangleMesh], GpuMesh | None] = (), None
         self._resting_lamps: dict[str, tuple[SceneObject, BoardSpec | None, list[Light]]] = {}
         self.state: GeometryState | None = None
 
@@ -164,8 +194,8 @@ class VirtualObjects:
             self._shown, self._board = shown, board
             animated = {item.id: self._animated(item) for item in shown}
             self._moving = {name: moving for name, moving in animated.items() if moving is not None}
-            self._standing = {}
             names = {item.id for item in shown}
+            self._standing = {name: kept for name, kept in self._standing.items() if name in names}
             self._resting_lamps = {name: kept for name, kept in self._resting_lamps.items() if name in names}
             self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
         moved = [moving.advance_to(capture_ns) for moving in self._moving.values()]
@@ -177,7 +207,7 @@ class VirtualObjects:
         """Merges and uploads the triangles; returns None if all are degenerate."""
         objects = [self._described(item) for item in self._shown]
         each = [self._placed(item) for item in objects]
-        merged = merge_for_gpu([mesh for meshes in each for mesh in meshes])
+        merged = self._merged([mesh for meshes in each for mesh in meshes])
         points = [np.vstack([_box_corners(mesh.bounds()) for mesh in meshes]) for meshes in each]
         swept = [self._swept(item, held) for item, held in zip(objects, points, strict=True)]
         if not np.ptp(np.vstack(swept), axis=0).any():
@@ -245,19 +275,17 @@ class VirtualObjects:
             self._given[item.material] = given_material(item.material)
         return self._given[item.material]
 
-    def _placed(self, item: PlacedObject) -> list[TriangleMesh]:
-        """Returns an object's meshes in the world."""
-        if item.id in self._standing:
-            return self._standing[item.id]
-        meshes = [mesh.transformed(item.world_from_asset) for mesh in item.meshes]
-        if item.material is not None:
-            meshes = [
-                replace(mesh, material=item.material, colors=None, opacity=None, tangents=None)
-                for mesh in meshes
-            ]
-        if not item.moves:
-            self._standing[item.id] = meshes
-        return meshes
+    def _placed(self, item: PlacedObject) -> Sequence[TriangleMesh]:
+        """Returns an object's meshes in the world: those of before unless it moved."""
+        before = self._standing.get(item.id)
+        self._standing[item.id] = placed = _PlacedMeshes.of(item, before)
+        return placed.meshes
+
+    def _merged(self, meshes: Sequence[TriangleMesh]) -> GpuMesh:
+        """Merges the meshes of all objects."""
+        before, merged = self._kept_merged
+        self._kept_merged = meshes, merged_again(merged, before, meshes)
+        return self._kept_merged[1]
 
     def _swept(self, item: PlacedObject, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:
         """Returns points that enclose the object at all times."""
@@ -300,6 +328,13 @@ def given_material(document: AnyMaterial) -> Material:
     if isinstance(read, GaussianBrdf):
         return Material.from_measured(read)
     return Material.from_texture_by_light(read)
+
+
+def _with_material(meshes: Sequence[TriangleMesh], material: Material | None) -> Sequence[TriangleMesh]:
+    """Returns the meshes with the material that replaces their own, if there is one."""
+    if material is None:
+        return meshes
+    return [each.changed(material=material, colors=None, opacity=None, tangents=None) for each in meshes]
 
 
 def _materials(objects: Sequence[SceneObject]) -> set[AnyMaterial]:

@@ -1,8 +1,7 @@
 """Times per pass: GPU timer queries, or finish + clock where the driver's queries read zero (llvmpipe)."""
 
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from types import TracebackType
 
 import moderngl
@@ -38,12 +37,10 @@ class PassTimers:
 
     def measure(self, name: str) -> AbstractContextManager[None]:
         """Times the GL work issued inside."""
-        return _Queried(self, name) if self._queries else self._clocked(name)
+        return _Queried(self, name) if self._queries else _Clocked(self, name)
 
-    @contextmanager
-    def _clocked(self, name: str) -> Iterator[None]:
-        start_s = time.perf_counter()
-        yield
+    def add_clocked(self, name: str, start_s: float) -> None:
+        """Waits for the GPU, and takes the time of a pass that began at `start_s`."""
         _add_since(start_s, self._submitted, name)
         self._gpu.ctx.finish()
         _add_since(start_s, self._clock, name)
@@ -98,8 +95,27 @@ class PassTimers:
         self._pending, self._current = [], []
 
 
+# Classes, for a frame has fifty, and generators take three times as long.
+class _Clocked:
+    """A pass that the CPU's clock times."""
+
+    __slots__ = ("_name", "_start_s", "_timers")
+
+    def __init__(self, timers: PassTimers, name: str) -> None:
+        self._timers, self._name = timers, name
+
+    def __enter__(self) -> None:
+        self._start_s = time.perf_counter()
+
+    def __exit__(
+        self, fault: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        if fault is None:
+            self._timers.add_clocked(self._name, self._start_s)
+
+
 class _Queried:
-    """A pass that a query times; a class, for a frame has fifty, and generators take three times as long."""
+    """A pass that a query times."""
 
     __slots__ = ("_name", "_query", "_start_s", "_timers")
 

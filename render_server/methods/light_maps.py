@@ -186,7 +186,7 @@ class TracedObjects:
 
     def set_objects(self, objects: GeometryState) -> ObjectBvh:
         """Sets the objects' triangles; their hierarchy is built in the background, or when rays are first traced."""
-        self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
+        self._bvh.set_triangles(objects.drawn.mesh, objects.bounds, objects.buffers)
         return self._bvh
 
     def release(self) -> None:

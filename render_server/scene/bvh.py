@@ -3,8 +3,9 @@
 Many rays are cast on the processor by Embree (`RayCaster`), a single one by `first_hit`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
@@ -45,10 +46,11 @@ class Bvh:
     ) -> bytes:
         """Packs triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex."""
         rows = np.empty((len(self.order), 3, 4), np.float32)
-        first = corners[self.order, 0]
-        rows[:, 0, :3] = first
-        rows[:, 1:, :3] = corners[self.order, 1:] - first[:, None]
-        rows.view(np.int32)[:, :, 3] = vertices[self.order]
+        ordered = corners.take(self.order, axis=0)
+        first = rows[:, 0, :3] = ordered[:, 0]
+        for corner in (1, 2):
+            np.subtract(ordered[:, corner], first, out=rows[:, corner, :3])
+        rows.view(np.int32)[:, :, 3] = vertices.take(self.order, axis=0)
         return rows.tobytes()
 
     @property
@@ -59,24 +61,38 @@ class Bvh:
         return float(areas.sum() / areas[0])
 
     def refitted(self, corners: Float32[np.ndarray, "m 3 3"]) -> "Bvh":
-        """Refits the tree to moved triangles: always correct, and efficient while neighbours stay neighbours."""
-        held = self.leaf & ((1 << COUNT_BITS) - 1)
-        firsts = np.concatenate([[0], np.cumsum(np.where(self.leaf < 0, 0, held))])
-        # A node's triangles follow each other in `order`, up to the first of what comes after its last descendant.
-        spans = np.stack([firsts[:-1], firsts[self.skip]], axis=1).ravel()
-        ordered = corners[self.order]
-        margin = np.float32(ROUNDING * float(np.abs(corners).max()))
-        least, greatest = short_axis.boxes(ordered)
-        low = _over_spans(np.minimum, least, spans) - margin
-        high = _over_spans(np.maximum, greatest, spans) + margin
-        return replace(self, low=low, high=high)
+        """Refits the tree to moved triangles: always correct, and efficient while neighbours stay neighbours.
 
+        Boxes are (low, -high) meanwhile, so that one minimum joins both corners.
+        """
+        least, greatest = short_axis.boxes(corners)
+        triangles = np.hstack([least, -greatest])
+        boxes = np.empty((len(self.leaf), 6), np.float32)
+        leaves, held = self._leaves
+        boxes[leaves] = reduce(np.minimum, [triangles.take(each, axis=0) for each in held])
+        for nodes, second in self._inner:
+            boxes[nodes] = np.minimum(boxes.take(nodes + 1, axis=0), boxes.take(second, axis=0))
+        margin = np.float32(ROUNDING * float(np.abs(boxes[0]).max()))
+        return replace(self, low=boxes[:, :3] - margin, high=margin - boxes[:, 3:])
 
-def _over_spans(
-    reduce: np.ufunc, rows: Float32[np.ndarray, "m 3"], spans: Int64[np.ndarray, " 2k"]
-) -> Float32[np.ndarray, "k 3"]:
-    """Reduces rows from each span's start to its end; the last row is repeated, because an end may lie behind all."""
-    return np.asarray(reduce.reduceat(np.concatenate([rows, rows[-1:]]), spans)[::2])
+    @cached_property
+    def _leaves(self) -> tuple[Int64[np.ndarray, " l"], Int64[np.ndarray, "t l"]]:
+        """The leaves, and the triangles of each; the last one stands in where a leaf holds fewer."""
+        (leaves,) = np.nonzero(self.leaf >= 0)
+        first, count = self.leaf[leaves] >> COUNT_BITS, self.leaf[leaves] & ((1 << COUNT_BITS) - 1)
+        place = np.minimum(np.arange(count.max())[:, None], count - 1)
+        return leaves, self.order[first + place].astype(np.int64)
+
+    @cached_property
+    def _inner(self) -> Sequence[tuple[Int64[np.ndarray, " i"], Int64[np.ndarray, " i"]]]:
+        """Inner nodes of each depth, the deepest first, and the second child of each; the first one follows it."""
+        depths = []
+        nodes = np.zeros(1, np.int64)
+        while len(nodes := nodes[self.leaf[nodes] < 0]):
+            second = self.skip[nodes + 1].astype(np.int64)
+            depths.append((nodes, second))
+            nodes = np.concatenate([nodes + 1, second])
+        return depths[::-1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.scene.asset_check import check_mesh_file
 from deltalight.render_server.scene.gltf_meshes import GltfAsset, load_gltf
 from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.moved_meshes import transformed
 from deltalight.render_server.scene.triangle_mesh import (
     FileGeometry,
     TriangleMesh,
@@ -115,7 +116,7 @@ def _parts(scene: "trimesh.Scene", path: Path) -> list[tuple[int, TriangleMesh]]
         made = converted(_file_geometry(geometry, path), materials[key], path)
         if made is not None:
             mesh = made.mesh
-            parts.append((key, mesh if np.array_equal(matrix, np.eye(4)) else mesh.transformed(matrix)))
+            parts.append((key, mesh if np.array_equal(matrix, np.eye(4)) else transformed(mesh, matrix)))
     return parts
 
 

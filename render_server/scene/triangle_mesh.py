@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
@@ -186,23 +187,12 @@ class TriangleMesh:
         is_used[self.triangles.ravel()] = True
         return np.flatnonzero(is_used)
 
-    def transformed(self, matrix: Float64[np.ndarray, "4 4"]) -> "TriangleMesh":
-        """Returns the mesh in another frame; a mirroring matrix reverses the winding."""
-        linear = matrix[:3, :3]
-        positions = self.positions @ linear.T + matrix[:3, 3]
-        normals = self.normals @ np.linalg.inv(linear)
-        normals /= np.maximum(short_axis.lengths(normals)[:, None], 1e-30)
-        mirrored = bool(np.linalg.det(linear) < 0)
-        moved = replace(
-            self,
-            positions=positions.astype(np.float32),
-            normals=normals.astype(np.float32),
-            triangles=np.ascontiguousarray(self.triangles[:, ::-1]) if mirrored else self.triangles,
-            tangents=None if self.tangents is None else turned_tangents(self.tangents, linear, mirrored),
-        )
+    def changed(self, **attributes: Any) -> "TriangleMesh":  # noqa: ANN401 (of any attribute)
+        """Returns the mesh with other attributes; its triangles use the same vertices."""
+        mesh = replace(self, **attributes)
         if "_used" in vars(self):  # the same, and it takes longer to find than to move the mesh
-            vars(moved)["_used"] = self._used
-        return moved
+            vars(mesh)["_used"] = self._used
+        return mesh
 
 
 def turned_tangents(
@@ -446,15 +436,14 @@ def _placement(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 6"] | N
 
 
 def _interleaved(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 12"]:
-    """Returns the vertices of meshes as rows; written by columns, because NumPy is slow along short rows."""
+    """Returns the vertices of meshes as rows."""
     ends = np.cumsum([len(mesh.positions) for mesh in meshes])
     rows = np.empty((ends[-1], 12), np.float32)
     for index, (mesh, end) in enumerate(zip(meshes, ends, strict=True)):
         own = rows[end - len(mesh.positions) : end]
         for first, values in ((0, mesh.positions), (3, mesh.normals), (6, mesh.uv), (8, mesh.colors)):
             if values is not None:
-                for column, part in enumerate(values.T, first):
-                    own[:, column] = part
+                write_columns(own, first, values)
         if mesh.uv is None:
             own[:, 6:8] = 0
         if mesh.colors is None:
@@ -463,3 +452,9 @@ def _interleaved(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 12"]:
         if mesh.opacity is not None:
             own[:, 11] += CLEAR_FRACTION * (1 - np.clip(mesh.opacity[:, 0], 0, 1))
     return rows
+
+
+def write_columns(rows: Float32[np.ndarray, "n 12"], first: int, values: Float32[np.ndarray, "n k"]) -> None:
+    """Writes k columns from `first` on; one by one, because NumPy is slow along short rows."""
+    for column, part in enumerate(values.T, first):
+        rows[:, column] = part

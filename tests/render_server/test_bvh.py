@@ -14,7 +14,9 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers, ObjectBvh, bvh_rows, bvh_texture
-from deltalight.render_server.scene.bvh import LEAF_SIZE, Bvh, RayCaster, build_bvh
+from deltalight.render_server.scene.bvh import COUNT_BITS, LEAF_SIZE, ROUNDING, Bvh, RayCaster, build_bvh
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 RAYS = 2048
@@ -42,6 +44,13 @@ def torus() -> np.ndarray:
 def vertices_of(corners: np.ndarray) -> np.ndarray:
     """Each corner is a vertex of its own."""
     return np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+
+
+def mesh_of(corners: np.ndarray) -> GpuMesh:
+    """Each corner is a vertex of its own."""
+    positions = corners.reshape(-1, 3)
+    triangles = vertices_of(corners)
+    return merge_for_gpu([TriangleMesh(positions, np.zeros_like(positions), triangles, None, Material())])
 
 
 def random_rays(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -216,6 +225,20 @@ def test_a_refitted_bvh_is_the_built_one_and_finds_what_moved(gpu: GpuContext) -
     np.testing.assert_allclose(found[both, 0], expected[both], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("count", [1, 3, 5, 700])
+def test_each_box_of_a_refitted_bvh_just_holds_its_triangles(count: int) -> None:
+    moved = build_bvh(soup(count)).refitted(soup(count, seed=1))
+    leaves = moved.leaf >= 0
+    held = np.where(leaves, moved.leaf & ((1 << COUNT_BITS) - 1), 0)
+    firsts = np.concatenate([[0], np.cumsum(held)])
+    corners = soup(count, seed=1)[moved.order]
+    margin = np.float32(ROUNDING * float(np.abs(corners).max()))
+    for node, (low, high) in enumerate(zip(moved.low, moved.high, strict=True)):
+        own = corners[firsts[node] : firsts[moved.skip[node]]]
+        np.testing.assert_array_equal(low, own.min(axis=(0, 1)) - margin)
+        np.testing.assert_array_equal(high, own.max(axis=(0, 1)) + margin)
+
+
 def test_a_refitted_bvh_of_shuffled_triangles_is_worn(gpu: GpuContext) -> None:
     """What has the same number of triangles but nothing in common costs so much that it is built anew."""
     corners = torus()
@@ -223,10 +246,9 @@ def test_a_refitted_bvh_of_shuffled_triangles_is_worn(gpu: GpuContext) -> None:
     assert build_bvh(corners).refitted(shuffled).cost > 10 * build_bvh(corners).cost
     objects = ObjectBvh(gpu)
     mesh = MeshBuffers(gpu)
-    mesh.triangles = vertices_of(corners)
     bounds = (corners.min(axis=(0, 1)), corners.max(axis=(0, 1)))
     for each in (corners, shuffled):
-        objects.set_triangles(each, bounds, mesh)
+        objects.set_triangles(mesh_of(each), bounds, mesh)
         nodes = objects.bindings["bvh_nodes"]
         assert isinstance(nodes, moderngl.Texture)
         packed = build_bvh(each).packed()

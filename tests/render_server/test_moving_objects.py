@@ -126,6 +126,38 @@ def vertices_of(buffers: MeshBuffers) -> bytes:
     return vertices.read()
 
 
+def test_what_moved_or_changed_is_as_if_it_had_been_loaded_there(gpu: GpuContext, stage: Stage) -> None:
+    """Dragged, turned, of another material, smaller, beside another object, and gone."""
+    asset = baked(stage.folder, bent_bar(stage.folder), 0.3)
+    other = placed(asset, pose={"translation_m": [0.2, 0.1, 0.3]}, id="other")
+    turned = {"translation_m": [0.02, 0, 0.1], "rotation_wxyz": [0.9, 0.1, 0.2, 0.3]}
+    scenes = [
+        [placed(asset), other],
+        [placed(asset, pose={"translation_m": [0.02, 0, 0.1]}), other],
+        [placed(asset, pose=turned), other],
+        [placed(asset, pose=turned, material={"base_color": [0.1, 0.2, 0.3]}), other],
+        [placed(asset, pose={**turned, "scale": 0.5}), {**other, "material": None}],
+        [{**other, "material": None}],
+        [placed(asset), other],
+    ]
+    objects = VirtualObjects(gpu)
+    for items in scenes:
+        fresh = VirtualObjects(gpu)
+        scene = shown(stage, *items)
+        made = []
+        for each in (objects, fresh):
+            each.load(scene.objects)
+            state = each.update(scene.objects, None, 0)
+            assert state is not None
+            mesh = state.drawn.mesh
+            buffer = vertices_of(state.buffers)[: mesh.vertices.nbytes]
+            made.append((buffer, mesh.vertices, mesh.triangles, mesh.material_table, state.points))
+        for one, expected in zip(*made, strict=True):
+            np.testing.assert_array_equal(one, expected)
+        fresh.release()
+    objects.release()
+
+
 def test_while_it_plays_triangles_are_those_of_the_baked_pose(gpu: GpuContext, stage: Stage) -> None:
     asset = bent_bar(stage.folder)
     pose = {"scale": 0.1, "rotation_wxyz": [0.9, 0.1, 0.2, 0.3], "translation_m": [0.1, 0.2, 0.3]}
