@@ -95,10 +95,13 @@ def _with_epilogue(stage: str, text: str) -> str:
 
 
 def _without_places(stage: str, qualifiers: str, declared: str) -> str:
-    """Returns a declaration without the places that glslang chose: those are given, or matched by name, at linking."""
-    matched = " uniform " in f" {declared}" or " buffer " in f" {declared}"
+    """Returns a declaration without the places that glslang chose.
+
+    Those of uniforms and buffers are given after linking; linking matches what one stage hands to the next by name.
+    """
     interface = _INTERFACE.get(stage)
-    if not (matched or (interface is not None and interface.match(declared))):
+    is_resource = not {"uniform", "buffer"}.isdisjoint(declared.split())
+    if not (is_resource or (interface is not None and interface.match(declared))):
         return f"layout({qualifiers}) {declared}"
     kept = ", ".join(each for each in qualifiers.split(", ") if not _PLACE.match(each))
     return f"layout({kept}) {declared}" if kept else declared

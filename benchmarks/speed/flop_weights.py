@@ -9,7 +9,7 @@ filtering of textures count nothing.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,8 @@ class Cost:
         return Cost(self.flops + other.flops, self.special + other.special)
 
 
-class Shape(NamedTuple):
+@dataclass(frozen=True)
+class Shape:
     """Columns and rows of a floating-point type; a vector has one column, a scalar one row."""
 
     columns: int

@@ -20,8 +20,10 @@ DECORATIONS: Final = range(71, 76)
 MERGES, ENDS = (246, 247), range(249, 256)
 PRIVATE = 6
 UNDEFINED, FIRST_VALUE = 1, 41
-WITHOUT_RESULT: Final = frozenset({*MERGES, *ENDS, 56, STORE, 63, 64, *DECORATIONS, 99, 224, 225, 228, 248, 317})
-"""Opcodes from FIRST_VALUE on that give no value: ends of blocks and functions, stores, decorations, barriers, lines."""
+WITHOUT_RESULT: Final = frozenset(
+    {*MERGES, *ENDS, 56, STORE, 63, 64, *DECORATIONS, 99, 224, 225, 228, 248, 317}
+)
+"""Opcodes from FIRST_VALUE on that give no value: ends of blocks and functions, stores, decorations, barriers."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,9 @@ class _Counters:
     def __init__(self, header: Sequence[int], instructions: Sequence[Instruction]) -> None:
         self.bound = header[3]
         self.declared: list[Instruction] = []
-        known = {(each.opcode, each.words[1:]): each.words[0] for each in instructions if each.opcode in TYPES}
+        known = {
+            (each.opcode, each.words[1:]): each.words[0] for each in instructions if each.opcode in TYPES
+        }
         self._uint = known.get((TYPE_INT, (32, 0))) or self._declare(TYPE_INT, 32, 0)
         wanted = PRIVATE, self._uint
         self._pointer = known.get((TYPE_POINTER, wanted)) or self._declare(TYPE_POINTER, *wanted)

@@ -53,19 +53,26 @@ def _frame_cells(found: MotionFigures, frames: int) -> list[str]:
 
 def stages_table(title: str, found: MotionFigures) -> Table:
     """Return the stages of one motion in the order in which they ran."""
-    headings = ("median ms", "p95", "submit", "runs in", "MB", "floor ms", "times floor")
+    headings = ["median ms", "p95", "submit", "runs in", "MB", "floor ms", "times floor"]
+    counts = any(stage.flops is not None for stage in found.stages.values())
+    headings[5:6] = ["MFLOP", "special", "floor ms", "of"] if counts else ["floor ms"]
     table = figure_table(title, ("Stage",), headings)
     for name, stage in found.stages.items():
         submit = MISSING if stage.submit_ms is None else f"{stage.submit_ms.median:.2f}"
-        table.add_row(name, *_both(stage.ms, 2), submit, f"{stage.runs:.0%}", *_floor_cells(stage))
+        moved = MISSING if stage.moved_bytes is None else f"{stage.moved_bytes / 1e6:.1f}"
+        floor = MISSING if stage.floor_ms is None else f"{stage.floor_ms:.3f}"
+        times = MISSING if stage.times_floor is None else f"{stage.times_floor:.1f}"
+        sides = [moved, *_arithmetic_cells(stage), floor, stage.bound or ""] if counts else [moved, floor]
+        table.add_row(name, *_both(stage.ms, 2), submit, f"{stage.runs:.0%}", *sides, times)
     return table
 
 
-def _floor_cells(stage: StageFigures) -> tuple[str, str, str]:
-    if stage.moved_bytes is None or stage.floor_ms is None:
-        return MISSING, MISSING, MISSING
-    times = MISSING if stage.times_floor is None else f"{stage.times_floor:.1f}"
-    return f"{stage.moved_bytes / 1e6:.1f}", f"{stage.floor_ms:.3f}", times
+def _arithmetic_cells(stage: StageFigures) -> tuple[str, str]:
+    """Return operations, special functions among them, and what share these are."""
+    if stage.flops is None or stage.special_functions is None:
+        return MISSING, MISSING
+    total = stage.flops + stage.special_functions
+    return f"{total / 1e6:.2f}", f"{stage.special_functions / total:.0%}" if total else MISSING
 
 
 def _both(spread: Spread, digits: int = 1) -> tuple[str, str]:
