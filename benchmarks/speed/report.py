@@ -51,13 +51,6 @@ class StageFigures(StrictModel):
             return None
         return self.ms.median / self.floor_ms
 
-    @property
-    def bound(self) -> Literal["bytes", "flops"] | None:
-        """What the floor follows from, where arithmetic was counted."""
-        if self.arithmetic_floor_ms is None or self.floor_ms is None or self.floor_ms < LEAST_FLOOR_MS:
-            return None
-        return "flops" if self.arithmetic_floor_ms == self.floor_ms else "bytes"
-
 
 class MotionFigures(StrictModel):
     """One motion by one method.

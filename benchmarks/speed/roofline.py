@@ -11,11 +11,15 @@ from deltalight.benchmarks.speed.arithmetic import ArithmeticCounter, counted_ar
 from deltalight.benchmarks.speed.flop_weights import Cost
 from deltalight.benchmarks.speed.measure import WARM_UP_FRAMES, Keep, SpeedJob, opened, rendering, time_step
 from deltalight.benchmarks.speed.motions import Step, prepare_take, steps_of
-from deltalight.benchmarks.speed.report import Peaks, SpeedReport, StageFigures
+from deltalight.benchmarks.speed.peaks import stage_bytes
+from deltalight.benchmarks.speed.report import MotionFigures, Peaks, SpeedReport, StageFigures
 from deltalight.benchmarks.variants import RENDERED, parse_variants
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext, is_software_renderer
 from deltalight.render_server.renderer import SceneRenderer
+
+ALIKE = 1.5
+"""How many times as much stages may hold as in the report: versions differ by a buffer, volumes by twice that."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +51,16 @@ class RooflineJob:
 
 
 def count_roofline(job: RooflineJob, progress: Progress, keep: Keep) -> SpeedReport:
-    """Returns the report with the arithmetic of the chosen methods and motions, which are rendered here.
+    """Returns the report's chosen methods and motions with their arithmetic, which are rendered here.
 
     Times stay those of the report. Where it is of a GPU, stages are rendered as on a GPU. `keep` is given the report
     after every motion.
 
     Raises:
-        DeltalightError: a tool is missing, nothing was chosen, or as `measure_speed`.
+        DeltalightError: a tool is missing, nothing was chosen, volumes of other sizes, or as `measure_speed`.
     """
-    chosen, report = job.chosen(), job.report
+    chosen = job.chosen()
+    report = _only(job.report, chosen)
     variants = parse_variants(",".join(chosen), RENDERED)
     scenes = SpeedJob(variants, [], job.frames, report.size, job.device).scenes()
     with counted_arithmetic() as counter, _opened_as_reported(job) as gpu:
@@ -65,9 +70,42 @@ def count_roofline(job: RooflineJob, progress: Progress, keep: Keep) -> SpeedRep
                 renderer.render(take.standing[0])
                 for motion in progress.track(motions, description=f"counting {name}"):
                     steps = steps_of(motion, take, scenes[name], WARM_UP_FRAMES + job.frames)
-                    report = with_arithmetic(report, name, motion, _count_motion(renderer, counter, steps))
+                    counts = _count_motion(renderer, counter, steps)
+                    moved = {} if renderer.graph is None else stage_bytes(renderer.graph)
+                    require_sizes(name, report.methods[name].motions[motion], moved)
+                    report = with_arithmetic(report, name, motion, counts)
                     keep(report)
     return report
+
+
+def _only(report: SpeedReport, chosen: Mapping[str, Sequence[str]]) -> SpeedReport:
+    """Returns the chosen methods and motions of a report."""
+    methods = {
+        name: report.methods[name].model_copy(
+            update={"motions": {motion: report.methods[name].motions[motion] for motion in motions}}
+        )
+        for name, motions in chosen.items()
+    }
+    return report.model_copy(update={"methods": methods})
+
+
+def require_sizes(method: str, found: MotionFigures, moved: Mapping[str, int]) -> None:
+    """Checks that stages hold about as much here (`moved`, bytes by stage) as in the report.
+
+    Raises:
+        DeltalightError: they do not; volumes whose size no setting names are as large as the machine allows.
+    """
+    both = [
+        (stage.moved_bytes, moved[name])
+        for name, stage in found.stages.items()
+        if stage.moved_bytes is not None and name in moved
+    ]
+    reported, here = (sum(each) for each in zip((0, 0), *both, strict=True))
+    if not reported / ALIKE <= here <= reported * ALIKE:
+        raise DeltalightError(
+            f"The stages of {method} hold {reported / 1e6:.0f} MB in the report and {here / 1e6:.0f} MB here, so "
+            "their arithmetic differs too: give `bench speed --methods` the size of the volume (volume_size=64)."
+        )
 
 
 def with_arithmetic(report: SpeedReport, method: str, motion: str, counts: Mapping[str, Cost]) -> SpeedReport:
