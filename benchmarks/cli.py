@@ -97,6 +97,34 @@ def counts(
 
 
 @bench.command()
+def roofline(
+    *,
+    report: Annotated[Path, typer.Argument(help="Report of `bench speed --out`; its times are kept.")],
+    methods: Annotated[
+        str | None, typer.Option(help="Which of the report's methods, as for `bench speed`; default: all.")
+    ] = None,
+    motions: Annotated[
+        str | None, typer.Option(help="Which of the report's motions, separated by commas; default: all.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames to count of each motion.")] = 3,
+    device: Device = None,
+    out: ReportFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Count the arithmetic of a speed report's stages, and show how far they are from the machine's limits."""
+    from deltalight.benchmarks.variants import RENDERED, parse_variants
+
+    named = None if methods is None else [variant.name for variant in parse_variants(methods, RENDERED)]
+    from deltalight.benchmarks.speed.command import run_roofline
+    from deltalight.benchmarks.speed.motions import parse_motions
+    from deltalight.benchmarks.speed.report import read_report
+    from deltalight.benchmarks.speed.roofline import RooflineJob
+
+    moved = None if motions is None else parse_motions(motions)
+    run_roofline(RooflineJob(read_report(report), named, moved, frames, device), out=out, as_json=as_json)
+
+
+@bench.command()
 def views(
     *,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of each camera's pictures.")] = "320x240",

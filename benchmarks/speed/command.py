@@ -1,4 +1,4 @@
-"""`deltalight bench speed` and `bench counts` with parsed options."""
+"""`deltalight bench speed`, `bench counts` and `bench roofline` with parsed options."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,8 +12,9 @@ from rich.progress import Progress
 from deltalight.benchmarks.report_output import put_report
 from deltalight.benchmarks.speed.compare import compare_reports, print_comparison
 from deltalight.benchmarks.speed.counts import count_frames, print_counts
-from deltalight.benchmarks.speed.measure import SpeedJob, measure_speed
+from deltalight.benchmarks.speed.measure import Keep, SpeedJob, measure_speed
 from deltalight.benchmarks.speed.report import SpeedReport
+from deltalight.benchmarks.speed.roofline import RooflineJob, count_roofline
 from deltalight.benchmarks.speed.sweep import as_data, measure_sweeps, print_sweeps
 from deltalight.benchmarks.speed.tables import print_report
 from deltalight.protocol.files import write_bytes
@@ -21,6 +22,19 @@ from deltalight.protocol.files import write_bytes
 
 def run_speed(job: SpeedJob, budget_ms: float, *, end_to_end: bool, out: Path | None, as_json: bool) -> None:
     """Measure, write the report to `out` if given after every motion, and print it, also if it is stopped before."""
+    with _kept(out, as_json=as_json) as keep, _progress() as progress:
+        measure_speed(job, budget_ms, progress, keep, end_to_end=end_to_end)
+
+
+def run_roofline(job: RooflineJob, *, out: Path | None, as_json: bool) -> None:
+    """Count, write the report to `out` if given after every motion, and print it, also if it is stopped before."""
+    with _kept(out, as_json=as_json) as keep, _progress() as progress:
+        count_roofline(job, progress, keep)
+
+
+@contextmanager
+def _kept(out: Path | None, *, as_json: bool) -> Iterator[Keep]:
+    """Gives what takes a report that grows and writes it to `out`, and prints the newest at the end."""
     newest: SpeedReport | None = None
 
     def keep(report: SpeedReport) -> None:
@@ -30,8 +44,7 @@ def run_speed(job: SpeedJob, budget_ms: float, *, end_to_end: bool, out: Path | 
             write_bytes(out, _as_text(report).encode())
 
     try:
-        with _progress() as progress:
-            measure_speed(job, budget_ms, progress, keep, end_to_end=end_to_end)
+        yield keep
     finally:  # Ctrl-C, or a method that fails after others were measured
         if newest is not None:
             _print_speed(newest, as_json=as_json)

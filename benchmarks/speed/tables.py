@@ -52,20 +52,35 @@ def _frame_cells(found: MotionFigures, frames: int) -> list[str]:
 
 
 def stages_table(title: str, found: MotionFigures) -> Table:
-    """Return the stages of one motion in the order in which they ran."""
-    headings = ("median ms", "p95", "submit", "runs in", "MB", "floor ms", "times floor")
-    table = figure_table(title, ("Stage",), headings)
+    """Return the stages of one motion in the order in which they ran; with arithmetic, if it was counted."""
+    counts = any(stage.flops is not None for stage in found.stages.values())
+    counted, timed = (
+        ("MB", "MFLOP", "special", "flops ms", "floor ms"),
+        ("p95", "submit", "runs in", "MB", "floor ms"),
+    )
+    table = figure_table(title, ("Stage",), ("median ms", *(counted if counts else timed), "times floor"))
     for name, stage in found.stages.items():
-        submit = MISSING if stage.submit_ms is None else f"{stage.submit_ms.median:.2f}"
-        table.add_row(name, *_both(stage.ms, 2), submit, f"{stage.runs:.0%}", *_floor_cells(stage))
+        moved = MISSING if stage.moved_bytes is None else f"{stage.moved_bytes / 1e6:.1f}"
+        floor = MISSING if stage.floor_ms is None else f"{stage.floor_ms:.3f}"
+        times = MISSING if stage.times_floor is None else f"{stage.times_floor:.1f}"
+        arithmetic = moved, *_arithmetic_cells(stage), floor
+        further = arithmetic if counts else (*_run_cells(stage), moved, floor)
+        table.add_row(name, f"{stage.ms.median:.2f}", *further, times)
     return table
 
 
-def _floor_cells(stage: StageFigures) -> tuple[str, str, str]:
-    if stage.moved_bytes is None or stage.floor_ms is None:
+def _run_cells(stage: StageFigures) -> tuple[str, str, str]:
+    submit = MISSING if stage.submit_ms is None else f"{stage.submit_ms.median:.2f}"
+    return f"{stage.ms.p95:.2f}", submit, f"{stage.runs:.0%}"
+
+
+def _arithmetic_cells(stage: StageFigures) -> tuple[str, str, str]:
+    """Return operations, the share of special functions among them, and what they take at the peak."""
+    if stage.flops is None or stage.special_functions is None:
         return MISSING, MISSING, MISSING
-    times = MISSING if stage.times_floor is None else f"{stage.times_floor:.1f}"
-    return f"{stage.moved_bytes / 1e6:.1f}", f"{stage.floor_ms:.3f}", times
+    total = stage.flops + stage.special_functions
+    share = f"{stage.special_functions / total:.0%}" if total else MISSING
+    return f"{total / 1e6:.2f}", share, f"{stage.arithmetic_floor_ms:.3f}"
 
 
 def _both(spread: Spread, digits: int = 1) -> tuple[str, str]:
