@@ -1,5 +1,6 @@
 """Delta light propagation volumes ([P2], docs/method.md 5)."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -37,10 +38,12 @@ from deltalight.render_server.passes.lpv import (
     LpvPropagate,
     LpvShow,
     LpvStart,
+    LpvStartChange,
     PropagatedLight,
     cells_of,
     injected_sums,
     lobe_weights,
+    medium_bindings,
     moment_weights,
 )
 from deltalight.render_server.passes.lpv_lighting import (
@@ -55,6 +58,9 @@ from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import MOST_VOLUMES, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 
+STEPS_OF_A_BOUNCE = 1 / 4
+"""Share of the steps: V_rho starts with the light of V_mu, and each bounce goes on where the one before ended."""
+
 
 class Propagated:
     """A light volume and its steps."""
@@ -64,12 +70,40 @@ class Propagated:
         self._weights, self._steps = moment_weights(cells) if has_moments else lobe_weights(), steps
         self.light = LightVolume(gpu, cells)
         self._start = LpvStart(gpu)
+        self._start_change = LpvStartChange(gpu)
         self._propagate = LpvPropagate(gpu)
+        self._in_place = self._propagate.is_in_place(cells, steps)
 
     def run(self, through: moderngl.Texture3D | None, *injected: moderngl.Buffer) -> LightVolume:
-        """Propagates the light of one to three injected sums, added up; without `through` nothing blocks it."""
+        """Propagates the light of one or two injected sums, added up; without `through` nothing blocks it."""
         self._start.run(self.light, *injected)
-        self._propagate.run(self.light, self._weights, self._steps, through)
+        return self._go(self._steps, through)
+
+    def run_change(
+        self,
+        before: LightVolume,
+        change: moderngl.Buffer,
+        through_real: moderngl.Texture3D | None,
+        through: moderngl.Texture3D | None,
+    ) -> LightVolume:
+        """Propagates what objects change of the light `before`."""
+        medium = medium_bindings(self.light.cells, self._weights, through)
+        self._start_change.run(self.light, before, change, medium, through_real, in_place=self._in_place)
+        return self._go(self._steps, through)
+
+    def go_on(
+        self,
+        through: moderngl.Texture3D | None,
+        injected: moderngl.Buffer,
+        known: moderngl.Buffer | None,
+    ) -> LightVolume:
+        """Adds what the sums `injected` have more than those `known`, and propagates on by STEPS_OF_A_BOUNCE."""
+        self._start.add(self.light, injected, known)
+        return self._go(math.ceil(STEPS_OF_A_BOUNCE * self._steps), through)
+
+    def _go(self, steps: int, through: moderngl.Texture3D | None) -> LightVolume:
+        medium = medium_bindings(self.light.cells, self._weights, through)
+        self._propagate.run(self.light, medium, steps, in_place=self._in_place)
         return self.light
 
     def release(self) -> None:
@@ -80,9 +114,8 @@ class Propagated:
 class DifferenceVolumes:
     """V_rho and V_mu.
 
-    V_mu starts from the real scene's light without objects, V_rho from that and the change due to them. Each bounce
-    propagates V_rho again with the light that surfaces reflect of it; the last one, if there are two, with what all
-    later ones would add.
+    V_mu starts from the real scene's light without objects, V_rho from V_mu and the change due to them. Each bounce
+    adds to V_rho what surfaces reflect of its light; the last one, if there are two, what all later ones would add.
     """
 
     def __init__(self, gpu: GpuContext, settings: DlpvMethod, size: int) -> None:
@@ -98,22 +131,24 @@ class DifferenceVolumes:
         return self._mu.run(through, injected)
 
     def propagate_rho(
-        self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Texture3D | None
+        self,
+        mu: LightVolume,
+        change: moderngl.Buffer,
+        through_real: moderngl.Texture3D | None,
+        through: moderngl.Texture3D | None,
     ) -> LightVolume:
         """Propagates V_rho."""
-        return self._rho.run(through, real, change)
+        return self._rho.run_change(mu, change, through_real, through)
 
     def bounce(
         self,
         rho: LightVolume,
         mu: LightVolume,
         surfels: tuple[VoxelStore, VoxelStore],
-        injected: moderngl.Buffer,
-        change: moderngl.Buffer,
         scene: Bindings,
         through: moderngl.Texture3D | None,
     ) -> tuple[LightVolume, moderngl.Buffer | None]:
-        """Propagates V_rho again, with the light that surfaces reflect of the previous pass.
+        """Propagates V_rho on, with the light that surfaces reflect of it.
 
         Returns it and the sums of what they reflect; None if there is no bounce.
         """
@@ -127,7 +162,7 @@ class DifferenceVolumes:
                 self._tail.measure(self._before, self._bounced)
             if number == last > 1:
                 self._tail.extend(self._before, self._bounced)
-            self._rho.run(through, injected, change, self._bounced)
+            self._rho.go_on(through, self._bounced, self._before if number > 1 else None)
         clear_ahead(self._gpu, (self._before, self._before.size))
         return rho, self._bounced if last > 0 else None
 
@@ -312,11 +347,11 @@ def difference_stages(
     propagate_rho = ForEachVolume(pool, DifferenceVolumes.propagate_rho)
     mu = g.stage("propagate mu", propagate_mu, "inject real", "geometry volume real")
     c = cell_stages(g, s, lit, settings, cubes, size)
-    first = g.stage("propagate rho", propagate_rho, c.real_light, c.change, c.through)
+    first = g.stage("propagate rho", propagate_rho, mu, c.change, c.through_real, c.through)
     surfels = g.value("surfels", both_surfels, c.real, c.objects)
     names = "bounces", "reflected light"
     bounce = ForEachVolume(pool, DifferenceVolumes.bounce, outputs=len(names))
-    bounced = first, mu, surfels, c.real_light, c.change, c.joint, c.through
+    bounced = first, mu, surfels, c.joint, c.through
     rho, reflected = g.stages("bounces", bounce, *bounced, outputs=names)
     sources = exchanged(g, s, cubes, c.change, c.covered, reflected)
     all_mu, all_rho = joined(g, "light mu", mu), joined(g, "light rho", rho)

@@ -170,8 +170,8 @@ def release_held(owner: object) -> None:
 class CellStages:
     """The resources of cells of one size (`cell_stages`), each of all volumes.
 
-    `through` is what lets light pass between cells, `covered` what the objects cover of their faces; `real` and
-    `objects` are surfels.
+    `through` is what lets light pass between cells, `through_real` without the objects, `covered` what the objects
+    cover of their faces; `real` and `objects` are surfels.
     """
 
     real: Resource[PerVolume[VoxelStore]]
@@ -179,6 +179,7 @@ class CellStages:
     joint: Resource[PerVolume[dict[str, Binding]]]
     real_light: Resource[PerVolume[moderngl.Buffer]]
     change: Resource[PerVolume[moderngl.Buffer]]
+    through_real: Resource[PerVolume[moderngl.Texture3D | None]]
     through: Resource[PerVolume[moderngl.Texture3D | None]]
     covered: Resource[PerVolume[moderngl.Buffer | None]]
 
@@ -214,4 +215,4 @@ def cell_stages(
     names = f"geometry volume{suffix}", f"covered by objects{suffix}"
     cover = ForEachVolume(pool, LpvCells.cover_joint, outputs=len(names))
     through, covered = g.stages(names[0], cover, *blocking, outputs=names)
-    return CellStages(real, objects, joint, real_light, change, through, covered)
+    return CellStages(real, objects, joint, real_light, change, through_real, through, covered)

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_3d
 from deltalight.render_server.passes.mesh_buffers import NO_CUTOUTS
@@ -97,6 +97,7 @@ class LightVolume:
         self.cells = cells
         size = (cells, cells, 3 * cells)
         self.state, self.next_state, self.total = (texture_3d(gpu, size, 4, "f4") for _ in range(3))
+        self.colour = 0  # of the cells that the next half step changes
 
     def swap(self) -> None:
         """Makes the last output the current state."""
@@ -182,24 +183,81 @@ def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
 
 
 class LpvStart:
-    """Converts fixed-point sums of injected light into the state before the first step."""
+    """Converts fixed-point sums of injected light into the state before the first step, or adds them to it later."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._kernel = Kernel(gpu, "lpv_start")
+        self._start, self._add = Kernel(gpu, "lpv_start"), Kernel(gpu, "lpv_start", ADD=1)
 
-    def run(self, volume: LightVolume, *sums: moderngl.Buffer) -> None:
-        """Initialises state and total of `volume` with one to three `sums`, added up."""
-        first, second, third = (*sums, None, None)[:3]
-        self._kernel.run(
+    def run(
+        self, volume: LightVolume, injected: moderngl.Buffer, more: moderngl.Buffer | None = None
+    ) -> None:
+        """Initialises state and total of `volume` with the sums `injected` and `more`, added up."""
+        self._run(self._start, volume, injected, more, 1)
+        volume.colour = 0
+
+    def add(
+        self, volume: LightVolume, injected: moderngl.Buffer, before: moderngl.Buffer | None = None
+    ) -> None:
+        """Adds to light under way what the sums `injected` have more than those of `before`."""
+        self._run(self._add, volume, injected, before, -1)
+
+    def _run(
+        self,
+        kernel: Kernel,
+        volume: LightVolume,
+        first: moderngl.Buffer,
+        second: moderngl.Buffer | None,
+        sign: int,
+    ) -> None:
+        kernel.run(
             (volume.cells**3,),
             First=first,
             Second=second,
-            Third=third,
+            second_sign=0 if second is None else sign,
             state=volume.state,
             total=volume.total,
             cells=volume.cells,
-            count_of_sums=len(sums),
         )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._start, self._add)
+
+
+class LpvStartChange:
+    """Starts a volume with the light of another one, and with what objects change of it: what they send and block."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "lpv_start_change")
+
+    def run(
+        self,
+        volume: LightVolume,
+        before: LightVolume,
+        change: moderngl.Buffer,
+        medium: Bindings,
+        through_real: moderngl.Texture3D | None,
+        *,
+        in_place: bool,
+    ) -> None:
+        """Initialises state and total of `volume` from those `before` and the injected `change`.
+
+        `medium` is that of `volume` (`medium_bindings`); `through_real` lets the light `before` pass; `in_place`: for
+        half steps (`LpvPropagate.is_in_place`).
+        """
+        self._kernel.run(
+            (volume.cells,) * 3,
+            medium,
+            light_mu=before.total,
+            First=change,
+            Second=None,
+            second_sign=0,
+            transmitted_real=through_real,
+            state=volume.state,
+            total=volume.total,
+            in_place=in_place,
+        )
+        volume.colour = 0
 
     def release(self) -> None:
         """Frees the GL object."""
@@ -331,11 +389,24 @@ class LpvTransmit:
         self._joint.release()
 
 
+def medium_bindings(
+    cells: int, weights: StepWeights, transmitted: moderngl.Texture3D | None
+) -> dict[str, Binding]:
+    """Returns the bindings of a step through so many cells an edge; without `transmitted` nothing blocks light."""
+    return {
+        "transmitted": transmitted,
+        "has_geometry": transmitted is not None,
+        "transfer": weights.transfer,
+        "sideways": weights.sideways,
+        "cells": cells,
+    }
+
+
 class LpvPropagate:
     """Propagates light from cell to cell (docs/method.md 5).
 
-    `tiled` runs several steps per dispatch in shared memory (default on a GPU); otherwise each is a dispatch, or two
-    halves are, if light crosses the volume.
+    `tiled` runs several steps per dispatch in shared memory (default on a GPU); otherwise each is a dispatch, or half
+    of one is, `in_place`.
     """
 
     def __init__(self, gpu: GpuContext, *, tiled: bool | None = None) -> None:
@@ -347,22 +418,17 @@ class LpvPropagate:
         )
         self._half_step = None if self._tiled else Kernel(gpu, "lpv_half_step")
 
-    def run(
-        self, volume: LightVolume, weights: StepWeights, steps: int, transmitted: moderngl.Texture3D | None
-    ) -> None:
-        """Runs `steps` steps; without `transmitted` nothing blocks light.
+    def is_in_place(self, cells: int, steps: int) -> bool:
+        """Whether so many steps in all are best run `in_place`: light crosses the volume, and is not tiled."""
+        return self._half_step is not None and steps >= cells
 
-        If not `tiled`, and light crosses the volume, half of the cells have one step more, and `volume` keeps the
-        state before the first step.
+    def run(self, volume: LightVolume, medium: Bindings, steps: int, *, in_place: bool = False) -> None:
+        """Runs `steps` steps through a medium (`medium_bindings`).
+
+        `in_place`, half steps of alternating colours change the total alone, and the state is what is injected into
+        the volume: cells of one colour have a step more. Otherwise the state is the light of the last step.
         """
-        medium: Bindings = {
-            "transmitted": transmitted,
-            "has_geometry": transmitted is not None,
-            "transfer": weights.transfer,
-            "sideways": weights.sideways,
-            "cells": volume.cells,
-        }
-        if self._half_step is not None and steps >= volume.cells:
+        if in_place and self._half_step is not None:
             _run_halves(self._half_step, volume, steps, medium)
         else:
             self._run_whole(volume, steps, medium)
@@ -384,7 +450,8 @@ class LpvPropagate:
 
 
 def _run_halves(half_step: Kernel, volume: LightVolume, steps: int, medium: Bindings) -> None:
-    """Runs so many half steps that every cell of both colours has at least `steps`."""
+    """Runs half steps, from the colour after the last one; cells of both colours have at least `steps`."""
     threads = (-(-volume.cells // 2), volume.cells, volume.cells)
-    for number in range(steps + 1):
-        half_step.run(threads, medium, state=volume.state, total=volume.total, colour=number % 2)
+    for _ in range(steps + (volume.colour == 0)):
+        half_step.run(threads, medium, state=volume.state, total=volume.total, colour=volume.colour)
+        volume.colour = 1 - volume.colour

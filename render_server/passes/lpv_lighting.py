@@ -7,7 +7,7 @@ import moderngl
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import list_threads
+from deltalight.render_server.gpu.list_groups import list_threads, map_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -26,6 +26,7 @@ class LpvInjectMaps:
     """Adds the light of reflective shadow maps to fixed-point sums ([P2] 4.3)."""
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
         self._real = Kernel(gpu, "lpv_inject_maps", REAL=1, GREATEST_ALPHA=GREATEST_ALPHA)
         self._change = Kernel(gpu, "lpv_inject_maps", GREATEST_ALPHA=GREATEST_ALPHA)
         self._direct = Kernel(gpu, "lpv_inject_maps", DIRECT=1, GREATEST_ALPHA=GREATEST_ALPHA)
@@ -35,7 +36,7 @@ class LpvInjectMaps:
     ) -> None:
         """Adds the light that the real scene reflects as if there were no objects."""
         views = [view for view in range(len(lights.real_views)) if view not in lights.real_views_of_objects]
-        _inject_views(self._real, views, lights, scene, Injected=sums, real_albedo=real_albedo)
+        self._inject_views(self._real, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
     def add_change(
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
@@ -45,12 +46,19 @@ class LpvInjectMaps:
         Of lights that come with objects, adds what all of the real scene reflects.
         """
         own: dict[str, Binding] = {"Injected": sums, "real_albedo": real_albedo}
-        _inject_views(self._real, lights.real_views_of_objects, lights, scene, **own)
-        _inject_views(self._change, _virtual_views(lights), lights, scene, **own)
+        self._inject_views(self._real, lights.real_views_of_objects, lights, scene, **own)
+        self._inject_views(self._change, _virtual_views(lights), lights, scene, **own)
 
     def add_direct(self, sums: moderngl.Buffer, lights: LightBuffers, scene: Bindings) -> None:
         """Adds the direct light that meets the objects, and subtracts what it lit before ([P2] 4.3.2)."""
-        _inject_views(self._direct, _virtual_views(lights), lights, scene, Injected=sums)
+        self._inject_views(self._direct, _virtual_views(lights), lights, scene, Injected=sums)
+
+    def _inject_views(
+        self, kernel: Kernel, views: Iterable[int], lights: LightBuffers, scene: Bindings, **own: Binding
+    ) -> None:
+        threads = (map_threads(self._gpu, lights.tile_size),)
+        for view in views:
+            kernel.run(threads, scene, view_index=view, **own)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -61,13 +69,6 @@ class LpvInjectMaps:
 def _virtual_views(lights: LightBuffers) -> range:
     first = lights.first_virtual_view
     return range(first, first + len(lights.virtual_views))
-
-
-def _inject_views(
-    kernel: Kernel, views: Iterable[int], lights: LightBuffers, scene: Bindings, **own: Binding
-) -> None:
-    for view in views:
-        kernel.run((lights.tile_size, lights.tile_size), scene, view_index=view, **own)
 
 
 class LpvInjectSurfaces:
@@ -257,7 +258,12 @@ class LpvQuery:
 
 def query_bindings(settings: DlpvMethod) -> dict[str, Binding]:
     """Returns the bindings for reading light from volumes (shaders/common/lpv_light.glsl)."""
-    return {"has_geometry": settings.resolved_geometry_volume, "damping": settings.resolved_damping}
+    damping = settings.resolved_damping
+    return {
+        "has_geometry": settings.resolved_geometry_volume,
+        "damping": damping,
+        "is_damped": damping > 0.0,
+    }
 
 
 class LpvFields:

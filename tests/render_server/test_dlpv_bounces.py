@@ -122,6 +122,10 @@ def test_without_light_there_is_no_tail(gpu: GpuContext) -> None:
     assert (extended(gpu, nothing, nothing) == 0).all()
 
 
+ALL_STEPS = 128
+"""Further ones bring no light, so bounces differ by what is reflected alone."""
+
+
 def niche(stage: Stage) -> SceneDocument:
     """A dark cube in a box of bright walls under a lamp: what it takes, the walls take from each other again."""
     walls = [shifted(trimesh.creation.box((0.02, 0.4, 0.3)), side * 0.2, 0.1, 0.15) for side in (-1, 1)]
@@ -136,7 +140,7 @@ def test_each_bounce_changes_less_than_the_one_before(
 ) -> None:
     monkeypatch.setattr(LpvBounceTail, "extend", lambda *_: None)  # those that are propagated alone
     document = niche(stage)
-    solutions = [solve(gpu, dlpv(document, bounces=count)) for count in (0, 1, 2, 3)]
+    solutions = [solve(gpu, dlpv(document, bounces=count, steps=ALL_STEPS)) for count in (0, 1, 2, 3)]
     assert all(np.array_equal(solutions[0].cones_mu, one.cones_mu) for one in solutions[1:])
     seen = (solutions[0].fade == 1) & (solutions[0].matte == 0)
     means = [one.cones_rho[seen].mean() for one in solutions]
@@ -152,7 +156,7 @@ def test_two_bounces_come_to_what_more_of_them_do(
     document = niche(stage)
 
     def change(bounces: int) -> float:
-        solution = solve(gpu, dlpv(document, bounces=bounces))
+        solution = solve(gpu, dlpv(document, bounces=bounces, steps=ALL_STEPS))
         seen = (solution.fade == 1) & (solution.matte == 0)
         return float((solution.cones_rho - solution.cones_mu)[seen].mean())
 

@@ -29,6 +29,7 @@ from deltalight.render_server.passes.lpv import (
     LpvJoin,
     LpvPropagate,
     injected_sums,
+    medium_bindings,
     moment_weights,
 )
 from deltalight.render_server.passes.voxels import LEAST_SURFELS
@@ -124,7 +125,7 @@ def test_steps_in_the_last_corner_are_those_of_a_small_volume(gpu: GpuContext, t
         volume, propagate = LightVolume(gpu, cells), LpvPropagate(gpu, tiled=tiled)
         for texture in (volume.state, volume.total):
             texture.write(light.tobytes())
-        propagate.run(volume, moment_weights(16), 3, None)
+        propagate.run(volume, medium_bindings(cells, moment_weights(16), None), 3)
         total = np.frombuffer(volume.total.read(), np.float32).reshape(light.shape)
         assert not total[:, :-8, :-8, :-8].any()
         for item in (volume, propagate):

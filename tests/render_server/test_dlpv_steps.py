@@ -1,5 +1,6 @@
 """Steps of light propagation volumes: energy, even fields, walls, directions (docs/method.md 5)."""
 
+import moderngl
 import numpy as np
 import pytest
 from jaxtyping import Float32
@@ -11,11 +12,16 @@ from deltalight.render_server.passes.lpv import (
     LightVolume,
     LpvBoxFilter,
     LpvPropagate,
+    LpvStart,
+    LpvStartChange,
     StepWeights,
+    injected_sums,
     lobe_weights,
+    medium_bindings,
     moment_weights,
     transmitted_fractions,
 )
+from tests.render_server.lpv_scenes import INJECTED_STEPS
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 CELLS = 16
@@ -35,21 +41,25 @@ def propagated(
     steps: int,
     *,
     tiled: bool | None = None,
+    in_place: bool = False,
     through: Float32[np.ndarray, "n n n 8"] | None = None,
 ) -> tuple[Float32[np.ndarray, "3 n n n 4"], Float32[np.ndarray, "3 n n n 4"]]:
     """State and total after some steps; `through` of each cell from -x, +x, -y, +y, -z, +z."""
     volume, step = LightVolume(gpu, light.shape[1]), LpvPropagate(gpu, tiled=tiled)
     volume.state.write(light.tobytes())
     volume.total.write(light.tobytes())
-    transmitted = None
-    if through is not None:
-        transmitted = transmitted_fractions(gpu, volume.cells)
-        transmitted.write(np.round(255 * through).astype(np.uint8).tobytes())
-    step.run(volume, weights, steps, transmitted)
+    transmitted = None if through is None else transmittances(gpu, through)
+    step.run(volume, medium_bindings(volume.cells, weights, transmitted), steps, in_place=in_place)
     found = cells_of(volume, "state").copy(), cells_of(volume, "total").copy()
     for item in (volume, step, *(() if transmitted is None else (transmitted,))):
         item.release()
     return found
+
+
+def transmittances(gpu: GpuContext, through: Float32[np.ndarray, "n n n 8"]) -> moderngl.Texture3D:
+    texture = transmitted_fractions(gpu, len(through))
+    texture.write(np.round(255 * through).astype(np.uint8).tobytes())
+    return texture
 
 
 def spot(cells: int = CELLS, seed: int = 0) -> Float32[np.ndarray, "3 n n n 4"]:
@@ -91,11 +101,108 @@ def test_half_steps_come_to_whole_steps(gpu: GpuContext, weights: StepWeights) -
     whole, more = (
         propagated(gpu, light, weights, steps, tiled=True, through=through)[1] for steps in (CELLS, CELLS + 1)
     )
-    _, halves = propagated(gpu, light, weights, CELLS, tiled=False, through=through)
+    _, halves = propagated(gpu, light, weights, CELLS, tiled=False, in_place=True, through=through)
     is_odd = np.indices((CELLS, CELLS, CELLS)).sum(axis=0) % 2 == 1
     assert halves[:, is_odd] == pytest.approx(whole[:, is_odd], abs=1e-5)
     assert halves[:, ~is_odd] == pytest.approx(more[:, ~is_odd], abs=1e-5)
     assert np.abs(whole - more).max() > 1e-3
+
+
+def sums_of(gpu: GpuContext, light: Float32[np.ndarray, "3 n n n 4"]) -> moderngl.Buffer:
+    """What is injected, in fixed point."""
+    sums = injected_sums(gpu, light.shape[1])
+    sums.write(np.round(light * INJECTED_STEPS).astype(np.int32).transpose(1, 2, 3, 0, 4).tobytes())
+    return sums
+
+
+class ChangedLight:
+    """V_mu after some steps, and V_rho that starts with it and with what objects send and block."""
+
+    def __init__(self, gpu: GpuContext, *, in_place: bool) -> None:
+        self._gpu, self._in_place = gpu, in_place
+        self.mu, self.rho = LightVolume(gpu, CELLS), LightVolume(gpu, CELLS)
+        self._start, self._start_change, self._steps = (
+            LpvStart(gpu),
+            LpvStartChange(gpu),
+            LpvPropagate(gpu, tiled=False),
+        )
+        self._held: list[moderngl.Buffer | moderngl.Texture3D] = []
+
+    def _sums(self, light: Float32[np.ndarray, "3 n n n 4"]) -> moderngl.Buffer:
+        self._held.append(sums := sums_of(self._gpu, light))
+        return sums
+
+    def propagate(
+        self,
+        light: Float32[np.ndarray, "3 n n n 4"],
+        change: Float32[np.ndarray, "3 n n n 4"],
+        through: tuple[Float32[np.ndarray, "n n n 8"], Float32[np.ndarray, "n n n 8"]],
+        steps: tuple[int, int],
+    ) -> None:
+        """By `steps` without and with objects, `through` what lets light pass without and with them."""
+        real, joint = (transmittances(self._gpu, each) for each in through)
+        self._held += (real, joint)
+        past_real, self._past_all = (
+            medium_bindings(CELLS, WEIGHTS["moments"], each) for each in (real, joint)
+        )
+        self._start.run(self.mu, self._sums(light))
+        self._steps.run(self.mu, past_real, steps[0], in_place=self._in_place)
+        self._start_change.run(
+            self.rho, self.mu, self._sums(change), self._past_all, real, in_place=self._in_place
+        )
+        self._steps.run(self.rho, self._past_all, steps[1], in_place=self._in_place)
+
+    def add(
+        self, more: Float32[np.ndarray, "3 n n n 4"], known: Float32[np.ndarray, "3 n n n 4"], steps: int
+    ) -> None:
+        self._start.add(self.rho, self._sums(more), self._sums(known))
+        self._steps.run(self.rho, self._past_all, steps, in_place=self._in_place)
+
+    def release(self) -> None:
+        for item in (self.mu, self.rho, self._start, self._start_change, self._steps, *self._held):
+            item.release()
+
+
+MANY_STEPS = 160  # nothing is under way any more
+
+
+def surroundings() -> tuple[Float32[np.ndarray, "3 n n n 4"], Float32[np.ndarray, "n n n 8"]]:
+    """Light in all cells, and what lets it pass."""
+    rng = np.random.default_rng(5)
+    light = rng.uniform(-1, 2, (3, CELLS, CELLS, CELLS, 4)).astype(np.float32)
+    return light, rng.uniform(0.8, 1, (CELLS, CELLS, CELLS, 8)).astype(np.float32)
+
+
+IN_PLACE = pytest.mark.parametrize("in_place", [False, True], ids=["whole", "in place"])
+
+
+@IN_PLACE
+def test_objects_that_change_nothing_leave_the_light_as_it_was(gpu: GpuContext, in_place: bool) -> None:
+    """Although V_mu has had few steps and V_rho has further ones."""
+    light, through = surroundings()
+    changed = ChangedLight(gpu, in_place=in_place)
+    changed.propagate(light, np.zeros_like(light), (through, through), (3, 9))
+    mu, rho = cells_of(changed.mu, "total").copy(), cells_of(changed.rho, "total").copy()
+    changed.release()
+    assert np.abs(mu).max() > 1
+    assert rho == pytest.approx(mu, abs=2e-5)
+
+
+@IN_PLACE
+def test_what_objects_send_and_block_comes_to_the_light_with_them(gpu: GpuContext, in_place: bool) -> None:
+    """V_rho that starts with V_mu, and is given more on the way, against all of it propagated at once."""
+    light, through = surroundings()
+    change, more, known = spot(seed=6), spot(seed=7), spot(seed=8)
+    joint = through * np.random.default_rng(9).uniform(0.5, 1, through.shape).astype(np.float32)
+    changed = ChangedLight(gpu, in_place=in_place)
+    changed.propagate(light, change, (through, joint), (MANY_STEPS, 5))
+    changed.add(more, known, MANY_STEPS)
+    rho = cells_of(changed.rho, "total").copy()
+    changed.release()
+    _, expected = propagated(
+        gpu, light + change + more - known, WEIGHTS["moments"], MANY_STEPS, tiled=False, through=joint
+    )
+    assert rho == pytest.approx(expected, abs=5e-4)
 
 
 @pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS)

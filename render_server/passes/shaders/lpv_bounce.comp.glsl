@@ -10,19 +10,17 @@
 
 layout(local_size_x = 64) in;
 
-vec3 brought(bool with_objects, Surfel s, vec3 n) {
-    return from_volume(with_objects, volume_coordinate(s.position_area.xyz), n);
-}
+Brought brought_to(Surfel s, vec3 n) { return brought(volume_coordinate(s.position_area.xyz), n); }
 
 #ifdef REAL
 vec3 sent_out(Surfel s, vec3 n) {
     vec3 natural = environment_irradiance(n);
-    vec3 e_mu = max(natural + brought(false, s, n), vec3(0.0));
-    vec3 e_rho = max(natural + brought(true, s, n), vec3(0.0));
+    Brought e = brought_to(s, n);
+    vec3 e_mu = max(natural + e.mu, vec3(0.0)), e_rho = max(natural + e.rho, vec3(0.0));
     return albedo_at(s, n, e_mu) * (e_rho - e_mu);
 }
 #else
-vec3 sent_out(Surfel s, vec3 n) { return virtual_albedo(s) * brought(true, s, n); }
+vec3 sent_out(Surfel s, vec3 n) { return virtual_albedo(s) * brought_to(s, n).rho; }
 #endif
 
 #include "common/inject_surfels.glsl"

@@ -5,7 +5,7 @@
 #include "common/light_step.glsl"
 
 layout(local_size_x = 16) in;
-layout(rgba32f) readonly uniform image3D state;   // before the first step
+layout(rgba32f) readonly uniform image3D state;   // its own light
 layout(rgba32f) uniform image3D total;
 uniform int colour;   // 0, 1
 

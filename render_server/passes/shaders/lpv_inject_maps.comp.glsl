@@ -13,8 +13,9 @@
 #include "common/volume.glsl"
 #include "common/inject_light.glsl"
 #include "common/inject_patch.glsl"
+#include "common/map_texels.glsl"
 
-#include "common/pixel_group.glsl"
+layout(local_size_x = 64) in;
 uniform sampler2D real_albedo;
 uniform sampler2D real_light_normal;
 uniform sampler2D virtual_light_uv;
@@ -75,16 +76,25 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
 }
 #endif
 
+float depth_at(LightView view, ivec2 texel) {
+#ifdef REAL
+    return first_depth(real_light_depth, view, texel);
+#else
+    return first_depth(virtual_light_depth, view, texel);
+#endif
+}
+
+bool is_wanted(LightView view, ivec2 texel) { return depth_at(view, texel) != NOTHING; }
+
 void main() {
     LightView view = listed_view(view_index);
-    if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy);
-#ifdef REAL
-    float depth = first_depth(real_light_depth, view, texel);
-#else
-    float depth = first_depth(virtual_light_depth, view, texel);
-#endif
-    if (depth == NOTHING) return;
-    vec2 s = texel_lateral(view, texel);
-    inject_texel(listed_light(light_of_view(view_index)), view, texel, s, depth, ray_point(view, s, depth));
+    Light light = listed_light(light_of_view(view_index));
+    uint i = next_wanted(view, first_item());
+    if (i < texels_of(view)) do {
+        ivec2 texel = map_texel(view, i);
+        vec2 s = texel_lateral(view, texel);
+        float depth = depth_at(view, texel);
+        inject_texel(light, view, texel, s, depth, ray_point(view, s, depth));
+        i = next_wanted(view, i + items_apart());
+    } while (i < texels_of(view));
 }

@@ -48,13 +48,13 @@ void shade(ivec2 texel, SurfacePoint s) {
     }
     if (fade > 0.0) {
 #ifdef CHANGE
-        e_rho += from_volume(true, q, s.normal) + from_other_volumes(s.position, s.normal);
-        if (direct_size > 0) e_rho += irradiance_in(false, direct_size, q * float(direct_size) / float(volume_size), s.normal);
+        e_rho += brought(q, s.normal).rho + from_other_volumes(s.position, s.normal);
+        if (direct_size > 0) e_rho += brought_in(direct_size, q * float(direct_size) / float(volume_size), s.normal).mu;
 #else
-        vec3 mu = from_volume(false, q, s.normal), rho = from_volume(true, q, s.normal);
-        vec3 change = rho - mu + from_other_volumes(s.position, s.normal);
-        e_rho = max(e_mu + fade * mu + change, vec3(0.0));   // composition fades the change
-        e_mu = max(e_mu + fade * mu, vec3(0.0));
+        Brought e = brought(q, s.normal);
+        vec3 change = e.rho - e.mu + from_other_volumes(s.position, s.normal);
+        e_rho = max(e_mu + fade * e.mu + change, vec3(0.0));   // composition fades the change
+        e_mu = max(e_mu + fade * e.mu, vec3(0.0));
 #endif
     }
     imageStore(irradiance_mu, texel, vec4(e_mu, s.present ? 1.0 : 0.0));
@@ -68,7 +68,7 @@ void shade(ivec2 texel, SurfacePoint s) {
     if (s.present) {
         enter_volume(s.position);
         vec3 q = volume_coordinate(s.position);
-        vec3 arriving = from_volume(true, q, s.normal) + from_other_volumes(s.position, s.normal);
+        vec3 arriving = brought(q, s.normal).rho + from_other_volumes(s.position, s.normal);
         e = max(environment_irradiance(s.normal) + arriving, vec3(0.0));
         c = mirrored(s);
     }

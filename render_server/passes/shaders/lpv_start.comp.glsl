@@ -1,29 +1,30 @@
-// Injected light -> initial state of a volume, and the total so far. A second set of sums may be added.
+// Injected light -> initial state of a volume, and the total so far. ADD: adds it to light that is under way.
 #include "common/light_cells.glsl"
+#include "common/injected_light.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430) readonly buffer First { int first[]; };
-layout(std430) readonly buffer Second { int second[]; };
-layout(std430) readonly buffer Third { int third[]; };
+#ifdef ADD
+layout(rgba32f) uniform image3D state;
+layout(rgba32f) uniform image3D total;
+
+void add(ivec3 texel, vec4 light) {
+    imageStore(state, texel, imageLoad(state, texel) + light);
+    imageStore(total, texel, imageLoad(total, texel) + light);
+}
+#else
 layout(rgba32f) writeonly uniform image3D state;
 layout(rgba32f) writeonly uniform image3D total;
+
+void add(ivec3 texel, vec4 light) {
+    imageStore(state, texel, light);
+    imageStore(total, texel, light);
+}
+#endif
 uniform int cells;
-uniform int count_of_sums;
 
 void main() {
-    uint count = uint(cells * cells * cells), i = gl_GlobalInvocationID.x;
-    if (i >= count) return;
-    ivec3 cell = cell_of_index(i, cells);
-    for (int channel = 0; channel < 3; ++channel) {
-        vec4 light;
-        for (uint k = 0u; k < 4u; ++k) {
-            uint at = i * uint(INJECTED_SUMS) + 4u * uint(channel) + k;
-            int sum = first[at];
-            if (count_of_sums > 1) sum += second[at];
-            if (count_of_sums > 2) sum += third[at];
-            light[k] = float(sum) / INJECTED_STEPS;
-        }
-        imageStore(state, in_channel(cell, channel, cells), light);
-        imageStore(total, in_channel(cell, channel, cells), light);
-    }
+    int i = int(gl_GlobalInvocationID.x);
+    if (i >= cells * cells * cells) return;
+    ivec3 cell = cell_of_index(uint(i), cells);
+    for (int channel = 0; channel < 3; ++channel) add(in_channel(cell, channel, cells), injected_light(i, channel));
 }

@@ -34,7 +34,7 @@ void gather(ivec2 texel) {
     Mirror m = mirror_at(mirror_pixel(texelFetch(sample_pixels, texel, 0)));
     enter_volume(position);
     vec3 q = volume_coordinate(position), d = reflect(normalize(position - m.point), normal.xyz);
-    vec3 arriving = from_volume(true, q, normal.xyz) + from_other_volumes(position, normal.xyz);
+    vec3 arriving = brought(q, normal.xyz).rho + from_other_volumes(position, normal.xyz);
     vec3 e = max(environment_irradiance(normal.xyz) + arriving, vec3(0.0));
     vec3 seen = environment(d, specular_half_angle(materials[int(normal.w)].dielectric.a));
     imageStore(irradiance_out, texel, vec4(e, open_fraction(m, position)));

@@ -10,13 +10,18 @@ struct Neighbours {
     vec3 from_low, from_high;   // transmittance
 };
 
-Neighbours neighbours_of(ivec3 cell) {
-    uvec2 open = has_geometry ? texelFetch(transmitted, cell, 0).xy : uvec2(0xffffffffu);
+const uvec2 OPEN = uvec2(0xffffffffu);   // nothing blocks
+
+Neighbours neighbours_past(ivec3 cell, uvec2 open) {
     vec4 xy = unpackUnorm4x8(open.x);
     vec2 z = unpackUnorm4x8(open.y).xy;
     uvec3 has_low = uvec3(greaterThan(cell, ivec3(0))), has_high = uvec3(lessThan(cell, ivec3(cells - 1)));
     ivec3 low = cell - ivec3(has_low), high = cell + ivec3(has_high);
     return Neighbours(low, high, vec3(xy.xz, z.x) * vec3(has_low), vec3(xy.yw, z.y) * vec3(has_high));
+}
+
+Neighbours neighbours_of(ivec3 cell) {
+    return neighbours_past(cell, has_geometry ? texelFetch(transmitted, cell, 0).xy : OPEN);
 }
 
 vec4 entering(ivec3 cell, Neighbours n, int channel) {
