@@ -274,11 +274,9 @@ class DeltaVoxels(DirectionalVoxels):
 
     def _light_by_mu(self, scene: Bindings) -> None:
         real, objects, light = self.real, self.objects, self._light
-        light.light_virtual(objects.store, scene, objects.groups)
-        light.keep_direct(real.store, scene, real.groups)
         self._gather.gather(objects.store, objects.groups, self.mu, {**scene, **self.march_bindings(1)})
-        light.light_virtual(objects.store, scene, objects.groups, gathered=True)
-        light.light_real_delta(real.store, scene, real.groups, gathered=True, from_mu=True)
+        light.light_virtual(objects.store, scene, objects.groups, from_mu=True)
+        light.light_real_delta(real.store, scene, real.groups, from_mu=True)
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         self._light.light_virtual(self.objects.store, scene, self.objects.groups, gathered=gathered)

@@ -112,13 +112,13 @@ class LightVoxels:
 
     The kinds are real light without objects, the real change, virtual light, and real light of a full solution. With
     `gathered`, gathered light replaces unoccluded ambient light, and the sums change by the difference; direct light
-    is that of the last run without.
+    is that of the last run without. With `from_mu`, the light that was gathered from mu is there from the start.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._threads = list_threads(gpu)
-        self._kernels: dict[tuple[str, bool], Kernel] = {}
+        self._kernels: dict[tuple[str, ...], Kernel] = {}
         self.support = gpu.ctx.buffer(reserve=SUPPORT_BYTES)
 
     @property
@@ -146,17 +146,9 @@ class LightVoxels:
         gathered: bool = False,
         from_mu: bool = False,
     ) -> None:
-        """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support.
-
-        `from_mu`: the gathered light is that of mu in both.
-        """
+        """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support."""
         clear_buffer(self._gpu, store.delta_sums)
-        own: Bindings = {"adds": True, "from_mu": from_mu}
-        self._run("REAL_DELTA", store, groups, {**scene, **own}, gathered=gathered)
-
-    def keep_direct(self, store: VoxelStore, scene: Bindings, groups: SurfelGroups) -> None:
-        """Keeps the direct light on real surfaces with the objects, for sums with gathered light."""
-        self._run("REAL_DELTA", store, groups, {**scene, "adds": False}, gathered=False)
+        self._run("REAL_DELTA", store, groups, scene, gathered=gathered, from_mu=from_mu)
 
     def light_virtual(
         self,
@@ -165,9 +157,10 @@ class LightVoxels:
         groups: SurfelGroups | None = None,
         *,
         gathered: bool = False,
+        from_mu: bool = False,
     ) -> None:
         """Sums c and a of virtual surfaces; `groups` keep each surfel's light."""
-        self._run("VIRTUAL", store, groups, scene, gathered=gathered)
+        self._run("VIRTUAL", store, groups, scene, gathered=gathered, from_mu=from_mu)
 
     def light_solution(
         self,
@@ -186,9 +179,16 @@ class LightVoxels:
         self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, scene, gathered=gathered)
 
     def _run(
-        self, kind: str, store: VoxelStore, groups: SurfelGroups | None, scene: Bindings, *, gathered: bool
+        self,
+        kind: str,
+        store: VoxelStore,
+        groups: SurfelGroups | None,
+        scene: Bindings,
+        *,
+        gathered: bool,
+        from_mu: bool = False,
     ) -> None:
-        self._kernel(kind, gathered=gathered).run(
+        self._kernel(kind, *["GATHERED"] * gathered, *["FROM_MU"] * from_mu).run(
             (self._threads,),
             store.bindings,
             NO_GROUPS if groups is None else groups.bindings,
@@ -198,12 +198,12 @@ class LightVoxels:
             Support=self.support,
         )
 
-    def _kernel(self, kind: str, *, gathered: bool) -> Kernel:
-        """Returns the kernel, compiled on first use."""
-        if (kind, gathered) not in self._kernels:
-            defines = {kind: 1, "GREATEST_ALPHA": GREATEST_ALPHA, **({"GATHERED": 1} if gathered else {})}
-            self._kernels[kind, gathered] = Kernel(self._gpu, "light_voxels", **defines)
-        return self._kernels[kind, gathered]
+    def _kernel(self, *names: str) -> Kernel:
+        """Returns the kernel of these defines, compiled on first use."""
+        if names not in self._kernels:
+            defines = {**dict.fromkeys(names, 1), "GREATEST_ALPHA": GREATEST_ALPHA}
+            self._kernels[names] = Kernel(self._gpu, "light_voxels", **defines)
+        return self._kernels[names]
 
     def reset_support(self, bounds: np.ndarray[Any, np.dtype[np.int32]]) -> None:
         """Resets the support of the delta to the voxels of the objects: min x, y, z, -max x, y, z of each volume."""
