@@ -96,8 +96,6 @@ class SolutionVoxels(DirectionalVoxels):
         self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
     ) -> "SolutionVoxels":
         """Lights, resolves and filters mu, then rho; with bounces, what is gathered from mu is both's first guess."""
-        self._occupy.run(self.mu, self.real.volume, self.real.store)
-        self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
         self.objects.forget_light()
         self._light_mu(mu, gathered=False)
         self._light_rho(rho, gathered=False)
@@ -125,14 +123,14 @@ class SolutionVoxels(DirectionalVoxels):
     def _light_mu(self, scene: Bindings, *, gathered: bool) -> None:
         real = self.real
         self._light.light_solution(real.store, scene, real.groups, with_objects=False, gathered=gathered)
-        self._filter_mu()
+        self._filter_mu(occupies=not gathered)
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         real, objects, light = self.real, self.objects, self._light
         light.light_solution(real.store, scene, real.groups, with_objects=True, gathered=gathered)
         light.light_virtual(objects.store, scene, objects.groups, gathered=gathered)
         clear_buffer(self._gpu, real.store.delta_sums)
-        self._filter_rho()
+        self._filter_rho(occupies=not gathered)
 
     def set_support(self, *, everywhere: bool) -> None:
         """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""

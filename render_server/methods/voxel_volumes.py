@@ -43,7 +43,6 @@ from deltalight.render_server.passes.voxel_light import (
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     FilterVoxels,
-    OccupyVoxels,
     ResolveVoxels,
     VoxelMipmap,
 )
@@ -60,13 +59,12 @@ class FarScene:
     """
 
     def __init__(self, gpu: GpuContext, light: LightVoxels, *, is_used: bool) -> None:
-        self._is_used = is_used
+        self._gpu, self._is_used = gpu, is_used
         self.mipmap = VoxelMipmap(gpu, FAR_SIZE, DIRECTIONS)
-        self._set = VoxelSet(gpu, FAR_SIZE, [self.mipmap])
+        self._set = VoxelSet(gpu, FAR_SIZE, [self.mipmap], own=self.mipmap)
         self._light = light
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
-        self._occupy = OccupyVoxels(gpu)
         self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
 
     def voxelize(self, real: GeometryState) -> VoxelSet:
@@ -83,9 +81,9 @@ class FarScene:
         if self._is_used:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
-            self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume)
-            self._occupy.run(self.mipmap, voxels.volume, voxels.store)
+            self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume, occupies=True)
             self._filter.run(self.mipmap, voxels.volume, voxels.store)
+            clear_ahead(self._gpu, (voxels.store.sums, voxels.store.sums.size))
         return voxels
 
     @property
@@ -99,7 +97,7 @@ class FarScene:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.mipmap, self._set, self._resolve, self._filter, self._occupy, self._block)
+        release_all(self.mipmap, self._set, self._resolve, self._filter, self._block)
 
 
 class DirectionalVoxels:
@@ -109,7 +107,7 @@ class DirectionalVoxels:
         self._gpu, self._bounces = gpu, settings.bounces
         self._measured = settings.radiance == "measured"
         self.mu, self.rho = (VoxelMipmap(gpu, size, DIRECTIONS) for _ in range(2))
-        self.real = VoxelSet(gpu, size, [self.mu, self.rho])
+        self.real = VoxelSet(gpu, size, [self.mu, self.rho], own=self.mu)
         self.objects = VoxelSet(gpu, size, [self.rho])
         self._light = LightVoxels(gpu)
         self.far = FarScene(gpu, self._light, is_used=settings.far_volume)
@@ -118,7 +116,6 @@ class DirectionalVoxels:
         self._tail = BounceTail(gpu, march_defines(settings))
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
-        self._occupy = OccupyVoxels(gpu)
 
     def _make_room(self, placements: Placements) -> None:
         make_room(self.real, (self.mu, self.rho, self.objects), placements)
@@ -140,12 +137,13 @@ class DirectionalVoxels:
             )
         return self.objects
 
-    def _filter_mu(self) -> None:
-        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume)
+    def _filter_mu(self, *, occupies: bool = False) -> None:
+        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume, occupies=occupies)
         self._filter.run(self.mu, self.real.volume, self.real.store)
 
-    def _filter_rho(self) -> None:
-        self._resolve.resolve_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
+    def _filter_rho(self, *, occupies: bool = False) -> None:
+        real, mu = self.real, self.mu if occupies else None
+        self._resolve.resolve_rho(self.rho, real.store, self.objects.store, real.volume, mu=mu)
         self._filter.run(self.rho, self.real.volume, self.real.store, self.objects.store)
 
     def _find_tail(self, scene: Bindings) -> None:
@@ -180,7 +178,6 @@ class DirectionalVoxels:
             self._tail,
             self._resolve,
             self._filter,
-            self._occupy,
         )
 
 
@@ -225,8 +222,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
         """Filters the lit voxels into mu."""
-        self._occupy.run(self.mu, self.real.volume, self.real.store)
-        self._filter_mu()
+        self._filter_mu(occupies=True)
         return self.mu
 
     def bounce_real(
@@ -282,11 +278,10 @@ class DeltaVoxels(DirectionalVoxels):
         self._light.light_virtual(self.objects.store, scene, self.objects.groups, gathered=gathered)
         self._light.light_real_delta(self.real.store, scene, self.real.groups, gathered=gathered)
 
-    def filter_joint(self, _lit: LitVoxels) -> VoxelMipmap:
-        """Filters the lit voxels of both sets into rho."""
-        self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
-        self._filter_rho()
-        return self.rho
+    def filter_joint(self, lit: LitVoxels) -> tuple[VoxelMipmap, LitVoxels]:
+        """Filters the lit voxels of both sets into rho, which uses up the sums of changed light."""
+        self._filter_rho(occupies=True)
+        return self.rho, lit
 
     def bounce_joint(
         self, lit: LitVoxels, _rho: VoxelMipmap, scene: Bindings
@@ -298,8 +293,6 @@ class DeltaVoxels(DirectionalVoxels):
             self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_rho(scene, gathered=True)
             self._filter_rho()
-        if self._bounces > 0:
-            clear_ahead(self._gpu, (self.real.store.delta_sums, self.real.store.delta_sums.size))
         self._find_tail(marching)
         return self.rho, lit
 
@@ -332,11 +325,13 @@ def delta_voxel_stages(
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
     joint = g.value("joint voxel scene", voxels.joint_scene, scene, s.objects, lit.object_maps, objects)
     lit_joint = g.stage("light joint voxels", voxels.light_joint, bounced, objects, s.objects, joint)
-    filtered_joint = g.stage("filter rho", voxels.filter_joint, lit_joint)
+    filtered_joint, spent_joint = g.stages(
+        "filter rho", voxels.filter_joint, lit_joint, outputs=("filter rho", "filtered joint voxels")
+    )
     rho, _ = g.stages(
         "bounces joint",
         voxels.bounce_joint,
-        *(lit_joint, filtered_joint, joint),
+        *(spent_joint, filtered_joint, joint),
         outputs=("bounces joint", "bounced joint voxels"),
     )
     return mu, rho

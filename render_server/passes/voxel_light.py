@@ -57,12 +57,19 @@ class SurfelGroups:
     def __init__(self, gpu: GpuContext, volume_size: int) -> None:
         self._gpu = gpu
         self._grid = gpu.storage_buffer(group_grid_bytes(volume_size), LOWER_VOLUME)
+        self._is_filled = False
         self._allocate(0)
 
     def resize(self, size: int, count: int) -> None:
         """Makes room for the groups of `count` volumes of `size` voxels an edge; `reset` is next."""
         self._grid.release()
         self._grid = self._gpu.storage_buffer(count * group_grid_bytes(size), LOWER_VOLUME)
+        self._is_filled = False
+
+    @property
+    def filled_grid(self) -> moderngl.Buffer | None:
+        """The grid, for whoever clears it together with the voxels; None: there are no groups."""
+        return self._grid if self._is_filled else None
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -81,6 +88,7 @@ class SurfelGroups:
             self._release_growing()
             self._allocate(store.surfel_capacity)
         clear_buffer(self._gpu, self._grid)
+        self._is_filled = True
         self._gpu.clear_start(self._entries, HEADER_BYTES)
 
     def _allocate(self, surfels: int) -> None:
