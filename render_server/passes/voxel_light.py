@@ -325,8 +325,10 @@ class BounceTail:
         self.irradiance = gpu.ctx.texture3d(shape, 4, dtype="f2")
         self.irradiance.filter = (moderngl.LINEAR, moderngl.LINEAR)
         clear_volume(gpu, self.irradiance)
-        self._gather = Kernel(gpu, "gather_voxels", TAIL=1, **defines)
-        self._sum = Kernel(gpu, "bounce_tail")
+        # In software, a workgroup that waits for its own stores takes longer than another dispatch (LevelFilter).
+        fused = {} if gpu.is_software else {"FUSED": 1}
+        self._gather = Kernel(gpu, "gather_voxels", TAIL=1, **fused, **defines)
+        self._sum = Kernel(gpu, "bounce_tail") if gpu.is_software else None
 
     def find(
         self,
@@ -337,10 +339,15 @@ class BounceTail:
         scene: Bindings,
     ) -> None:
         """Finds it from what one more gathering from `rho` would add to what `groups` hold."""
+        own: Bindings = {
+            "TailSums": self._sums,
+            "bounce_tail": self.irradiance,
+            "GroupsDone": self._gpu.group_counters,
+        }
         gathered = {**gather_bindings(store, groups, mu, rho), "only_unseen": False}
-        self._gather.run((gather_threads(self._gpu, store),), gathered, scene, TailSums=self._sums)
-        threads = store.volume_count * self._sum.local_size[0]
-        self._sum.run((threads,), TailSums=self._sums, bounce_tail=self.irradiance)
+        self._gather.run((gather_threads(self._gpu, store),), own, gathered, scene)
+        if self._sum is not None:
+            self._sum.run((store.volume_count * self._sum.local_size[0],), own)
 
     def release(self) -> None:
         """Frees the GL objects."""

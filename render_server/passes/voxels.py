@@ -339,7 +339,7 @@ class LevelFilter:
         tile = self._kernel.local_size[0] if self._is_fused else 1
         cells = math.ceil((volume.placement.size >> level) / tile) * tile  # whole tiles
         threads = (cells, cells, cells * directions * len(volume.placements))
-        own: Bindings = {"first_level": level, "TilesDone": self._gpu.group_counters}
+        own: Bindings = {"first_level": level, "GroupsDone": self._gpu.group_counters}
         self._kernel.run(threads, volume.bindings, own, *shared)
 
     def release(self) -> None:
