@@ -123,14 +123,20 @@ class SolutionVoxels(DirectionalVoxels):
     def _light_mu(self, scene: Bindings, *, gathered: bool) -> None:
         real = self.real
         self._light.light_solution(real.store, scene, real.groups, with_objects=False, gathered=gathered)
-        self._filter_mu(occupies=not gathered)
+        if gathered:
+            self._filter_mu()
+        else:
+            self._filter_first_mu()
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         real, objects, light = self.real, self.objects, self._light
         light.light_solution(real.store, scene, real.groups, with_objects=True, gathered=gathered)
         light.light_virtual(objects.store, scene, objects.groups, gathered=gathered)
         clear_buffer(self._gpu, real.store.delta_sums)
-        self._filter_rho(occupies=not gathered)
+        if gathered:
+            self._filter_rho()
+        else:
+            self._filter_first_rho()
 
     def set_support(self, *, everywhere: bool) -> None:
         """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""

@@ -43,6 +43,7 @@ from deltalight.render_server.passes.voxel_light import (
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     FilterVoxels,
+    RefilterVoxels,
     ResolveVoxels,
     VoxelMipmap,
 )
@@ -116,6 +117,7 @@ class DirectionalVoxels:
         self._tail = BounceTail(gpu, march_defines(settings))
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
+        self._refilter = RefilterVoxels(gpu, self._resolve, self._filter)
 
     def _make_room(self, placements: Placements) -> None:
         make_room(self.real, (self.mu, self.rho, self.objects), placements)
@@ -137,14 +139,22 @@ class DirectionalVoxels:
             )
         return self.objects
 
-    def _filter_mu(self, *, occupies: bool = False) -> None:
-        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume, occupies=occupies)
+    def _filter_mu(self) -> None:
+        """Filters mu anew; its occupancy is known."""
+        self._refilter.run_mu(self.mu, self.real.store, self.real.volume)
+
+    def _filter_rho(self) -> None:
+        """Filters rho anew; its occupancy is known."""
+        self._refilter.run_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
+
+    def _filter_first_mu(self) -> None:
+        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume, occupies=True)
         self._filter.run(self.mu, self.real.volume, self.real.store)
 
-    def _filter_rho(self, *, occupies: bool = False) -> None:
-        real, mu = self.real, self.mu if occupies else None
-        self._resolve.resolve_rho(self.rho, real.store, self.objects.store, real.volume, mu=mu)
-        self._filter.run(self.rho, self.real.volume, self.real.store, self.objects.store)
+    def _filter_first_rho(self) -> None:
+        real, virtual = self.real.store, self.objects.store
+        self._resolve.resolve_rho(self.rho, real, virtual, self.real.volume, mu=self.mu)
+        self._filter.run(self.rho, self.real.volume, real, virtual)
 
     def _find_tail(self, scene: Bindings) -> None:
         """Finds what bounces change beyond those that were gathered."""
@@ -178,6 +188,7 @@ class DirectionalVoxels:
             self._tail,
             self._resolve,
             self._filter,
+            self._refilter,
         )
 
 
@@ -222,7 +233,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
         """Filters the lit voxels into mu."""
-        self._filter_mu(occupies=True)
+        self._filter_first_mu()
         return self.mu
 
     def bounce_real(
@@ -280,7 +291,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_joint(self, lit: LitVoxels) -> tuple[VoxelMipmap, LitVoxels]:
         """Filters the lit voxels of both sets into rho, which uses up the sums of changed light."""
-        self._filter_rho(occupies=True)
+        self._filter_first_rho()
         return self.rho, lit
 
     def bounce_joint(

@@ -299,16 +299,19 @@ class ResolveVoxels:
             mipmap=rho.texture,
             Occupied=rho.occupied,
             marks=mu is not None,
-            DeltaSums=real.delta_sums,
-            VirtualGrid=virtual.grid,
             VirtualTouched=virtual.touched,
-            VirtualSums=virtual.sums,
+            **_joint_sums(real, virtual),
         )
         note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
 
     def release(self) -> None:
         """Frees the programs."""
         release_all(self._mu, self._rho)
+
+
+def _joint_sums(real: VoxelStore, virtual: VoxelStore) -> dict[str, Binding]:
+    """What resolved_voxels.glsl reads of both sets besides the real one's own."""
+    return {"DeltaSums": real.delta_sums, "VirtualGrid": virtual.grid, "VirtualSums": virtual.sums}
 
 
 class LevelFilter:
@@ -383,3 +386,38 @@ class FilterVoxels:
     def release(self) -> None:
         """Frees the programs."""
         release_all(self._levels, self._listed)
+
+
+class RefilterVoxels:
+    """Resolves and filters mipmaps anew whose occupancy is known: in one dispatch each on a GPU, which skips by it."""
+
+    def __init__(self, gpu: GpuContext, resolve: ResolveVoxels, filtering: FilterVoxels) -> None:
+        self._gpu, self._resolve, self._filter = gpu, resolve, filtering
+        self._mu: LevelFilter | None = None
+        self._rho: LevelFilter | None = None
+        if not gpu.is_software:
+            self._mu = LevelFilter(gpu, "filter_voxels", RESOLVES=1)
+            self._rho = LevelFilter(gpu, "filter_voxels", RESOLVES=1, RHO=1, SPENDS_DELTA=1)
+
+    def run_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
+        """Rebuilds mu, as `ResolveVoxels.resolve_mu` and `FilterVoxels` do."""
+        if self._mu is None:
+            self._resolve.resolve_mu(mu, real, volume)
+            self._filter.run(mu, volume, real)
+        else:
+            own: Bindings = {"Occupied": mu.occupied}
+            self._mu.run(volume, DIRECTIONS, own, real.bindings, mipmap=mu.texture)
+
+    def run_rho(self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume) -> None:
+        """Rebuilds rho, as `ResolveVoxels.resolve_rho` and `FilterVoxels` do."""
+        if self._rho is None:
+            self._resolve.resolve_rho(rho, real, virtual, volume)
+            self._filter.run(rho, volume, real, virtual)
+        else:
+            own: Bindings = {"Occupied": rho.occupied, **_joint_sums(real, virtual)}
+            self._rho.run(volume, DIRECTIONS, own, real.bindings, mipmap=rho.texture)
+            note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
+
+    def release(self) -> None:
+        """Frees its own programs."""
+        release_all(self._mu, self._rho)
