@@ -70,7 +70,7 @@ class SolutionVoxels(DirectionalVoxels):
         """Groups the surfels of both sets after voxelisation."""
         real.groups.reset(real.store)
         if self._bounces > 0:
-            self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
+            self._group.run(real.store, real.groups, real.volume.bindings)
         return real, objects
 
     def mu_scene(

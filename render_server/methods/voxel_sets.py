@@ -61,8 +61,8 @@ def _fits(size: int, count: int, budget_mb: int, gpu: GpuContext | None, directi
 class VoxelSet:
     """The sparse voxels of one geometry: the placement that they were filled for, their surfels and groups.
 
-    `mipmaps` are filtered from them; replaced voxels are cleared from them, also from the occupancy of the one that is
-    `own`, which holds no other voxels. `is_lit`: the sums hold light, which must be cleared before relighting.
+    `mipmaps` are filtered from them; replaced voxels are cleared from them, also from the occupancy of the one that
+    is `own`, which holds no other voxels. `is_lit`: the sums hold light, which must be cleared before relighting.
     """
 
     def __init__(

@@ -134,9 +134,7 @@ class DirectionalVoxels:
         self.objects.fill_all([objects.parts] * len(placements), placements)
         self.objects.groups.reset(self.objects.store)
         if self._bounces > 0:
-            self._group.run(
-                self.objects.store, self.objects.groups, self.objects.volume.bindings, has_seen=False
-            )
+            self._group.run(self.objects.store, self.objects.groups, self.objects.volume.bindings)
         return self.objects
 
     def _filter_mu(self) -> None:
@@ -228,7 +226,8 @@ class DeltaVoxels(DirectionalVoxels):
         """Lights real surfels: by the measured radiance where the camera sees them, by the lights elsewhere."""
         voxels.forget_light()
         voxels.groups.reset(voxels.store)
-        self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings}, voxels.groups)
+        own = {**scene, **voxels.volume.bindings}
+        self._light.light_real(voxels.store, own, voxels.groups, finds_groups=self._bounces > 0)
         return voxels
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
@@ -243,7 +242,7 @@ class DeltaVoxels(DirectionalVoxels):
         if self._bounces == 0:
             return self.mu, voxels
         own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
-        self._group.run(store, groups, own, has_seen=True)
+        self._group.sum(store, groups, own, has_seen=True)
         for _ in range(self._bounces):
             self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)}, only_unseen=True)
             self._light.light_real(store, own, groups, gathered=True)

@@ -184,7 +184,7 @@ class Caustics:
             clear_ahead(self._gpu, (self._last_sums, self._last_sums.size))
 
     def _add_beams(self, shared: Bindings, scene: Bindings) -> None:
-        """Finds where beams are; adds narrow ones, then wide ones in each tile of the reduced grid that they may reach."""
+        """Finds where beams are; adds narrow ones, then wide ones in each tile of the grid that they may reach."""
         assert self._places is not None
         most, (across, down) = self._places.height * BEAMS_A_ROW, self._tiles
         own: Bindings = {

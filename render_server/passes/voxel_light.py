@@ -141,9 +141,11 @@ class LightVoxels:
         groups: SurfelGroups | None = None,
         *,
         gathered: bool = False,
+        finds_groups: bool = False,
     ) -> None:
-        """Sums c_mu and a_real; `groups` keep each surfel's light."""
-        self._run("REAL", store, groups, scene, gathered=gathered)
+        """Sums c_mu and a_real; `groups` keep each surfel's light. `finds_groups`: gives groups slots on the way."""
+        more = ("FINDS_GROUPS",) if finds_groups else ()
+        self._run("REAL", store, groups, scene, *more, gathered=gathered)
 
     def light_real_delta(
         self,
@@ -192,11 +194,11 @@ class LightVoxels:
         store: VoxelStore,
         groups: SurfelGroups | None,
         scene: Bindings,
-        *,
+        *more: str,
         gathered: bool,
         from_mu: bool = False,
     ) -> None:
-        self._kernel(kind, *["GATHERED"] * gathered, *["FROM_MU"] * from_mu).run(
+        self._kernel(kind, *more, *["GATHERED"] * gathered, *["FROM_MU"] * from_mu).run(
             (self._threads,),
             store.bindings,
             NO_GROUPS if groups is None else groups.bindings,
@@ -232,9 +234,13 @@ class GroupSurfels:
         self._find = Kernel(gpu, "group_surfels")
         self._sum = Kernel(gpu, "group_surfels", SUM=1)
 
-    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
-        """Fills `groups` (after their `reset`); with `has_seen`, its surfel lights mark what the camera sees."""
+    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings) -> None:
+        """Fills `groups` (after their `reset`)."""
         self._find.run((self._threads,), store.bindings, groups.bindings, scene)
+        self.sum(store, groups, scene, has_seen=False)
+
+    def sum(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
+        """Sums up groups that were found; with `has_seen`, its surfel lights mark what the camera sees."""
         self._sum.run((self._threads,), store.bindings, groups.bindings, scene, has_seen=has_seen)
 
     def release(self) -> None:

@@ -267,7 +267,9 @@ class ResolveVoxels:
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu, self._threads = gpu, list_threads(gpu)
         self._mu = Kernel(gpu, "resolve_voxels")
-        spends = {} if gpu.is_software else {"SPENDS_DELTA": 1}  # clearing whole buffers is faster in software
+        spends = (
+            {} if gpu.is_software else {"SPENDS_DELTA": 1}
+        )  # clearing whole buffers is faster in software
         self._rho = Kernel(gpu, "resolve_voxels", RHO=1, **spends)
 
     def resolve_mu(
@@ -389,7 +391,7 @@ class FilterVoxels:
 
 
 class RefilterVoxels:
-    """Resolves and filters mipmaps anew whose occupancy is known: in one dispatch each on a GPU, which skips by it."""
+    """Resolves and filters mipmaps anew whose occupancy is known: on a GPU in one dispatch, which skips by it."""
 
     def __init__(self, gpu: GpuContext, resolve: ResolveVoxels, filtering: FilterVoxels) -> None:
         self._gpu, self._resolve, self._filter = gpu, resolve, filtering

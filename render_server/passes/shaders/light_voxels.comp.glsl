@@ -5,6 +5,7 @@
 // VIRTUAL: L_rho = albedo / pi E_rho + emission.
 // E is direct + ambient light at first; FROM_MU: direct light + what the surfel's group gathered from mu; GATHERED: the direct
 // light of either run + what the group gathered, where REAL and VIRTUAL add the growth of L.
+// FINDS_GROUPS: each surfel's group gets a slot on the way (group_surfels).
 // REAL_MU and REAL_RHO sum all of L, each under the maps of its own solution: L_mu as REAL,
 // L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
 #define SURFELS_ACCESS readonly
@@ -53,15 +54,33 @@ layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 per slot
 layout(std430) buffer Support { int support[]; };        // of each volume, bounds of changed voxels: min xyz, -max xyz
 #endif
 
-#if defined(GATHERED) || defined(FROM_MU)
+#ifdef FINDS_GROUPS
+#define GROUP_GRID_ACCESS
+#define GROUP_ENTRIES_ACCESS
+#define GROUP_SUMS_ACCESS
+#endif
+#ifdef GATHERED
+#define READS_GROUPS
+#endif
+#ifdef FROM_MU
+#define READS_GROUPS
+#endif
+#ifdef READS_GROUPS
 #define GROUP_GRID_ACCESS readonly
 #define GROUP_LIGHT_ACCESS readonly
 #if defined(GATHERED) && (defined(REAL_DELTA) || defined(REAL_RHO))
 #define GROUP_SUMS_ACCESS
 #endif
+#endif
+#ifdef GROUP_GRID_ACCESS
 #include "common/surfel_groups.glsl"
 
 int group_of(Surfel s, vec3 n) { return group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n)); }
+#endif
+#ifdef FINDS_GROUPS
+#include "common/find_group.glsl"
+#else
+void find_group(uint voxel, vec3 n) {}
 #endif
 
 #ifdef GATHERED
@@ -192,7 +211,7 @@ vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
 }
 #endif
 
-#ifdef GROUP_SUMS_ACCESS
+#if defined(GROUP_SUMS_ACCESS) && !defined(FINDS_GROUPS)
 // Light of mu on a surfel, for its group's albedo.
 void add_to_group(Surfel s, vec3 n, vec3 mu, vec3 radiance) {
     int slot = group_of(s, n);
@@ -239,6 +258,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 void light(Surfel s, uint own, vec3 n) {
     uint voxel = floatBitsToUint(s.uv_voxel.z);
     ivec3 v = enter_volume_of(voxel, volume_size);
+    find_group(voxel, n);
     vec3 radiance = outgoing(s, n, own);
 #if defined(REAL_DELTA) || defined(GATHERED)
     if (radiance == vec3(0.0)) return;
