@@ -22,7 +22,9 @@ def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = No
 
 
 def clear_buffers(gpu: GpuContext, *starts: Start) -> None:
-    """Sets the starts of one to eight buffers to zero, in one dispatch; none if `clear_ahead` had that done.
+    """Sets the starts of one to eight buffers to zero, in one dispatch; none if that was done before.
+
+    Done before: by `clear_ahead`, or by a kernel (`note_cleared`).
 
     By a kernel: `Buffer.clear` maps the buffer, so it waits for the GPU; with glClearBufferSubData, an H200 took 9 ms
     longer for a frame of 256^3 voxels. In software, clearing is no more than a memset, 15 to 50 times as fast as a
@@ -49,6 +51,12 @@ def clear_ahead(gpu: GpuContext, *starts: Start) -> None:
     """
     if not gpu.is_software:
         gpu.used_up.update(starts)
+
+
+def note_cleared(gpu: GpuContext, *starts: Start) -> None:
+    """Notes what a kernel that had other work there has just cleared on a GPU: the next `clear_buffers` need not."""
+    if not gpu.is_software:
+        gpu.cleared_ahead.update(starts)
 
 
 def clear_used_up(gpu: GpuContext) -> None:

@@ -70,7 +70,7 @@ class SolutionVoxels(DirectionalVoxels):
         """Groups the surfels of both sets after voxelisation."""
         real.groups.reset(real.store)
         if self._bounces > 0:
-            self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
+            self._group.run(real.store, real.groups, real.volume.bindings)
         return real, objects
 
     def mu_scene(
@@ -96,8 +96,6 @@ class SolutionVoxels(DirectionalVoxels):
         self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
     ) -> "SolutionVoxels":
         """Lights, resolves and filters mu, then rho; with bounces, what is gathered from mu is both's first guess."""
-        self._occupy.run(self.mu, self.real.volume, self.real.store)
-        self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
         self.objects.forget_light()
         self._light_mu(mu, gathered=False)
         self._light_rho(rho, gathered=False)
@@ -125,14 +123,20 @@ class SolutionVoxels(DirectionalVoxels):
     def _light_mu(self, scene: Bindings, *, gathered: bool) -> None:
         real = self.real
         self._light.light_solution(real.store, scene, real.groups, with_objects=False, gathered=gathered)
-        self._filter_mu()
+        if gathered:
+            self._filter_mu()
+        else:
+            self._filter_first_mu()
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         real, objects, light = self.real, self.objects, self._light
         light.light_solution(real.store, scene, real.groups, with_objects=True, gathered=gathered)
         light.light_virtual(objects.store, scene, objects.groups, gathered=gathered)
         clear_buffer(self._gpu, real.store.delta_sums)
-        self._filter_rho()
+        if gathered:
+            self._filter_rho()
+        else:
+            self._filter_first_rho()
 
     def set_support(self, *, everywhere: bool) -> None:
         """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""

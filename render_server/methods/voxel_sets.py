@@ -61,12 +61,19 @@ def _fits(size: int, count: int, budget_mb: int, gpu: GpuContext | None, directi
 class VoxelSet:
     """The sparse voxels of one geometry: the placement that they were filled for, their surfels and groups.
 
-    `mipmaps` are filtered from them; replaced voxels are cleared from them. `is_lit`: the sums hold light, which must
-    be cleared before relighting.
+    `mipmaps` are filtered from them; replaced voxels are cleared from them, also from the occupancy of the one that
+    is `own`, which holds no other voxels. `is_lit`: the sums hold light, which must be cleared before relighting.
     """
 
-    def __init__(self, gpu: GpuContext, size: int, mipmaps: Sequence[VoxelMipmap]) -> None:
-        self._gpu = gpu
+    def __init__(
+        self,
+        gpu: GpuContext,
+        size: int,
+        mipmaps: Sequence[VoxelMipmap],
+        *,
+        own: VoxelMipmap | None = None,
+    ) -> None:
+        self._gpu, self._own = gpu, own
         self.store = VoxelStore(gpu, size)
         self.volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, size))
         self.groups = SurfelGroups(gpu, size)
@@ -80,7 +87,8 @@ class VoxelSet:
 
     def fill_all(self, meshes: Sequence[Meshes], placements: Sequence[VolumePlacement]) -> None:
         """Fills several volumes, each with the triangles of its own."""
-        self._clear.run(self.store, self.volume)
+        occupied = None if self._own is None else self._own.occupied
+        self._clear.run(self.store, self.volume, occupied=occupied, group_grid=self.groups.filled_grid)
         self.volume.place(*placements)
         self._voxelize.run_all(self.store, meshes, self.volume)
         self.is_lit = False

@@ -43,7 +43,7 @@ from deltalight.render_server.passes.voxel_light import (
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     FilterVoxels,
-    OccupyVoxels,
+    RefilterVoxels,
     ResolveVoxels,
     VoxelMipmap,
 )
@@ -60,13 +60,12 @@ class FarScene:
     """
 
     def __init__(self, gpu: GpuContext, light: LightVoxels, *, is_used: bool) -> None:
-        self._is_used = is_used
+        self._gpu, self._is_used = gpu, is_used
         self.mipmap = VoxelMipmap(gpu, FAR_SIZE, DIRECTIONS)
-        self._set = VoxelSet(gpu, FAR_SIZE, [self.mipmap])
+        self._set = VoxelSet(gpu, FAR_SIZE, [self.mipmap], own=self.mipmap)
         self._light = light
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
-        self._occupy = OccupyVoxels(gpu)
         self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
 
     def voxelize(self, real: GeometryState) -> VoxelSet:
@@ -83,9 +82,9 @@ class FarScene:
         if self._is_used:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
-            self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume)
-            self._occupy.run(self.mipmap, voxels.volume, voxels.store)
+            self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume, occupies=True)
             self._filter.run(self.mipmap, voxels.volume, voxels.store)
+            clear_ahead(self._gpu, (voxels.store.sums, voxels.store.sums.size))
         return voxels
 
     @property
@@ -99,7 +98,7 @@ class FarScene:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.mipmap, self._set, self._resolve, self._filter, self._occupy, self._block)
+        release_all(self.mipmap, self._set, self._resolve, self._filter, self._block)
 
 
 class DirectionalVoxels:
@@ -109,7 +108,7 @@ class DirectionalVoxels:
         self._gpu, self._bounces = gpu, settings.bounces
         self._measured = settings.radiance == "measured"
         self.mu, self.rho = (VoxelMipmap(gpu, size, DIRECTIONS) for _ in range(2))
-        self.real = VoxelSet(gpu, size, [self.mu, self.rho])
+        self.real = VoxelSet(gpu, size, [self.mu, self.rho], own=self.mu)
         self.objects = VoxelSet(gpu, size, [self.rho])
         self._light = LightVoxels(gpu)
         self.far = FarScene(gpu, self._light, is_used=settings.far_volume)
@@ -118,7 +117,7 @@ class DirectionalVoxels:
         self._tail = BounceTail(gpu, march_defines(settings))
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
-        self._occupy = OccupyVoxels(gpu)
+        self._refilter = RefilterVoxels(gpu, self._resolve, self._filter)
 
     def _make_room(self, placements: Placements) -> None:
         make_room(self.real, (self.mu, self.rho, self.objects), placements)
@@ -135,18 +134,25 @@ class DirectionalVoxels:
         self.objects.fill_all([objects.parts] * len(placements), placements)
         self.objects.groups.reset(self.objects.store)
         if self._bounces > 0:
-            self._group.run(
-                self.objects.store, self.objects.groups, self.objects.volume.bindings, has_seen=False
-            )
+            self._group.run(self.objects.store, self.objects.groups, self.objects.volume.bindings)
         return self.objects
 
     def _filter_mu(self) -> None:
-        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume)
-        self._filter.run(self.mu, self.real.volume, self.real.store)
+        """Filters mu anew; its occupancy is known."""
+        self._refilter.run_mu(self.mu, self.real.store, self.real.volume)
 
     def _filter_rho(self) -> None:
-        self._resolve.resolve_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
-        self._filter.run(self.rho, self.real.volume, self.real.store, self.objects.store)
+        """Filters rho anew; its occupancy is known."""
+        self._refilter.run_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
+
+    def _filter_first_mu(self) -> None:
+        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume, occupies=True)
+        self._filter.run(self.mu, self.real.volume, self.real.store)
+
+    def _filter_first_rho(self) -> None:
+        real, virtual = self.real.store, self.objects.store
+        self._resolve.resolve_rho(self.rho, real, virtual, self.real.volume, mu=self.mu)
+        self._filter.run(self.rho, self.real.volume, real, virtual)
 
     def _find_tail(self, scene: Bindings) -> None:
         """Finds what bounces change beyond those that were gathered."""
@@ -180,7 +186,7 @@ class DirectionalVoxels:
             self._tail,
             self._resolve,
             self._filter,
-            self._occupy,
+            self._refilter,
         )
 
 
@@ -220,13 +226,13 @@ class DeltaVoxels(DirectionalVoxels):
         """Lights real surfels: by the measured radiance where the camera sees them, by the lights elsewhere."""
         voxels.forget_light()
         voxels.groups.reset(voxels.store)
-        self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings}, voxels.groups)
+        own = {**scene, **voxels.volume.bindings}
+        self._light.light_real(voxels.store, own, voxels.groups, finds_groups=self._bounces > 0)
         return voxels
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
         """Filters the lit voxels into mu."""
-        self._occupy.run(self.mu, self.real.volume, self.real.store)
-        self._filter_mu()
+        self._filter_first_mu()
         return self.mu
 
     def bounce_real(
@@ -236,7 +242,7 @@ class DeltaVoxels(DirectionalVoxels):
         if self._bounces == 0:
             return self.mu, voxels
         own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
-        self._group.run(store, groups, own, has_seen=True)
+        self._group.sum(store, groups, own, has_seen=True)
         for _ in range(self._bounces):
             self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)}, only_unseen=True)
             self._light.light_real(store, own, groups, gathered=True)
@@ -274,21 +280,18 @@ class DeltaVoxels(DirectionalVoxels):
 
     def _light_by_mu(self, scene: Bindings) -> None:
         real, objects, light = self.real, self.objects, self._light
-        light.light_virtual(objects.store, scene, objects.groups)
-        light.keep_direct(real.store, scene, real.groups)
         self._gather.gather(objects.store, objects.groups, self.mu, {**scene, **self.march_bindings(1)})
-        light.light_virtual(objects.store, scene, objects.groups, gathered=True)
-        light.light_real_delta(real.store, scene, real.groups, gathered=True, from_mu=True)
+        light.light_virtual(objects.store, scene, objects.groups, from_mu=True)
+        light.light_real_delta(real.store, scene, real.groups, from_mu=True)
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         self._light.light_virtual(self.objects.store, scene, self.objects.groups, gathered=gathered)
         self._light.light_real_delta(self.real.store, scene, self.real.groups, gathered=gathered)
 
-    def filter_joint(self, _lit: LitVoxels) -> VoxelMipmap:
-        """Filters the lit voxels of both sets into rho."""
-        self._occupy.add(self.rho, self.real.volume, self.objects.store, to=self.mu)
-        self._filter_rho()
-        return self.rho
+    def filter_joint(self, lit: LitVoxels) -> tuple[VoxelMipmap, LitVoxels]:
+        """Filters the lit voxels of both sets into rho, which uses up the sums of changed light."""
+        self._filter_first_rho()
+        return self.rho, lit
 
     def bounce_joint(
         self, lit: LitVoxels, _rho: VoxelMipmap, scene: Bindings
@@ -300,8 +303,6 @@ class DeltaVoxels(DirectionalVoxels):
             self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_rho(scene, gathered=True)
             self._filter_rho()
-        if self._bounces > 0:
-            clear_ahead(self._gpu, (self.real.store.delta_sums, self.real.store.delta_sums.size))
         self._find_tail(marching)
         return self.rho, lit
 
@@ -334,11 +335,13 @@ def delta_voxel_stages(
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
     joint = g.value("joint voxel scene", voxels.joint_scene, scene, s.objects, lit.object_maps, objects)
     lit_joint = g.stage("light joint voxels", voxels.light_joint, bounced, objects, s.objects, joint)
-    filtered_joint = g.stage("filter rho", voxels.filter_joint, lit_joint)
+    filtered_joint, spent_joint = g.stages(
+        "filter rho", voxels.filter_joint, lit_joint, outputs=("filter rho", "filtered joint voxels")
+    )
     rho, _ = g.stages(
         "bounces joint",
         voxels.bounce_joint,
-        *(lit_joint, filtered_joint, joint),
+        *(spent_joint, filtered_joint, joint),
         outputs=("bounces joint", "bounced joint voxels"),
     )
     return mu, rho

@@ -122,7 +122,9 @@ class Caustics:
         self._beams: moderngl.Texture | None = None
         self._places: moderngl.Texture | None = None
         self._end = Kernel(gpu, "caustic_ends")
-        self._find_bounds = Kernel(gpu, "caustic_bounds", **reuse_define(reuses))
+        self._empties = not (reuses or gpu.is_software)  # the sums, by the way; in software that is a memset
+        own = {"CLEARS": 1} if self._empties else reuse_define(reuses)
+        self._find_bounds = Kernel(gpu, "caustic_bounds", **own)
         self._tiles = tuple(-(-edge // TILE) for edge in grid.size)
         self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
         self._tile_beams = gpu.ctx.buffer(reserve=4)
@@ -131,7 +133,6 @@ class Caustics:
         self._gather = Kernel(
             gpu, "caustic_gather", ROWS=rows, GROUP_ROWS=TILE // rows, **reuse_define(reuses)
         )
-        self._splat = Kernel(gpu, "caustic_splat")
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -165,7 +166,8 @@ class Caustics:
         """Fills the sums with the light of the beams where they end."""
         if self._last_sums is not None:
             self._sums, self._last_sums = self._last_sums, self._sums
-        clear_buffers(self._gpu, (self._sums, self._sums.size), (self._tile_beams, self._tile_beams.size))
+        sums = [] if self._empties else [(self._sums, self._sums.size)]
+        clear_buffers(self._gpu, (self._tile_beams, self._tile_beams.size), *sums)
         grid = self._grid
         shared: Bindings = {
             **self.bindings,
@@ -176,14 +178,13 @@ class Caustics:
             "picture_pixels": grid.picture_size,
             "scale": grid.scale,
         }
-        self._gather_wide(shared, scene)
-        self._splat.run((self._threads,), shared, scene)
+        self._add_beams(shared, scene)
         clear_ahead(self._gpu, (self._tile_beams, self._tile_beams.size))
         if self._last_sums is not None:
             clear_ahead(self._gpu, (self._last_sums, self._last_sums.size))
 
-    def _gather_wide(self, shared: Bindings, scene: Bindings) -> None:
-        """Finds where beams are, and adds the wide ones: in each tile of the reduced grid those that may reach it."""
+    def _add_beams(self, shared: Bindings, scene: Bindings) -> None:
+        """Finds where beams are; adds narrow ones, then wide ones in each tile of the grid that they may reach."""
         assert self._places is not None
         most, (across, down) = self._places.height * BEAMS_A_ROW, self._tiles
         own: Bindings = {
@@ -195,7 +196,9 @@ class Caustics:
         self._find_bounds.run(
             (self._bound_threads(),), own, shared, self._grid.bindings, scene, **self._last_bindings()
         )
-        self._find_tiles.run((list_threads(self._gpu, most), down), own, shared, scene)
+        walkers = list_threads(self._gpu, most)
+        rows = -(-self._threads // walkers)  # of workgroups that add narrow beams
+        self._find_tiles.run((walkers, down + rows), own, shared, scene)
         self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
 
     def _bound_threads(self) -> int:
@@ -221,5 +224,4 @@ class Caustics:
             self._tile_beams,
             self._find_tiles,
             self._gather,
-            self._splat,
         )

@@ -57,12 +57,19 @@ class SurfelGroups:
     def __init__(self, gpu: GpuContext, volume_size: int) -> None:
         self._gpu = gpu
         self._grid = gpu.storage_buffer(group_grid_bytes(volume_size), LOWER_VOLUME)
+        self._is_filled = False
         self._allocate(0)
 
     def resize(self, size: int, count: int) -> None:
         """Makes room for the groups of `count` volumes of `size` voxels an edge; `reset` is next."""
         self._grid.release()
         self._grid = self._gpu.storage_buffer(count * group_grid_bytes(size), LOWER_VOLUME)
+        self._is_filled = False
+
+    @property
+    def filled_grid(self) -> moderngl.Buffer | None:
+        """The grid, for whoever clears it together with the voxels; None: there are no groups."""
+        return self._grid if self._is_filled else None
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -81,6 +88,7 @@ class SurfelGroups:
             self._release_growing()
             self._allocate(store.surfel_capacity)
         clear_buffer(self._gpu, self._grid)
+        self._is_filled = True
         self._gpu.clear_start(self._entries, HEADER_BYTES)
 
     def _allocate(self, surfels: int) -> None:
@@ -112,13 +120,13 @@ class LightVoxels:
 
     The kinds are real light without objects, the real change, virtual light, and real light of a full solution. With
     `gathered`, gathered light replaces unoccluded ambient light, and the sums change by the difference; direct light
-    is that of the last run without.
+    is that of the last run without. With `from_mu`, the light that was gathered from mu is there from the start.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._threads = list_threads(gpu)
-        self._kernels: dict[tuple[str, bool], Kernel] = {}
+        self._kernels: dict[tuple[str, ...], Kernel] = {}
         self.support = gpu.ctx.buffer(reserve=SUPPORT_BYTES)
 
     @property
@@ -133,9 +141,11 @@ class LightVoxels:
         groups: SurfelGroups | None = None,
         *,
         gathered: bool = False,
+        finds_groups: bool = False,
     ) -> None:
-        """Sums c_mu and a_real; `groups` keep each surfel's light."""
-        self._run("REAL", store, groups, scene, gathered=gathered)
+        """Sums c_mu and a_real; `groups` keep each surfel's light. `finds_groups`: gives groups slots on the way."""
+        more = ("FINDS_GROUPS",) if finds_groups else ()
+        self._run("REAL", store, groups, scene, *more, gathered=gathered)
 
     def light_real_delta(
         self,
@@ -146,17 +156,9 @@ class LightVoxels:
         gathered: bool = False,
         from_mu: bool = False,
     ) -> None:
-        """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support.
-
-        `from_mu`: the gathered light is that of mu in both.
-        """
+        """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support."""
         clear_buffer(self._gpu, store.delta_sums)
-        own: Bindings = {"adds": True, "from_mu": from_mu}
-        self._run("REAL_DELTA", store, groups, {**scene, **own}, gathered=gathered)
-
-    def keep_direct(self, store: VoxelStore, scene: Bindings, groups: SurfelGroups) -> None:
-        """Keeps the direct light on real surfaces with the objects, for sums with gathered light."""
-        self._run("REAL_DELTA", store, groups, {**scene, "adds": False}, gathered=False)
+        self._run("REAL_DELTA", store, groups, scene, gathered=gathered, from_mu=from_mu)
 
     def light_virtual(
         self,
@@ -165,9 +167,10 @@ class LightVoxels:
         groups: SurfelGroups | None = None,
         *,
         gathered: bool = False,
+        from_mu: bool = False,
     ) -> None:
         """Sums c and a of virtual surfaces; `groups` keep each surfel's light."""
-        self._run("VIRTUAL", store, groups, scene, gathered=gathered)
+        self._run("VIRTUAL", store, groups, scene, gathered=gathered, from_mu=from_mu)
 
     def light_solution(
         self,
@@ -186,9 +189,16 @@ class LightVoxels:
         self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, scene, gathered=gathered)
 
     def _run(
-        self, kind: str, store: VoxelStore, groups: SurfelGroups | None, scene: Bindings, *, gathered: bool
+        self,
+        kind: str,
+        store: VoxelStore,
+        groups: SurfelGroups | None,
+        scene: Bindings,
+        *more: str,
+        gathered: bool,
+        from_mu: bool = False,
     ) -> None:
-        self._kernel(kind, gathered=gathered).run(
+        self._kernel(kind, *more, *["GATHERED"] * gathered, *["FROM_MU"] * from_mu).run(
             (self._threads,),
             store.bindings,
             NO_GROUPS if groups is None else groups.bindings,
@@ -198,12 +208,12 @@ class LightVoxels:
             Support=self.support,
         )
 
-    def _kernel(self, kind: str, *, gathered: bool) -> Kernel:
-        """Returns the kernel, compiled on first use."""
-        if (kind, gathered) not in self._kernels:
-            defines = {kind: 1, "GREATEST_ALPHA": GREATEST_ALPHA, **({"GATHERED": 1} if gathered else {})}
-            self._kernels[kind, gathered] = Kernel(self._gpu, "light_voxels", **defines)
-        return self._kernels[kind, gathered]
+    def _kernel(self, *names: str) -> Kernel:
+        """Returns the kernel of these defines, compiled on first use."""
+        if names not in self._kernels:
+            defines = {**dict.fromkeys(names, 1), "GREATEST_ALPHA": GREATEST_ALPHA}
+            self._kernels[names] = Kernel(self._gpu, "light_voxels", **defines)
+        return self._kernels[names]
 
     def reset_support(self, bounds: np.ndarray[Any, np.dtype[np.int32]]) -> None:
         """Resets the support of the delta to the voxels of the objects: min x, y, z, -max x, y, z of each volume."""
@@ -224,9 +234,13 @@ class GroupSurfels:
         self._find = Kernel(gpu, "group_surfels")
         self._sum = Kernel(gpu, "group_surfels", SUM=1)
 
-    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
-        """Fills `groups` (after their `reset`); with `has_seen`, its surfel lights mark what the camera sees."""
+    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings) -> None:
+        """Fills `groups` (after their `reset`)."""
         self._find.run((self._threads,), store.bindings, groups.bindings, scene)
+        self.sum(store, groups, scene, has_seen=False)
+
+    def sum(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
+        """Sums up groups that were found; with `has_seen`, its surfel lights mark what the camera sees."""
         self._sum.run((self._threads,), store.bindings, groups.bindings, scene, has_seen=has_seen)
 
     def release(self) -> None:
@@ -317,8 +331,10 @@ class BounceTail:
         self.irradiance = gpu.ctx.texture3d(shape, 4, dtype="f2")
         self.irradiance.filter = (moderngl.LINEAR, moderngl.LINEAR)
         clear_volume(gpu, self.irradiance)
-        self._gather = Kernel(gpu, "gather_voxels", TAIL=1, **defines)
-        self._sum = Kernel(gpu, "bounce_tail")
+        # In software, a workgroup that waits for its own stores takes longer than another dispatch (LevelFilter).
+        fused = {} if gpu.is_software else {"FUSED": 1}
+        self._gather = Kernel(gpu, "gather_voxels", TAIL=1, **fused, **defines)
+        self._sum = Kernel(gpu, "bounce_tail") if gpu.is_software else None
 
     def find(
         self,
@@ -329,10 +345,15 @@ class BounceTail:
         scene: Bindings,
     ) -> None:
         """Finds it from what one more gathering from `rho` would add to what `groups` hold."""
+        own: Bindings = {
+            "TailSums": self._sums,
+            "bounce_tail": self.irradiance,
+            "GroupsDone": self._gpu.group_counters,
+        }
         gathered = {**gather_bindings(store, groups, mu, rho), "only_unseen": False}
-        self._gather.run((gather_threads(self._gpu, store),), gathered, scene, TailSums=self._sums)
-        threads = store.volume_count * self._sum.local_size[0]
-        self._sum.run((threads,), TailSums=self._sums, bounce_tail=self.irradiance)
+        self._gather.run((gather_threads(self._gpu, store),), own, gathered, scene)
+        if self._sum is not None:
+            self._sum.run((store.volume_count * self._sum.local_size[0],), own)
 
     def release(self) -> None:
         """Frees the GL objects."""

@@ -7,7 +7,7 @@ import moderngl
 import numpy as np
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
+from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume, note_cleared
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads
@@ -124,6 +124,7 @@ class VoxelMipmap:
         self.texture.repeat_x = self.texture.repeat_y = self.texture.repeat_z = False
         clear_volume(gpu, self.texture)
         self.occupied = gpu.storage_buffer(count * occupancy_bytes(size), LOWER_VOLUME)
+        clear_buffer(gpu, self.occupied)
 
     def release(self) -> None:
         """Frees the texture and the buffer."""
@@ -225,39 +226,32 @@ class ClearVoxels:
         first, *second = self._mipmaps = mipmaps
         self._threads = list_threads(gpu)
         defines = {"DIRECTIONS": first.directions, **({"TWO": 1} if second else {})}
-        if gpu.is_software:  # FilterVoxels walks lists there
-            defines["LEVEL_1"] = 1
-        self._kernel = Kernel(gpu, "clear_voxels", **defines)
+        # In software, FilterVoxels walks lists, and clearing whole buffers is a memset.
+        defines["LEVEL_1" if gpu.is_software else "BUFFERS"] = 1
+        self._gpu, self._kernel = gpu, Kernel(gpu, "clear_voxels", **defines)
 
-    def run(self, store: VoxelStore, volume: PlacedVolume) -> None:
-        """Clears the voxels; the lists of `store` are left for the voxelisation that follows to `reset`."""
-        images = {name: each.texture for name, each in zip(("mipmap", "second"), self._mipmaps, strict=False)}
-        self._kernel.run((self._threads,), store.bindings, volume.bindings, **images)
+    def run(
+        self,
+        store: VoxelStore,
+        volume: PlacedVolume,
+        *,
+        occupied: moderngl.Buffer | None = None,
+        group_grid: moderngl.Buffer | None = None,
+    ) -> None:
+        """Clears the voxels; the lists of `store` are left for the voxelisation that follows to `reset`.
 
-    def release(self) -> None:
-        """Frees the program."""
-        self._kernel.release()
-
-
-class OccupyVoxels:
-    """Finds which cells of a mipmap hold anything, from the voxels that sets touched."""
-
-    def __init__(self, gpu: GpuContext) -> None:
-        self._gpu, self._threads = gpu, list_threads(gpu)
-        self._kernel = Kernel(gpu, "occupy_voxels")
-
-    def run(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore) -> None:
-        """Replaces the mipmap's occupancy by that of the store."""
-        clear_buffer(self._gpu, mipmap.occupied)
-        self._mark(mipmap, volume, store)
-
-    def add(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore, to: VoxelMipmap) -> None:
-        """Replaces the mipmap's occupancy by that of the store and of the mipmap `to`, which is of the same size."""
-        self._gpu.ctx.copy_buffer(mipmap.occupied, to.occupied)
-        self._mark(mipmap, volume, store)
-
-    def _mark(self, mipmap: VoxelMipmap, volume: PlacedVolume, store: VoxelStore) -> None:
-        self._kernel.run((self._threads,), store.bindings, volume.bindings, Occupied=mipmap.occupied)
+        Also clears an occupancy that holds these voxels alone and, on a GPU, the grid of their groups.
+        """
+        bound: dict[str, Binding] = {
+            name: each.texture for name, each in zip(("mipmap", "second"), self._mipmaps, strict=False)
+        }
+        if not self._gpu.is_software:
+            bound.update(Occupied=occupied, GroupGrid=group_grid)
+        elif occupied is not None:
+            clear_buffer(self._gpu, occupied)
+        self._kernel.run((self._threads,), store.bindings, volume.bindings, **bound)
+        if group_grid is not None:
+            note_cleared(self._gpu, (group_grid, group_grid.size))
 
     def release(self) -> None:
         """Frees the program."""
@@ -265,35 +259,61 @@ class OccupyVoxels:
 
 
 class ResolveVoxels:
-    """Writes sums to level 0: of mu (real alone) and of rho (real with its changed light, and virtual)."""
+    """Writes sums to level 0: of mu (real alone) and of rho (real with its changed light, and virtual).
+
+    Where they are told to, both mark in the mipmap's occupancy which cells hold anything.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._threads = list_threads(gpu)
+        self._gpu, self._threads = gpu, list_threads(gpu)
         self._mu = Kernel(gpu, "resolve_voxels")
-        self._rho = Kernel(gpu, "resolve_voxels", RHO=1)
+        spends = (
+            {} if gpu.is_software else {"SPENDS_DELTA": 1}
+        )  # clearing whole buffers is faster in software
+        self._rho = Kernel(gpu, "resolve_voxels", RHO=1, **spends)
 
-    def resolve_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
-        """Writes (c_mu, a_real)."""
-        self._mu.run((self._threads,), real.bindings, volume.bindings, mipmap=mu.texture)
+    def resolve_mu(
+        self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume, *, occupies: bool = False
+    ) -> None:
+        """Writes (c_mu, a_real); `occupies`: the mipmap's occupancy, which is empty, too."""
+        own: Bindings = {"mipmap": mu.texture, "Occupied": mu.occupied, "marks": occupies}
+        self._mu.run((self._threads,), own, real.bindings, volume.bindings)
 
     def resolve_rho(
-        self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume
+        self,
+        rho: VoxelMipmap,
+        real: VoxelStore,
+        virtual: VoxelStore,
+        volume: PlacedVolume,
+        *,
+        mu: VoxelMipmap | None = None,
     ) -> None:
-        """Writes (c_rho, a_real + a_virtual)."""
+        """Writes (c_rho, a_real + a_virtual), and uses up the sums of changed light.
+
+        With `mu`, of the real set alone, also replaces the occupancy by that of mu and what the virtual set adds.
+        """
+        if mu is not None:
+            self._gpu.ctx.copy_buffer(rho.occupied, mu.occupied)
         self._rho.run(
             (self._threads,),
             real.bindings,
             volume.bindings,
             mipmap=rho.texture,
-            DeltaSums=real.delta_sums,
-            VirtualGrid=virtual.grid,
+            Occupied=rho.occupied,
+            marks=mu is not None,
             VirtualTouched=virtual.touched,
-            VirtualSums=virtual.sums,
+            **_joint_sums(real, virtual),
         )
+        note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
 
     def release(self) -> None:
         """Frees the programs."""
         release_all(self._mu, self._rho)
+
+
+def _joint_sums(real: VoxelStore, virtual: VoxelStore) -> dict[str, Binding]:
+    """What resolved_voxels.glsl reads of both sets besides the real one's own."""
+    return {"DeltaSums": real.delta_sums, "VirtualGrid": virtual.grid, "VirtualSums": virtual.sums}
 
 
 class LevelFilter:
@@ -324,7 +344,7 @@ class LevelFilter:
         tile = self._kernel.local_size[0] if self._is_fused else 1
         cells = math.ceil((volume.placement.size >> level) / tile) * tile  # whole tiles
         threads = (cells, cells, cells * directions * len(volume.placements))
-        own: Bindings = {"first_level": level, "TilesDone": self._gpu.group_counters}
+        own: Bindings = {"first_level": level, "GroupsDone": self._gpu.group_counters}
         self._kernel.run(threads, volume.bindings, own, *shared)
 
     def release(self) -> None:
@@ -368,3 +388,38 @@ class FilterVoxels:
     def release(self) -> None:
         """Frees the programs."""
         release_all(self._levels, self._listed)
+
+
+class RefilterVoxels:
+    """Resolves and filters mipmaps anew whose occupancy is known: on a GPU in one dispatch, which skips by it."""
+
+    def __init__(self, gpu: GpuContext, resolve: ResolveVoxels, filtering: FilterVoxels) -> None:
+        self._gpu, self._resolve, self._filter = gpu, resolve, filtering
+        self._mu: LevelFilter | None = None
+        self._rho: LevelFilter | None = None
+        if not gpu.is_software:
+            self._mu = LevelFilter(gpu, "filter_voxels", RESOLVES=1)
+            self._rho = LevelFilter(gpu, "filter_voxels", RESOLVES=1, RHO=1, SPENDS_DELTA=1)
+
+    def run_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
+        """Rebuilds mu, as `ResolveVoxels.resolve_mu` and `FilterVoxels` do."""
+        if self._mu is None:
+            self._resolve.resolve_mu(mu, real, volume)
+            self._filter.run(mu, volume, real)
+        else:
+            own: Bindings = {"Occupied": mu.occupied}
+            self._mu.run(volume, DIRECTIONS, own, real.bindings, mipmap=mu.texture)
+
+    def run_rho(self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume) -> None:
+        """Rebuilds rho, as `ResolveVoxels.resolve_rho` and `FilterVoxels` do."""
+        if self._rho is None:
+            self._resolve.resolve_rho(rho, real, virtual, volume)
+            self._filter.run(rho, volume, real, virtual)
+        else:
+            own: Bindings = {"Occupied": rho.occupied, **_joint_sums(real, virtual)}
+            self._rho.run(volume, DIRECTIONS, own, real.bindings, mipmap=rho.texture)
+            note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
+
+    def release(self) -> None:
+        """Frees its own programs."""
+        release_all(self._mu, self._rho)

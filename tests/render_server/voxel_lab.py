@@ -19,7 +19,6 @@ from deltalight.render_server.passes.voxels import (
     SURFEL_BYTES,
     SURFELS_HEADER_BYTES,
     FilterVoxels,
-    OccupyVoxels,
     ResolveVoxels,
     VoxelMipmap,
     VoxelStore,
@@ -66,7 +65,6 @@ class VoxelLab:
         self._light = LightVoxels(gpu)
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
-        self._occupy = OccupyVoxels(gpu)
         self._lights = LightBuffers(gpu, 64, 4)
         self._lights.set_environment(np.zeros((16, 16, 3), np.float32))
         self._cones = Kernel(gpu, Path(__file__).with_name("cones"))
@@ -118,8 +116,7 @@ class VoxelLab:
         }
         self.voxelize(voxels.store, mesh)
         self._light.light_virtual(voxels.store, scene)
-        self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume)
-        self._occupy.run(voxels.rho, self._volume, voxels.store)
+        self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume, mu=voxels.mu)
         self._filter.run(voxels.rho, self._volume, voxels.store)
         materials.release()
         return voxels
@@ -167,7 +164,6 @@ class VoxelLab:
             self._light,
             self._resolve,
             self._filter,
-            self._occupy,
             self._lights,
             self._cones,
         ):

@@ -1,34 +1,7 @@
-// Sums up the bounces beyond those that the voxels hold (docs/method.md 4.3). Of each, about the same share returns to surfaces and
-// is the next one's amount, so all of them add share / (1 - share) times the next one. A workgroup for each volume, which leaves
-// the sums empty.
-#include "common/bounce_tail.glsl"
-
+// Sums up the bounces beyond those that the voxels hold, a workgroup for each volume: where gather_voxels does not.
 const int THREADS = 256;   // = local_size_x
 layout(local_size_x = 256) in;
-layout(std430) buffer TailSums { int tail_sums[]; };
-layout(rgba16f) writeonly uniform image3D bounce_tail;   // rgb irradiance times area, a: area
-#include "common/workgroup_sum.glsl"
+#include "common/bounce_tail.glsl"
+#include "common/tail_sums.glsl"
 
-// Sums of all of the volume: (amount, returned).
-vec2 summed_amounts(int first, int thread) {
-    vec2 sum = vec2(0.0);
-    for (int place = thread; place < TAIL_PLACES; place += THREADS) {
-        int at = (first + place) * TAIL_SUMS;
-        sum += vec2(tail_sums[at + TAIL_AMOUNT], tail_sums[at + TAIL_RETURNED]);
-    }
-    return workgroup_sum(sum, thread);
-}
-
-void main() {
-    int number = int(gl_WorkGroupID.x), thread = int(gl_LocalInvocationID.x);
-    int first = number * TAIL_PLACES;
-    vec2 amounts = summed_amounts(first, thread);
-    float share = amounts.y / max(amounts.x, 1.0);   // < 1: no surface reflects all
-    vec4 scale = vec4(vec3(share / (1.0 - share)), 1.0) / TAIL_FIXED_POINT;
-    for (int place = thread; place < TAIL_PLACES; place += THREADS) {
-        int at = (first + place) * TAIL_SUMS;
-        vec4 sums = vec4(tail_sums[at], tail_sums[at + 1], tail_sums[at + 2], tail_sums[at + TAIL_AREA]);
-        imageStore(bounce_tail, tail_texel(number, place), sums * scale);
-        for (int i = 0; i < TAIL_SUMS; ++i) tail_sums[at + i] = 0;
-    }
-}
+void main() { sum_tail(int(gl_WorkGroupID.x), int(gl_LocalInvocationID.x)); }

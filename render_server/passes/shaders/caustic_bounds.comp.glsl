@@ -1,10 +1,11 @@
 // Where each beam may light the picture; and a ball around the surfaces that need light in each tile (its middle and radius, world m),
 // of real surfaces and below them of objects. The first workgroups find the balls, the others walk the beams. With REUSES, some
 // between them bring over the caustics that the last frame's texels know: one dispatch, for none of these waits for another.
+// CLEARS: the threads that walk the beams also empty the sums.
 #include "common/geometry.glsl"
 #include "common/walk.glsl"
 #define FINDS_PLACES
-#ifdef REUSES
+#if defined(REUSES) || defined(CLEARS)
 #define ADDS_CAUSTICS
 #endif
 #include "common/beam_footprint.glsl"
@@ -116,5 +117,9 @@ void main() {
         uint count = beams_held();
         for (uint i = 64u * (group - before_beams) + thread; i < count; i += 64u * (groups - before_beams))
             put_place(i, place_of(beam_at(i)));
+#ifdef CLEARS
+        uint sums = uint(caustic_sums.length());
+        for (uint i = 64u * (group - before_beams) + thread; i < sums; i += 64u * (groups - before_beams)) caustic_sums[i] = 0;
+#endif
     }
 }

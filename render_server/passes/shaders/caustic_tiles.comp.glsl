@@ -1,12 +1,17 @@
-// Finds the tiles that each wide beam may light: invocations (x) walk the beams for each row of tiles (y).
+// Finds the tiles that each wide beam may light: invocations (x) walk the beams for each row of tiles (y). Workgroups below these
+// rows add the irradiance of narrow beams to the pixels around their hits, a workgroup per beam: one dispatch, for neither waits
+// for the other. Sums are integers, so that their order does not matter.
 #include "common/geometry.glsl"
+#define ADDS_CAUSTICS
 #include "common/beam_footprint.glsl"
 #include "common/beam_tiles.glsl"
+#include "common/camera.glsl"
 #include "common/walk.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba32f) readonly uniform image2D tile_balls;
 layout(std430) buffer TileBeams { uint tile_beams[]; };
+uniform ivec2 picture_pixels;
 
 void mark(uint i, int row) {
     BeamPlace at = place_of_beam(i);
@@ -19,7 +24,27 @@ void mark(uint i, int row) {
             atomicOr(tile_beams[first_word(ivec2(x, row), at.layer) + int(i >> 5u)], 1u << (i & 31u));
 }
 
+void splat(Beam beam, BeamPlace place) {
+    mat3 basis = basis_around(beam.direction.xyz);
+    ivec2 size = place.high - place.low + 1;
+    for (int i = int(gl_LocalInvocationIndex); i < size.x * size.y; i += 64) {
+        ivec2 pixel = place.low + ivec2(i % size.x, i / size.x);
+        vec3 normal, p = position_on(place.layer, pixel, normal);
+        ivec3 part = caustic_part(beam, basis, p, normal);
+        int at = sums_of_pixel(pixel, picture_pixels) + place.layer;
+        for (int j = 0; j < 3; ++j)
+            if (part[j] != 0) atomicAdd(caustic_sums[at + j], part[j]);
+    }
+}
+
 void main() {
-    uint count = beams_held();
-    for (uint i = first_item(); i < count; i += items_apart()) mark(i, int(gl_WorkGroupID.y));
+    int row = int(gl_WorkGroupID.y);
+    bool is_wide = row < tiles.y;
+    uint count = beams_held(), wide = is_wide ? count : 0u, narrow = is_wide ? 0u : count;
+    for (uint i = first_item(); i < wide; i += items_apart()) mark(i, row);
+    uint rows = gl_NumWorkGroups.y - uint(tiles.y), first = uint(row - tiles.y) * gl_NumWorkGroups.x + gl_WorkGroupID.x;
+    for (uint i = first; i < narrow; i += rows * gl_NumWorkGroups.x) {
+        BeamPlace place = place_of_beam(i);
+        if (place.layer >= 0 && place.sharp != 0) splat(beam_at(i), place);
+    }
 }

@@ -1,5 +1,6 @@
 // Empties the voxels that a set touched: its grid cells, and their texels in all directions of a mipmap or of two; with
-// LEVEL_1 also those above them, which filter_voxels does not visit again where it walks lists.
+// LEVEL_1 also those above them, which filter_voxels does not visit again where it walks lists. With BUFFERS, all of two
+// buffers that follow from the voxels: a mipmap's occupancy and the grid of groups.
 #include "common/volume.glsl"
 #include "common/walk.glsl"
 #define GRID_ACCESS
@@ -10,6 +11,11 @@ layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image3D mipmap;
 #ifdef TWO
 layout(rgba16f) writeonly uniform image3D second;
+#endif
+
+#ifdef BUFFERS
+layout(std430) writeonly buffer Occupied { uint occupied[]; };
+layout(std430) writeonly buffer GroupGrid { uint group_grid[]; };
 #endif
 
 void empty(ivec3 texel) {
@@ -30,4 +36,8 @@ void main() {
         }
         grid[touched[i]] = 0u;
     }
+#ifdef BUFFERS
+    for (uint i = first_item(); i < uint(occupied.length()); i += items_apart()) occupied[i] = 0u;
+    for (uint i = first_item(); i < uint(group_grid.length()); i += items_apart()) group_grid[i] = 0u;
+#endif
 }

@@ -1,14 +1,21 @@
 // Filters levels of the six one-sided mipmaps (docs/method.md 4.4): two cells along k composited front to back, mean of
 // the four across. Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do not occlude
 // each other). With FUSED, all levels in one dispatch (common/mipmap_tiles.glsl); nothing is read below cells that hold nothing,
-// which are most. Software renderers compute such cells as well: with LISTED,
-// they walk the voxels that a set touched, to the cells of level 1 around them, where nearly all of the work is.
+// which are most. RESOLVES: it also computes level 0 from the sums (resolved_voxels.glsl). Software renderers compute such cells as
+// well: with LISTED, they walk the voxels that a set touched, to the cells of level 1 around them, where nearly all of the work is.
 #include "common/volume.glsl"
 
-#ifdef LISTED
+#if defined(LISTED) || defined(RESOLVES)
 #define GRID_ACCESS readonly
+#ifdef LISTED
 #define TOUCHED_ACCESS readonly
+#else
+#define SUMS_ACCESS readonly
+#endif
 #include "common/voxel_store.glsl"
+#endif
+
+#ifdef LISTED
 #include "common/walk.glsl"
 
 layout(local_size_x = 64) in;
@@ -16,6 +23,9 @@ layout(rgba16f) uniform image3D mipmap;
 #else
 #ifdef FUSED
 #include "common/occupancy.glsl"
+#ifdef RESOLVES
+#include "common/resolved_voxels.glsl"
+#endif
 
 layout(rgba16f) coherent uniform image3D mipmap;
 #else
@@ -55,8 +65,31 @@ vec4 filtered(int level, ivec3 cell, int k) {
     return 0.25 * sum;
 }
 
+#ifdef RESOLVES
+// Writes a voxel's texel, if a set touched it.
+void resolve(ivec3 v, int k) {
+    uint voxel = voxel_index(v + ivec3(0, 0, volume * volume_size), volume_size), slot = grid[voxel];
+    ivec3 texel = level_base(0, k) + v;
+#ifdef RHO
+    uint other = virtual_grid[voxel];
+    if (slot != 0u) imageStore(mipmap, texel, joint_texel(int(slot - 1u), other, k));
+    else if (other != 0u) imageStore(mipmap, texel, virtual_texel(int(other - 1u), k));
+#else
+    if (slot != 0u) imageStore(mipmap, texel, real_texel(int(slot - 1u), k));
+#endif
+}
+
+void resolve_cell(ivec3 cell, int k) {
+    for (int j = 0; j < 8; ++j) resolve(2 * cell + ivec3(j & 1, j >> 1 & 1, j >> 2), k);
+}
+#else
+void resolve_cell(ivec3 cell, int k) {}
+#endif
+
 void write_cell(int level, ivec3 cell, int k) {
-    vec4 sum = may_hold(level, cell) ? filtered(level, cell, k) : vec4(0.0);
+    bool holds = may_hold(level, cell);
+    if (level == 1 && holds) resolve_cell(cell, k);
+    vec4 sum = holds ? filtered(level, cell, k) : vec4(0.0);
     imageStore(mipmap, level_base(level, k) + cell, sum);
 }
 

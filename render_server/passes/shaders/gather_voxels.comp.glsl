@@ -1,6 +1,7 @@
 // Irradiance of each group of surfels by a few cones through one mipmap (docs/method.md 4.3, further bounces): the light of
 // other surfaces, and of the environment where nothing is in front of it. CHANGE: E_rho from E_mu, by the cones that may meet the
-// objects' changes. TAIL: what one more such gathering would add, for some groups of each cell of bounce_tail.glsl.
+// objects' changes. TAIL: what one more such gathering would add, for some groups of each cell of bounce_tail.glsl; FUSED: the last
+// workgroup to end sums that up.
 #if !defined(CHANGE) && !defined(TAIL)
 #define KEEPS_COVERAGE
 #endif
@@ -33,7 +34,13 @@ vec3 sums_at(int at) { return vec3(group_sums[at], group_sums[at + 1], group_sum
 
 #ifdef TAIL
 #include "common/bounce_tail.glsl"
+#ifdef FUSED
+const int THREADS = 64;   // = local_size_x
+#include "common/tail_sums.glsl"
+#include "common/last_group.glsl"
+#else
 layout(std430) buffer TailSums { int tail_sums[]; };
+#endif
 const float WHITEST = 0.95;   // as in light_voxels
 const int SAMPLED = 2;   // groups along each side of a cell
 
@@ -117,4 +124,11 @@ void main() {
         gather(int(i));
         i += items_apart();
     } while (find_group(i, count));
+#ifdef FUSED
+    if (ends_part(0, gl_NumWorkGroups.x))
+        for (int number = 0; number < volume_count; ++number) {
+            sum_tail(number, int(gl_LocalInvocationID.x));
+            barrier();   // before the next volume's sums share their memory
+        }
+#endif
 }

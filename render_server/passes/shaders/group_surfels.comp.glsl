@@ -7,7 +7,9 @@
 #include "common/walk.glsl"
 #include "common/voxel_store.glsl"
 #include "common/surfel_groups.glsl"
-#ifdef SUM
+#ifndef SUM
+#include "common/find_group.glsl"
+#else
 #define SURFEL_LIGHTS_ACCESS readonly
 #include "common/surfel_light.glsl"
 #endif
@@ -34,15 +36,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
     atomicAdd(group_sums[at + GROUP_UNSEEN], 1);
 }
 #else
-void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
-    uint entry = group_entry(floatBitsToUint(s.uv_voxel.z), n);
-    if (atomicCompSwap(group_grid[entry], 0u, 0xffffffffu) != 0u) return;
-    uint slot = atomicAdd(group_count, 1u);
-    if (slot >= uint(group_entries.length())) return;
-    group_entries[slot] = entry;
-    atomicExchange(group_grid[entry], slot + 1u);   // others compare and swap it
-    for (int i = 0; i < GROUP_SUMS; ++i) group_sums[int(slot) * GROUP_SUMS + i] = 0;
-}
+void add_to_group(Surfel s, uint surfel, int side, vec3 n) { find_group(floatBitsToUint(s.uv_voxel.z), n); }
 #endif
 
 void main() {

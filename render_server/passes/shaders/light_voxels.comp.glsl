@@ -3,8 +3,9 @@
 // REAL: L_mu is the measured radiance (all bounces), or albedo / pi E_mu where the camera does not look;
 //       REAL_DELTA sums L_rho - L_mu = L_mu (E_rho / E_mu - 1).
 // VIRTUAL: L_rho = albedo / pi E_rho + emission.
-// E is direct + ambient light at first; GATHERED: the direct light of that run + what the surfel's group gathered;
-// REAL and VIRTUAL then add the growth of L.
+// E is direct + ambient light at first; FROM_MU: direct light + what the surfel's group gathered from mu; GATHERED: the direct
+// light of either run + what the group gathered, where REAL and VIRTUAL add the growth of L.
+// FINDS_GROUPS: each surfel's group gets a slot on the way (group_surfels).
 // REAL_MU and REAL_RHO sum all of L, each under the maps of its own solution: L_mu as REAL,
 // L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
 #define SURFELS_ACCESS readonly
@@ -51,28 +52,43 @@ const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no su
 #ifdef REAL_DELTA
 layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 per slot
 layout(std430) buffer Support { int support[]; };        // of each volume, bounds of changed voxels: min xyz, -max xyz
-uniform bool adds;            // or only keeps the direct light
+#endif
+
+#ifdef FINDS_GROUPS
+#define GROUP_GRID_ACCESS
+#define GROUP_ENTRIES_ACCESS
+#define GROUP_SUMS_ACCESS
+#endif
+#ifdef GATHERED
+#define READS_GROUPS
+#endif
+#ifdef FROM_MU
+#define READS_GROUPS
+#endif
+#ifdef READS_GROUPS
+#define GROUP_GRID_ACCESS readonly
+#define GROUP_LIGHT_ACCESS readonly
+#if defined(GATHERED) && (defined(REAL_DELTA) || defined(REAL_RHO))
+#define GROUP_SUMS_ACCESS
+#endif
+#endif
+#ifdef GROUP_GRID_ACCESS
+#include "common/surfel_groups.glsl"
+
+int group_of(Surfel s, vec3 n) { return group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n)); }
+#endif
+#ifdef FINDS_GROUPS
+#include "common/find_group.glsl"
+#else
+void find_group(uint voxel, vec3 n) {}
 #endif
 
 #ifdef GATHERED
-#define GROUP_GRID_ACCESS readonly
-#define GROUP_LIGHT_ACCESS readonly
-#if defined(REAL_DELTA) || defined(REAL_RHO)
-#define GROUP_SUMS_ACCESS
-#endif
-#include "common/surfel_groups.glsl"
-#ifdef REAL_DELTA
-uniform bool from_mu;         // nothing was gathered from rho yet: what was from mu is the first guess
-#define GATHERED_RHO (from_mu ? 0 : 1)
-#else
-const int GATHERED_RHO = 1;
-#endif
-
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
-    int slot = group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n));
+    int slot = group_of(s, n);
     vec3 ambient = environment_irradiance(n);
     mu = surfel_light(own, DIRECT_MU).rgb + (slot < 0 ? ambient : group_light[2 * slot].rgb);
-    rho = surfel_light(own, DIRECT_RHO).rgb + (slot < 0 ? ambient : group_light[2 * slot + GATHERED_RHO].rgb);
+    rho = surfel_light(own, DIRECT_RHO).rgb + (slot < 0 ? ambient : group_light[2 * slot + 1].rgb);
 }
 #else
 #ifdef VIRTUAL
@@ -111,6 +127,10 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     mu = surfel_light(own, DIRECT_MU).rgb;
 #endif
     vec3 ambient = environment_irradiance(n);
+#ifdef FROM_MU
+    int slot = group_of(s, n);
+    if (slot >= 0) ambient = group_light[2 * slot].rgb;   // also the first guess of rho's
+#endif
     mu += ambient;
     rho += ambient;
 }
@@ -191,10 +211,10 @@ vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
 }
 #endif
 
-#if defined(GATHERED) && defined(GROUP_SUMS_ACCESS)
+#if defined(GROUP_SUMS_ACCESS) && !defined(FINDS_GROUPS)
 // Light of mu on a surfel, for its group's albedo.
 void add_to_group(Surfel s, vec3 n, vec3 mu, vec3 radiance) {
-    int slot = group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n));
+    int slot = group_of(s, n);
     if (slot < 0) return;
     float scale = s.position_area.w / (voxel_edge * voxel_edge) * LIGHT_FIXED_POINT;
     atomicAdd(group_sums[slot * GROUP_SUMS + GROUP_IRRADIANCE], int(round(scale * dot(mu, LUMINANCE))));
@@ -228,7 +248,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
     add_to_group(s, n, mu, surfel_light(own, RADIANCE_MU).rgb);
-#ifdef GATHERED
+#if defined(GATHERED) || defined(FROM_MU)
     if (all(lessThanEqual(abs(rho - mu), LEAST_CHANGE * max(mu, rho)))) return vec3(0.0);
 #endif
     return change_of(surfel_light(own, RADIANCE_MU).rgb / (mu + 1e-6), mu, rho);
@@ -238,12 +258,12 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 void light(Surfel s, uint own, vec3 n) {
     uint voxel = floatBitsToUint(s.uv_voxel.z);
     ivec3 v = enter_volume_of(voxel, volume_size);
+    find_group(voxel, n);
     vec3 radiance = outgoing(s, n, own);
 #if defined(REAL_DELTA) || defined(GATHERED)
     if (radiance == vec3(0.0)) return;
 #endif
 #ifdef REAL_DELTA
-    if (!adds) return;
     int held = 6 * volume;
     for (int j = 0; j < 3; ++j) { atomicMin(support[held + j], v[j]); atomicMin(support[held + 3 + j], -v[j]); }
 #endif

@@ -2,11 +2,10 @@
 // level, then the cells above it, which need no others; the last workgroup of a slab to end filters the levels above those, of the
 // slab alone. The shader has write_cell(level, cell, k), and coherent images.
 layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
-layout(std430) coherent buffer TilesDone { uint tiles_done[]; };   // of each slab; 0 between dispatches
+#include "common/last_group.glsl"
 uniform int first_level;   // to write; >= 1
 uniform int level_count;   // how many are written
 const int TILE = 8, TILE_LEVELS = 4, THREADS = TILE * TILE * TILE;
-shared bool is_last;
 
 int thread() { return int(gl_LocalInvocationIndex); }
 
@@ -25,20 +24,6 @@ void filter_tile(ivec3 tile, int k) {
     }
 }
 
-// Whether all other workgroups of the slab are done. Each invocation made its stores visible to all workgroups (the image is
-// coherent) before the first one counted its workgroup; whoever reads the last count and then passes the barrier sees them all.
-bool ends_slab(int slab, int tile_count) {
-    memoryBarrier();
-    barrier();
-    if (thread() == 0) {
-        is_last = atomicAdd(tiles_done[slab], 1u) + 1u == uint(tile_count);
-        if (is_last) tiles_done[slab] = 0u;   // nobody else counts here any more
-    }
-    memoryBarrier();
-    barrier();
-    return is_last;
-}
-
 void filter_above_tiles(int k) {
     for (int level = first_level + TILE_LEVELS; level < first_level + level_count; ++level) {
         int n = volume_size >> level;
@@ -52,5 +37,5 @@ void main() {
     int k = slab % DIRECTIONS;
     work_in_volume(slab / DIRECTIONS);
     filter_tile(ivec3(gl_WorkGroupID.xy, z % tiles), k);
-    if (level_count > TILE_LEVELS && ends_slab(slab, tiles * tiles * tiles)) filter_above_tiles(k);
+    if (level_count > TILE_LEVELS && ends_part(slab, uint(tiles * tiles * tiles))) filter_above_tiles(k);
 }
