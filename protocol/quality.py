@@ -25,14 +25,14 @@ class QualityTier:
 
     `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_share` of its voxels an
     edge. `reflection_cones` look up what a pixel of a smooth object reflects, in one of `reflection_step` x
-    `reflection_step` pixels; while only the camera moves, in one tile of `reflection_turns`, and in the others where no
-    pixel of the frame before serves (1: everywhere). `caustic_blocks` x `caustic_blocks` blocks of each light's map of the objects send
-    beams. While objects move, the light that they throw back, block between surfaces and focus is found in one of
-    `bounce_turns` frames; their shadows are in every one. One tile of the picture in `refresh_tiles` gets new light
-    in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new light, and
-    the real scene is built anew whenever the camera moves. `distant_light`: objects also take and add light at
-    surfaces beyond their volumes. `glass_rays`: with transparent objects, rays find the penumbrae on real surfaces,
-    and cones bend.
+    `reflection_step` pixels; while only the camera moves, in one tile of the picture in `reflection_turns`, and
+    where nothing that the frame before looked up serves. `caustic_blocks` x `caustic_blocks` blocks of each light's
+    map of the objects send beams. While objects move, the light that they throw back, block between surfaces and
+    focus is found in one of `bounce_turns` frames; their shadows are in every one. One tile of the picture in
+    `refresh_tiles` gets new light in each frame in which only the camera moves, the others keep that of the frame
+    before; 0: all get new light, and the real scene is built anew whenever the camera moves. `distant_light`:
+    objects also take and add light at surfaces beyond their volumes. `glass_rays`: with transparent objects, rays
+    find the penumbrae on real surfaces, and cones bend.
     """
 
     cone_count: int = 64

@@ -70,7 +70,7 @@ class ListWalk:
         self._groups = ListGroups(gpu, SOFTWARE_GROUP_ITEMS, in_rows=False) if gpu.is_software else None
 
     def run(self, kernel: Kernel, items: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
-        """Runs a kernel of 64 threads a workgroup over `items` (count, then items), which it binds by its own name."""
+        """Runs a kernel, 64 threads a workgroup, over `items` (count, then items), which `own` binds too."""
         if self._groups is None:
             kernel.run((self._threads,), *shared, **own)
         else:

@@ -168,7 +168,9 @@ class ScreenCones:
         self._walk = ListWalk(gpu, width * height)
         size = -(-width // step), -(-height // step)
         self._traced = texture_2d(gpu, size, 4, "f2")
-        self._history = ReflectionHistory(gpu, size, tier.reflection_turns) if tier.reflection_turns > 1 else None
+        self._history = (
+            ReflectionHistory(gpu, size, tier.reflection_turns) if tier.reflection_turns > 1 else None
+        )
         voxels = {} if march is None else {"VOXELS": 1, **march}
         self._kernel = Kernel(
             gpu,

@@ -3,7 +3,7 @@
 #include "common/reprojection.glsl"
 #include "common/octahedral.glsl"
 
-layout(rgba32ui) writeonly uniform uimage2D records_out;     // bits of the point (world m), and tag(); at pixel / STEP
+layout(rgba32ui) writeonly uniform uimage2D records_out;     // at pixel / STEP; point (world m) with stamp(), and direction (octahedral)
 layout(rgba32ui) readonly uniform uimage2D last_records;
 layout(rgba16f) readonly uniform image2D last_reflected;
 uniform uint run_number;
@@ -12,31 +12,26 @@ uniform uint run_number;
 // apart differ by at most 2 / pi of it (16 %) of the contrast within them.
 const float SAME_DIRECTION = 0.25;
 const float SAME_POINT = 1.5;   // records' spacing at the surface's depth
-const float DIRECTION_STEPS = 1023.0;
-const uint RUNS = 4096u;        // until a number comes again
+const uint STAMP = 15u;         // bits of each coordinate that are the stamp's: the points' are off by 2e-6 of them
 
 struct Seen { vec4 position; vec3 normal; vec3 mirrored; };   // a surface's point (w: depth), and the direction that it reflects
 
-// Direction of a record, and the run that wrote it: texels that a run did not write keep records of earlier ones.
-uint tag(vec3 direction, uint run) {
-    uvec2 steps = uvec2(round(octahedral_uv(direction) * DIRECTION_STEPS));
-    return run % RUNS << 20 | steps.y << 10 | steps.x;
-}
+// Of the run that wrote a record, out of 4096: texels that the last one did not write keep records of earlier ones.
+uvec3 stamp(uint run) { return uvec3(run, run >> 4, run >> 8) & STAMP; }
 
-vec3 tagged_direction(uint tag) {
-    return octahedral_direction(vec2(tag & 1023u, tag >> 10 & 1023u) / DIRECTION_STEPS);
-}
+uvec3 stamped(uvec3 point, uint run) { return (point & ~STAMP) | stamp(run); }
 
 void put_record(ivec2 pixel, Seen s) {
-    imageStore(records_out, pixel / STEP, uvec4(floatBitsToUint(s.position.xyz), tag(s.mirrored, run_number)));
+    uvec3 point = stamped(floatBitsToUint(s.position.xyz), run_number);
+    imageStore(records_out, pixel / STEP, uvec4(point, packUnorm2x16(octahedral_uv(s.mirrored))));
 }
 
 // Squared distance of a record's direction from that of `s`; far away if it is of another surface or of an earlier run.
 float misses_by(uvec4 record, Seen s) {
-    bool is_of_last = record.w >> 20 == (run_number - 1u) % RUNS;
-    vec3 turned = tagged_direction(record.w) - s.mirrored;
-    bool same = is_of_last && is_same_surface(uintBitsToFloat(record.xyz) - s.position.xyz, s.position.w, s.normal, SAME_POINT * float(STEP));
-    return same ? dot(turned, turned) : 1e9;
+    vec3 away = uintBitsToFloat(record.xyz & ~STAMP) - s.position.xyz;
+    vec3 turned = octahedral_direction(unpackUnorm2x16(record.w)) - s.mirrored;
+    bool is_of_last = (record.xyz & STAMP) == stamp(run_number - 1u);
+    return is_of_last && is_same_surface(away, s.position.w, s.normal, SAME_POINT * float(STEP)) ? dot(turned, turned) : 1e9;
 }
 
 // Carries over the record around a point's place in the last picture whose direction is nearest to that of now, if it is within
@@ -55,7 +50,7 @@ bool carry_record(ivec2 pixel, Seen s, float half_angle) {
         if (off < least) { least = off; found = record; place = texel; }
     }
     if (place.x < 0) return false;
-    imageStore(records_out, pixel / STEP, uvec4(found.xyz, (found.w & 0xfffffu) | run_number % RUNS << 20));
+    imageStore(records_out, pixel / STEP, uvec4(stamped(found.xyz, run_number), found.w));
     imageStore(reflected, pixel / STEP, imageLoad(last_reflected, place));
     return true;
 }

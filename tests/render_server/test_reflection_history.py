@@ -1,0 +1,119 @@
+"""Reflections in smooth objects while the camera moves: few are traced anew, the others are near what tracing finds."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import moderngl
+import numpy as np
+import pytest
+import trimesh
+
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.quality import TIERS, Quality
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Dispatch, watched
+from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server.scenes import (
+    EYE,
+    Stage,
+    array_of,
+    ball,
+    camera,
+    directional,
+    floor,
+    floor_depth,
+    frame,
+    look_at,
+    shifted,
+)
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+TURNS = TIERS["balanced"].reflection_turns
+STEP_M = 0.008  # of the camera aside, from frame to frame: half a degree as seen from the objects
+SAME_DIRECTION = 0.25  # as in reflection_history.glsl
+
+
+@dataclass
+class Shown:
+    """Of a frame: what was reflected (radiance), and its records' points; 0 where none."""
+
+    reflected: np.ndarray
+    points: np.ndarray
+
+    def traced(self, before: "Shown") -> float:
+        """Fraction of the records whose points are none of those before."""
+        known = {point.tobytes() for point in before.points[before.points.any(axis=-1)]}
+        points = self.points[self.points.any(axis=-1)]
+        return sum(point.tobytes() not in known for point in points) / max(len(points), 1)
+
+
+def seen(aside_m: float, number: int, *, corner: int = 0) -> ViewFrame:
+    """A patterned floor, from a camera that moved aside; `corner`: colour of one of the picture's."""
+    x, y, z = EYE
+    pose = look_at((x + aside_m, y, z))
+    rays = np.dstack([camera().rays(), np.ones(camera().rays().shape[:2])])
+    world = (floor_depth(pose)[..., None] * rays) @ pose.world_from_camera[:3, :3].T
+    world = world + pose.world_from_camera[:3, 3]
+    waves = np.sin(world[..., 0] * 20) * np.cos(world[..., 1] * 16)
+    color = (130 + 40 * waves[..., None] * (1, 0.8, 0.5)).astype(np.uint8)
+    color[:24, :24] = corner
+    return frame(color, pose=pose, frame_id=number, timestamp_ns=50_000_000 * number)
+
+
+def silver_things(stage: Stage, roughness: float = 0.4, irradiance: float = 2.0) -> SceneDocument:
+    """A ball and a plate on the floor."""
+    material = {"metallic": 1.0, "roughness": roughness}
+    plate = shifted(trimesh.creation.box((0.3, 0.01, 0.2)), -0.1, 0.12, 0.1)
+    objects = [
+        stage.virtual(each, (1.0, 1.0, 1.0), material)
+        for each in (ball(0.08, (0.12, 0.0, 0.08), detail=4), plate)
+    ]
+    settings = {"name": "dvct", "volume_size": 32, "caustics": False, "cone_scale": 2}
+    return stage.document(objects, [directional(irradiance=irradiance)], floor()).replaced(method=settings)
+
+
+class Player:
+    """A renderer of a quality, and the number of its newest frame."""
+
+    def __init__(self, gpu: GpuContext, scene: SceneDocument, quality: Quality) -> None:
+        self._gpu, self._renderer = gpu, SceneRenderer(gpu, scene, checks=True)
+        self._quality, self._count = quality, 0
+        self.change(scene)
+
+    def change(self, scene: SceneDocument) -> None:
+        self._renderer.set_scene(scene.replaced(method=scene.method.replaced(quality=self._quality)))
+
+    def show(self, aside_m: float, corner: int = 0) -> Shown:
+        self._count += 1
+        runs: list[Dispatch] = []
+        with watched(self._gpu, runs.append):
+            self._renderer.render(seen(aside_m, self._count, corner=corner))
+        records = next((run.written["records_out"] for run in runs if "records_out" in run.written), None)
+        assert self._renderer.graph is not None
+        reflected = array_of(self._renderer.graph["screen cones"])[..., :3]
+        return Shown(reflected, points_of(records, reflected.shape[:2]))
+
+    def shows(self, path: Sequence[float]) -> list[Shown]:
+        return [self.show(aside_m) for aside_m in path]
+
+    def release(self) -> None:
+        self._renderer.release()
+
+
+def points_of(records: object, size: tuple[int, ...]) -> np.ndarray:
+    """Bits of the records' points (h, w, 3) without the stamps; 0 where the run wrote none."""
+    if not isinstance(records, moderngl.Texture):
+        return np.zeros((*size, 3), np.uint32)
+    texels = np.frombuffer(records.read(), np.uint32).reshape(records.height, records.width, 4)
+    stamps = texels[..., :3] & 15
+    newest = (stamps == stamps[texels[..., 3] > 0].reshape(-1, 3)[-1]).all(axis=-1)
+    return np.where(newest[..., None], texels[..., :3] & ~np.uint32(15), 0)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneDocument:
+    return silver_things(Stage(tmp_path))
