@@ -6,7 +6,7 @@ import moderngl
 
 from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGroups, ListWalk
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
@@ -207,9 +207,7 @@ class ScreenCones:
         `object_rays`: what rays saw of the objects (`MirrorRays.reflection`), so that cones leave them out.
         """
         rays: Bindings = {"OBJECT_RAYS": object_rays is not None, "object_rays": object_rays}
-        kept: Bindings = {}
-        if self._history is not None:
-            self._traced, kept = self._history.turn(self._traced, scene)
+        kept = {} if self._history is None else self._history.turn(scene)
         listed = self._grid.shown_pixels if self._grid.quads is None else self._grid.quads
         self._walk.run(
             self._kernel,
@@ -239,36 +237,33 @@ class ScreenCones:
 class ReflectionHistory:
     """What the last frame traced of reflections, for frames in which only the camera moved.
 
-    A reflection depends on the direction that it is seen from, so each texel has a record (RGBA32UI) of the point
-    and the mirrored direction that its cones were for (shaders/common/reflection_history.glsl). One tile in `turns`
-    is traced in turn, because the picture that is reflected may change. `size` is that of the traced texels.
+    A reflection depends on the direction that it is seen from, so each texel has a record of the point and the
+    mirrored direction that its cones were for, and of what they found (shaders/common/reflection_history.glsl). One
+    tile in `turns` is traced in turn, because the picture that is reflected may change. `size` is that of the traced
+    texels.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], turns: int) -> None:
-        self._reflected = texture_2d(gpu, size, 4, "f2")
-        self._records = [texture_2d(gpu, size, 4, "u4") for _ in range(2)]
+        width, height = size
+        self._records = texture_2d(gpu, (3 * width, 2 * height), 2, "u4")  # of the last frame and of this one
         self._turns, self._runs = turns, 0
-        self._changes: object = None
+        self._changes: Binding = None
 
-    def turn(self, reflected: moderngl.Texture, scene: Bindings) -> tuple[moderngl.Texture, Bindings]:
-        """Makes `reflected` the last frame's; returns the texture for this frame's, and the kernel's bindings."""
+    def turn(self, scene: Bindings) -> Bindings:
+        """Makes the newest records the last frame's; returns the kernel's bindings for this one's."""
         then, self._changes = self._changes, scene["direct_light_changes"]
         self._runs += 1
-        self._records.reverse()
-        self._reflected, free = reflected, self._reflected
-        return free, {
+        return {
             "has_history": then == self._changes,
-            "last_reflected": reflected,
-            "last_records": self._records[1],
-            "records_out": self._records[0],
+            "records": self._records,
             "run_number": self._runs,
             "turns": self._turns,
             "turn": self._runs % self._turns,
         }
 
     def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(self._reflected, *self._records)
+        """Frees the texture."""
+        self._records.release()
 
 
 class TransmittedLight:

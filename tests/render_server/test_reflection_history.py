@@ -97,7 +97,7 @@ class Player:
         runs: list[Dispatch] = []
         with watched(self._gpu, runs.append):
             self._renderer.render(seen(aside_m, self._count, corner=corner))
-        records = next((run.written["records_out"] for run in runs if "records_out" in run.written), None)
+        records = next((run.written["records"] for run in runs if "records" in run.written), None)
         assert self._renderer.graph is not None
         reflected = array_of(self._renderer.graph["screen cones"])[..., :3]
         return Shown(reflected, points_of(records, reflected.shape[:2]))
@@ -113,10 +113,11 @@ def points_of(records: object, size: tuple[int, ...]) -> np.ndarray:
     """Bits of the records' points (h, w, 3) without the stamps; 0 where the run wrote none."""
     if not isinstance(records, moderngl.Texture):
         return np.zeros((*size, 3), np.uint32)
-    texels = np.frombuffer(records.read(), np.uint32).reshape(records.height, records.width, 4)
-    stamps = texels[..., :3] & 15
-    newest = (stamps == stamps[texels[..., 3] > 0].reshape(-1, 3)[-1]).all(axis=-1)
-    return np.where(newest[..., None], texels[..., :3] & ~np.uint32(15), 0)
+    halves = np.frombuffer(records.read(), np.uint32).reshape(2, *size, 6)[..., :3]
+    runs = ((halves & 15) << np.array([0, 4, 8], np.uint32)).sum(axis=-1)
+    newest = runs == runs.max()
+    points = np.where(newest[..., None], halves & ~np.uint32(15), 0)
+    return np.asarray(points.max(axis=0))
 
 
 @pytest.fixture
@@ -140,8 +141,7 @@ def nothing_kept() -> Iterator[None]:
         turn = ReflectionHistory.turn
 
         def forgetting(history: ReflectionHistory, *given: Any) -> Any:  # noqa: ANN401 (as the method's)
-            free, bindings = turn(history, *given)
-            return free, {**bindings, "has_history": False}
+            return {**turn(history, *given), "has_history": False}
 
         patched.setattr(ReflectionHistory, "turn", forgetting)
         yield

@@ -172,9 +172,10 @@ bool is_known(ivec2 pixel, Lobe lobe) {
 
 void trace(ivec2 pixel, Lobe lobe) {
     start_on_object(lobe.normal);
-    imageStore(reflected, pixel / STEP, reflection(pixel, lobe));
+    vec4 found = reflection(pixel, lobe);
+    imageStore(reflected, pixel / STEP, found);
 #ifdef REUSES
-    if (lobe.is_single) put_record(pixel, seen_of(lobe));
+    if (lobe.is_single) put_traced(pixel, seen_of(lobe), found);
 #endif
 }
 

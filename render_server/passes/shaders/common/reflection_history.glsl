@@ -3,9 +3,9 @@
 #include "common/reprojection.glsl"
 #include "common/octahedral.glsl"
 
-layout(rgba32ui) writeonly uniform uimage2D records_out;     // at pixel / STEP; point (world m) with stamp(), and direction (octahedral)
-layout(rgba32ui) readonly uniform uimage2D last_records;
-layout(rgba16f) readonly uniform image2D last_reflected;
+// Three texels a record, in a row: point (world m) with stamp(), direction (octahedral), radiance times fraction and fraction (halves).
+// Even runs write the upper half, odd ones the lower; each reads the other. (One image, because OpenGL guarantees no more than eight.)
+layout(rg32ui) uniform uimage2D records;
 uniform uint run_number;
 
 // Of the half-angle of what a pixel reflects: the directions of two pixels that may show the same. Means over two discs so far
@@ -19,18 +19,36 @@ struct Seen { vec4 position; vec3 normal; vec3 mirrored; };   // a surface's poi
 // Of the run that wrote a record, out of 4096: texels that the last one did not write keep records of earlier ones.
 uvec3 stamp(uint run) { return uvec3(run, run >> 4, run >> 8) & STAMP; }
 
-uvec3 stamped(uvec3 point, uint run) { return (point & ~STAMP) | stamp(run); }
+ivec2 record_place(ivec2 texel, uint run) {
+    return ivec2(3 * texel.x, texel.y + int(run & 1u) * imageSize(records).y / 2);
+}
 
-void put_record(ivec2 pixel, Seen s) {
-    uvec3 point = stamped(floatBitsToUint(s.position.xyz), run_number);
-    imageStore(records_out, pixel / STEP, uvec4(point, packUnorm2x16(octahedral_uv(s.mirrored))));
+struct Record { uvec3 point; uint direction; uvec2 value; };
+
+Record last_record(ivec2 texel) {
+    ivec2 place = record_place(texel, run_number - 1u);
+    uvec2 first = imageLoad(records, place).xy, second = imageLoad(records, place + ivec2(1, 0)).xy;
+    return Record(uvec3(first, second.x), second.y, imageLoad(records, place + ivec2(2, 0)).xy);
+}
+
+void put_record(ivec2 texel, Record r) {
+    ivec2 place = record_place(texel, run_number);
+    uvec3 point = (r.point & ~STAMP) | stamp(run_number);
+    imageStore(records, place, uvec4(point.xy, 0u, 0u));
+    imageStore(records, place + ivec2(1, 0), uvec4(point.z, r.direction, 0u, 0u));
+    imageStore(records, place + ivec2(2, 0), uvec4(r.value, 0u, 0u));
+}
+
+void put_traced(ivec2 pixel, Seen s, vec4 value) {
+    uvec2 halves = uvec2(packHalf2x16(value.rg), packHalf2x16(value.ba));
+    put_record(pixel / STEP, Record(floatBitsToUint(s.position.xyz), packUnorm2x16(octahedral_uv(s.mirrored)), halves));
 }
 
 // Squared distance of a record's direction from that of `s`; far away if it is of another surface or of an earlier run.
-float misses_by(uvec4 record, Seen s) {
-    vec3 away = uintBitsToFloat(record.xyz & ~STAMP) - s.position.xyz;
-    vec3 turned = octahedral_direction(unpackUnorm2x16(record.w)) - s.mirrored;
-    bool is_of_last = (record.xyz & STAMP) == stamp(run_number - 1u);
+float misses_by(Record record, Seen s) {
+    vec3 away = uintBitsToFloat(record.point & ~STAMP) - s.position.xyz;
+    vec3 turned = octahedral_direction(unpackUnorm2x16(record.direction)) - s.mirrored;
+    bool is_of_last = (record.point & STAMP) == stamp(run_number - 1u);
     return is_of_last && is_same_surface(away, s.position.w, s.normal, SAME_POINT * float(STEP)) ? dot(turned, turned) : 1e9;
 }
 
@@ -40,17 +58,18 @@ bool carry_record(ivec2 pixel, Seen s, float half_angle) {
     vec2 at = last_pixel(s.position.xyz) / float(STEP) - 0.5;
     float least = SAME_DIRECTION * half_angle;
     least *= least;
-    uvec4 found = uvec4(0u);
-    ivec2 place = ivec2(-1);
+    Record found = Record(uvec3(0u), 0u, uvec2(0u));
+    bool serves = false;
+    ivec2 size = imageSize(records) / ivec2(3, 2);
     for (int j = 0; j < 4; ++j) {
         ivec2 texel = ivec2(floor(at)) + ivec2(j & 1, j >> 1);
-        if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, imageSize(last_records)))) continue;
-        uvec4 record = imageLoad(last_records, texel);
+        if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, size))) continue;
+        Record record = last_record(texel);
         float off = misses_by(record, s);
-        if (off < least) { least = off; found = record; place = texel; }
+        if (off < least) { least = off; found = record; serves = true; }
     }
-    if (place.x < 0) return false;
-    imageStore(records_out, pixel / STEP, uvec4(stamped(found.xyz, run_number), found.w));
-    imageStore(reflected, pixel / STEP, imageLoad(last_reflected, place));
+    if (!serves) return false;
+    put_record(pixel / STEP, found);
+    imageStore(reflected, pixel / STEP, vec4(unpackHalf2x16(found.value.x), unpackHalf2x16(found.value.y)));
     return true;
 }
