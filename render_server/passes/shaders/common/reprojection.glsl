@@ -8,7 +8,7 @@ uniform int turns;
 uniform int turn;
 
 const float OFF_PLANE = 4.0;            // pixels at the surface's depth that it may lie off this pixel's plane,
-const float APART = 8.0;                // or away from this pixel's point
+const float PIXELS_APART = 8.0;         // or away from this pixel's point
 const float LEAST_WEIGHT = 0.25;
 const int TURN_TILE = 8;                // texels
 const uint STALE_REAL = 1u, STALE_OBJECT = 2u;   // of a texel: where light must be computed
@@ -41,7 +41,7 @@ bool is_same_surface(vec3 away, float depth, vec3 normal, float pixels) {
 float same_surface(ivec2 pixel, vec4 position, vec3 normal) {
     if (any(lessThan(pixel, ivec2(0))) || any(greaterThanEqual(pixel, textureSize(last_position, 0)))) return 0.0;
     vec4 seen = texelFetch(last_position, pixel, 0);
-    return seen.w > 0.0 && is_same_surface(seen.xyz - position.xyz, position.w, normal, APART) ? 1.0 : 0.0;
+    return seen.w > 0.0 && is_same_surface(seen.xyz - position.xyz, position.w, normal, PIXELS_APART) ? 1.0 : 0.0;
 }
 
 // Whether it is the turn of a texel's tile, one in `turns`.
