@@ -3,7 +3,7 @@
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import common_kernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, common_kernel
 
 LIST_HEADER_BYTES = 4  # of shaders/common/work_list.glsl: the number of items
 GROUPS_BYTES = 12
@@ -11,6 +11,7 @@ SOFTWARE_WALKERS = 1024
 # Mesa's software renderer silently ends all loops of a thread after 65535 iterations in total; tracing the
 # cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_DIVISOR = 12
+SOFTWARE_GROUP_ITEMS = 256  # of a workgroup of 64 threads: below SOFTWARE_DIVISOR each
 LIST_WALKERS = 16384
 MOST_WALKERS = 65535 * 64  # OpenGL guarantees no more workgroups in a row; a dispatch of more does nothing
 GPU_WALKERS = 2**18  # 4096 workgroups: what the largest GPUs hold at a time; idle threads cost microseconds
@@ -37,12 +38,15 @@ def map_threads(gpu: GpuContext, side: int) -> int:
 
 
 class ListGroups:
-    """Counts the workgroups that walk a list of shaders/common/work_list.glsl, for `Kernel.run_counted`."""
+    """Counts the workgroups that walk a list of shaders/common/work_list.glsl, for `Kernel.run_counted`.
 
-    def __init__(self, gpu: GpuContext, per_group: int) -> None:
+    They lie in rows (`counted_group()`), or in one for kernels that walk as shaders/common/walk.glsl says.
+    """
+
+    def __init__(self, gpu: GpuContext, per_group: int, *, in_rows: bool = True) -> None:
         self._per_group = per_group
         self._groups = gpu.ctx.buffer(reserve=GROUPS_BYTES)
-        self._kernel = common_kernel(gpu, "count_groups")
+        self._kernel = common_kernel(gpu, "count_groups" if in_rows else "count_walkers")
 
     def count(self, texels: moderngl.Buffer) -> moderngl.Buffer:
         """Returns the workgroups (x, y, z) that `per_group` items each need; valid until the next call."""
@@ -52,3 +56,27 @@ class ListGroups:
     def release(self) -> None:
         """Frees the buffer."""
         self._groups.release()
+
+
+class ListWalk:
+    """Runs kernels over lists of at most `longest` items, whose length only the GPU knows (shaders/common/walk.glsl).
+
+    In software, by as many workgroups as the items need: each of the others costs up to 40 µs, a long kernel's
+    prologue. On a GPU by list_threads(), because there a dispatch that counts costs more than idle threads.
+    """
+
+    def __init__(self, gpu: GpuContext, longest: int) -> None:
+        self._threads = list_threads(gpu, longest)
+        self._groups = ListGroups(gpu, SOFTWARE_GROUP_ITEMS, in_rows=False) if gpu.is_software else None
+
+    def run(self, kernel: Kernel, items: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
+        """Runs a kernel, 64 threads a workgroup, over `items` (count, then items), which `own` binds too."""
+        if self._groups is None:
+            kernel.run((self._threads,), *shared, **own)
+        else:
+            kernel.run_counted(self._groups.count(items), *shared, **own)
+
+    def release(self) -> None:
+        """Frees the buffer."""
+        if self._groups is not None:
+            self._groups.release()

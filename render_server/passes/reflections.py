@@ -6,11 +6,11 @@ import moderngl
 
 from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGroups, list_threads
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGroups, ListWalk
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
-from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid, reuse_define
 from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.shading import DirectLight
 
@@ -153,7 +153,7 @@ class ScreenCones:
     `reflected` (RGBA16F): radiance times fraction of the specular lobe, and that fraction, on the picture's grid.
     `march` are defines of march.glsl to look up in voxels and environment what the picture does not show; the
     fraction is then 1. None: that fraction of the lobe is left to other passes. `tier` says by how many cones; they
-    start at one pixel of each quad if the `grid` lists quads.
+    start at one pixel of each quad if the `grid` lists quads, and where what the last frame traced does not serve.
     """
 
     def __init__(
@@ -163,9 +163,14 @@ class ScreenCones:
         march: Mapping[str, float | str] | None,
         tier: QualityTier,
     ) -> None:
-        self._grid = grid
-        self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
-        self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
+        self._grid, step = grid, 1 if grid.quads is None else 2
+        width, height = grid.picture_size
+        self._walk = ListWalk(gpu, width * height)
+        size = -(-width // step), -(-height // step)
+        self._traced = texture_2d(gpu, size, 4, "f2")
+        self._history = (
+            ReflectionHistory(gpu, size, tier.reflection_turns) if tier.reflection_turns > 1 else None
+        )
         voxels = {} if march is None else {"VOXELS": 1, **march}
         self._kernel = Kernel(
             gpu,
@@ -174,13 +179,20 @@ class ScreenCones:
             CONE_COUNT=tier.reflection_cones,
             RAY_ROUGHNESS=RAY_ROUGHNESS,
             MEDIAN_DISC=MEDIAN_DISC / tier.reflection_cones**0.5,  # the cones share the disc
+            STEP=step,
             **voxels,
+            **reuse_define(self._history is not None),
         )
-        self._traced: moderngl.Texture | None = None
+        self._filled: moderngl.Texture | None = None
         self._fill: Kernel | None = None
         if grid.quads is not None:
-            self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
+            self._filled = texture_2d(gpu, grid.picture_size, 4, "f2")
             self._fill = Kernel(gpu, "fill_reflections")
+
+    @property
+    def reflected(self) -> moderngl.Texture:
+        """What the newest run found."""
+        return self._traced if self._filled is None else self._filled
 
     def run(
         self,
@@ -195,14 +207,17 @@ class ScreenCones:
         `object_rays`: what rays saw of the objects (`MirrorRays.reflection`), so that cones leave them out.
         """
         rays: Bindings = {"OBJECT_RAYS": object_rays is not None, "object_rays": object_rays}
-        self._kernel.run(
-            (self._threads,),
+        kept = {} if self._history is None else self._history.turn(scene)
+        listed = self._grid.shown_pixels if self._grid.quads is None else self._grid.quads
+        self._walk.run(
+            self._kernel,
+            listed,
             objects.bindings,
             rays,
-            scene,
-            ShownPixels=self._grid.shown_pixels if self._grid.quads is None else self._grid.quads,
+            {**scene, **kept},
+            ShownPixels=listed,
             scale=self._grid.scale,
-            reflected=self.reflected if self._traced is None else self._traced,
+            reflected=self._traced,
             sample_pixels=self._grid.pixels,
             direct_mu=direct.light.mu,
             direct_rho=direct.light.rho,
@@ -211,13 +226,44 @@ class ScreenCones:
         )
         if self._fill is not None:
             shown = self._grid.shown_pixels
-            self._fill.run(
-                (self._threads,), scene, ShownPixels=shown, traced=self._traced, reflected=self.reflected
-            )
+            filled: Bindings = {"traced": self._traced, "reflected": self._filled}
+            self._walk.run(self._fill, shown, scene, filled, ShownPixels=shown)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.reflected, self._traced, self._kernel, self._fill)
+        release_all(self._traced, self._history, self._filled, self._kernel, self._fill, self._walk)
+
+
+class ReflectionHistory:
+    """What the last frame traced of reflections, for frames in which only the camera moved.
+
+    A reflection depends on the direction that it is seen from, so each texel has a record of the point and the
+    mirrored direction that its cones were for, and of what they found (shaders/common/reflection_history.glsl). One
+    tile in `turns` is traced in turn, because the picture that is reflected may change. `size` is that of the traced
+    texels.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], turns: int) -> None:
+        width, height = size
+        self._records = texture_2d(gpu, (3 * width, 2 * height), 2, "u4")  # of the last frame and of this one
+        self._turns, self._runs = turns, 0
+        self._changes: Binding = None
+
+    def turn(self, scene: Bindings) -> Bindings:
+        """Makes the newest records the last frame's; returns the kernel's bindings for this one's."""
+        then, self._changes = self._changes, scene["direct_light_changes"]
+        self._runs += 1
+        return {
+            "has_history": then == self._changes,
+            "records": self._records,
+            "run_number": self._runs,
+            "turns": self._turns,
+            "turn": self._runs % self._turns,
+        }
+
+    def release(self) -> None:
+        """Frees the texture."""
+        self._records.release()
 
 
 class TransmittedLight:
@@ -235,7 +281,7 @@ class TransmittedLight:
         tier: QualityTier,
     ) -> None:
         self._grid = grid
-        self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
+        self._walk = ListWalk(gpu, grid.picture_size[0] * grid.picture_size[1])
         self.radiance = texture_2d(gpu, grid.picture_size, 4, "f2")
         voxels = {} if march is None else {"VOXELS": 1, **march}
         rays = tier.reflection_cones
@@ -250,8 +296,9 @@ class TransmittedLight:
         scene: Bindings,
     ) -> None:
         """Fills `radiance`; `reflected` is the objects' own. The picture needs its mip levels."""
-        self._kernel.run(
-            (self._threads,),
+        self._walk.run(
+            self._kernel,
+            self._grid.shown_pixels,
             objects.bindings,
             scene,
             ShownPixels=self._grid.shown_pixels,
@@ -267,4 +314,4 @@ class TransmittedLight:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.radiance, self._kernel)
+        release_all(self.radiance, self._kernel, self._walk)

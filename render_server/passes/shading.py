@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import list_threads
+from deltalight.render_server.gpu.list_groups import ListWalk, list_threads
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -163,7 +163,7 @@ class LightHistory:
         self._reproject = Kernel(gpu, "reproject_light", **direct.defines)
         self._find_stale = Kernel(gpu, "stale_texels")
         self._seen: tuple[LightState | None, Float64[np.ndarray, "4 4"]] = None, np.eye(4)
-        self._turn = 0
+        self._turn = self._direct_changes = 0
 
     def run(self, scene: Bindings, light: LightState | None, view: CameraView) -> dict[str, Binding]:
         """Fills in the light that the last frame knows, and marks where cones and caustics are to compute it.
@@ -179,6 +179,7 @@ class LightHistory:
         if last is not None and light is not None:
             knows_direct, knows_bounced = last.direct is light.direct, last.bounced is light.bounced
             knows_unblocked = last.unblocked is light.unblocked
+        self._direct_changes += not knows_direct
         self._turn = (self._turn + 1) % self._turns
         self._real_texels.reverse()
         self._object_texels.reverse()
@@ -194,6 +195,7 @@ class LightHistory:
             "stale_texels": self._stale,
             "turns": self._turns,
             "turn": self._turn,
+            "direct_light_changes": self._direct_changes,
             **self._cones.remember(),
         }
         self._fill(scene, found, knows_direct=knows_direct)
@@ -277,7 +279,7 @@ class VirtualSurface:
     """Radiance of the virtual surfaces (RGBA16F) on the picture's grid, where objects cover it."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._threads = list_threads(gpu, size[0] * size[1])
+        self._walk = ListWalk(gpu, size[0] * size[1])
         self.radiance = texture_2d(gpu, size, 4, "f2")
         self._kernel = Kernel(gpu, "virtual_surface")
 
@@ -291,8 +293,9 @@ class VirtualSurface:
         caustics: Caustics | None = None,
     ) -> None:
         """Shades the objects. `screen`: what they reflect of the picture (passes/reflections.py), if anything."""
-        self._kernel.run(
-            (self._threads,),
+        self._walk.run(
+            self._kernel,
+            grid.shown_pixels,
             _caustics_on(grid, caustics),
             scene,
             radiance_out=self.radiance,
@@ -305,8 +308,7 @@ class VirtualSurface:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self.radiance.release()
-        self._kernel.release()
+        release_all(self.radiance, self._kernel, self._walk)
 
 
 def _caustics_on(grid: LowResGrid, caustics: Caustics | None) -> dict[str, Binding]:

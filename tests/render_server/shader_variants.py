@@ -72,6 +72,7 @@ MEASURED = (
 EXTENDED: dict[Case, dict[str, Any]] = {
     Case("exact", "depth", "mirror"): {},
     Case("exact", "depth", "antialiased"): {"quality": "live"},
+    Case("exact", "model", "mirror"): {"quality": "balanced"},
     Case("paper", "depth", "mirror"): {},
     Case("differential", "depth", "mirror"): {},
     Case("dlpv", "model", "mirror"): {},

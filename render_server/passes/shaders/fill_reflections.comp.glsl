@@ -6,7 +6,7 @@
 
 layout(local_size_x = 64) in;
 uniform sampler2D object_coverage;
-uniform sampler2D traced;
+uniform sampler2D traced;   // a texel for each quad
 #pragma texels rgba16f traced
 uniform float pixel_size;   // m at 1 m depth
 layout(rgba16f) writeonly uniform image2D reflected;
@@ -27,7 +27,7 @@ vec4 filled(ivec2 pixel) {
         vec4 sn = texelFetch(virtual_raster_normal, raster_texel(from), 0);
         float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y) + 1e-3;
         w *= sn.w == normal.w ? continuation(position.xyz, normal.xyz, sp.xyz, sn.xyz, SIZE * pixel_size * position.w) + 1e-4 : 0.0;
-        sum += w * texelFetch(traced, from, 0);
+        sum += w * texelFetch(traced, from / 2, 0);
         total += w;
     }
     return sum / max(total, 1e-6);

@@ -17,7 +17,7 @@
 #endif
 
 layout(local_size_x = 64) in;
-layout(rgba16f) writeonly uniform image2D reflected;   // rgb radiance times fraction; a: fraction of the lobe
+layout(rgba16f) writeonly uniform image2D reflected;   // at pixel / STEP; rgb radiance times fraction; a: fraction of the lobe
 #include "common/camera.glsl"
 #pragma switch OBJECT_RAYS
 #ifdef OBJECT_RAYS
@@ -25,6 +25,10 @@ layout(rgba16f) readonly uniform image2D object_rays;   // objects, by rays: rad
 const float OBJECTS_BY_RAYS = RAY_ROUGHNESS;            // of smoother surfaces
 #else
 const float OBJECTS_BY_RAYS = -1.0;
+#endif
+
+#ifdef REUSES
+#include "common/reflection_history.glsl"
 #endif
 
 const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its own surface
@@ -93,7 +97,16 @@ void start_on_object(vec4 normal) {
 #endif
 }
 
+// What a pixel shows of an object's surface, and the lobe that it has there.
+struct Lobe { vec4 position; vec4 normal; float roughness; bool reflects; bool is_single; };
+
 #ifdef EXTENDED
+Lobe lobe_at(ivec2 pixel) {
+    ivec2 raster = raster_texel(pixel);
+    Material m = coated_material(raster);
+    return Lobe(texelFetch(virtual_raster_position, raster, 0), shown_normal(raster, false), m.roughness, true, m.over.coat == 0.0);
+}
+
 // The same of a rougher lobe too, by one cone through voxels.
 vec4 any_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bool of_coat, bool wanted) {
     if (roughness < ROUGHEST) return lobe_reflection(pixel, position, normal, roughness, of_coat, wanted ? CONE_COUNT : 1);
@@ -106,33 +119,80 @@ vec4 any_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bo
 #endif
 }
 
-vec4 reflection(ivec2 pixel) {
+vec4 reflection(ivec2 pixel, Lobe lobe) {
     ivec2 raster = raster_texel(pixel);
-    vec4 position = texelFetch(virtual_raster_position, raster, 0), normal = shown_normal(raster, false);
-    start_on_object(normal);
     Material m = coated_material(raster);
-    vec3 share = coat_share(reflected_towards(m, normal.xyz, normalize(camera_position - position.xyz)));
-    vec4 base = any_reflection(pixel, position, normal, m.roughness, false, has_interface(m.f0));
-    if (m.over.coat == 0.0) return base;
-    vec4 coat = any_reflection(pixel, position, shown_normal(raster, true), m.over.roughness, true, true);
+    vec3 share = coat_share(reflected_towards(m, lobe.normal.xyz, normalize(camera_position - lobe.position.xyz)));
+    vec4 base = any_reflection(pixel, lobe.position, lobe.normal, m.roughness, false, has_interface(m.f0));
+    if (lobe.is_single) return base;
+    vec4 coat = any_reflection(pixel, lobe.position, shown_normal(raster, true), m.over.roughness, true, true);
     return vec4(mix(base.rgb, coat.rgb, share), mix(base.a, coat.a, dot(share, vec3(1.0 / 3.0))));
 }
 #else
-vec4 reflection(ivec2 pixel) {
+Lobe lobe_at(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
-    vec4 position = texelFetch(virtual_raster_position, raster, 0);
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
     MaterialEntry m = materials[int(normal.w)];
     bool shines = m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0;
     float roughness = roughness_at(raster, int(normal.w));
-    if (!shines || roughness >= ROUGHEST) return vec4(0.0);
-    start_on_object(normal);
-    return lobe_reflection(pixel, position, normal, roughness, false, CONE_COUNT);
+    return Lobe(texelFetch(virtual_raster_position, raster, 0), normal, roughness, shines && roughness < ROUGHEST, true);
+}
+
+vec4 reflection(ivec2 pixel, Lobe lobe) {
+    return lobe_reflection(pixel, lobe.position, lobe.normal, lobe.roughness, false, CONE_COUNT);
 }
 #endif
 
-// Of the listed pixels: all that show an object, or one for each quad of them (list_quads).
+#ifdef REUSES
+Seen seen_of(Lobe lobe) {
+    vec3 v = normalize(lobe.position.xyz - camera_position);
+    return Seen(lobe.position, lobe.normal.xyz, reflect(v, lobe.normal.xyz));
+}
+
+// Half-angle of all that a pixel reflects.
+float half_angle_of(ivec2 pixel, Lobe lobe) {
+    Change x = change_along(pixel, ivec2(1, 0), lobe.position, lobe.normal, false);
+    Change y = change_along(pixel, ivec2(0, 1), lobe.position, lobe.normal, false);
+    float alpha = max(lobe.roughness * lobe.roughness, LEAST_ALPHA);
+    return 0.5 * spread_of(alpha, x, y) * sqrt(float(CONE_COUNT));
+}
+#endif
+
+// Whether a pixel needs no cones: it reflects nothing, or the last frame knows what.
+bool is_known(ivec2 pixel, Lobe lobe) {
+    if (!lobe.reflects) {
+        imageStore(reflected, pixel / STEP, vec4(0.0));
+        return true;
+    }
+#ifdef REUSES
+    if (has_history && lobe.is_single && !is_due(pixel / scale)) return carry_record(pixel, seen_of(lobe), half_angle_of(pixel, lobe));
+#endif
+    return false;
+}
+
+void trace(ivec2 pixel, Lobe lobe) {
+    start_on_object(lobe.normal);
+    vec4 found = reflection(pixel, lobe);
+    imageStore(reflected, pixel / STEP, found);
+#ifdef REUSES
+    if (lobe.is_single) put_traced(pixel, seen_of(lobe), found);
+#endif
+}
+
+shared uint pending_count;
+shared uint pending[64];
+
+// Of the listed pixels: all that show an object, or one for each quad of them (list_quads). A workgroup first finds which of its pixels
+// need cones, so that these are traced by threads in a row.
 void main() {
-    uint i = first_item();
-    if (i < pixels_shown()) do imageStore(reflected, shown_pixel(i), reflection(shown_pixel(i))); while ((i += items_apart()) < pixels_shown());
+    uint lane = gl_LocalInvocationID.x, count = pixels_shown();
+    for (uint start = first_item() - lane; start < count; start += items_apart()) {
+        if (lane == 0u) pending_count = 0u;
+        barrier();
+        uint i = start + lane;
+        if (i < count && !is_known(shown_pixel(i), lobe_at(shown_pixel(i)))) pending[atomicAdd(pending_count, 1u)] = i;
+        barrier();
+        if (lane < pending_count) trace(shown_pixel(pending[lane]), lobe_at(shown_pixel(pending[lane])));
+        barrier();
+    }
 }

@@ -10,13 +10,11 @@ struct LastTexels { ivec2 base; vec4 weights; float total; };   // of 2 x 2; `we
 LastTexels last_texels(vec4 position, vec3 normal, bool object) {
     vec2 at = last_pixel(position.xyz) / float(scale) - 0.5;
     LastTexels found = LastTexels(ivec2(floor(at)), vec4(0.0), 0.0);
-    float size = pixel_size * position.w, far = TEXELS_APART * float(scale) * size;
     for (int j = 0; j < 4; ++j) {
         ivec2 texel = found.base + ivec2(j & 1, j >> 1);
         if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, textureSize(last_real_texels, 0)))) continue;
         vec4 seen = object ? texelFetch(last_object_texels, texel, 0) : texelFetch(last_real_texels, texel, 0);
-        vec3 away = seen.xyz - position.xyz;
-        if (seen.w > 0.0 && abs(dot(away, normal)) < OFF_PLANE * size && dot(away, away) < far * far)
+        if (seen.w > 0.0 && is_same_surface(seen.xyz - position.xyz, position.w, normal, TEXELS_APART * float(scale)))
             found.weights[j] = bilinear(at, j) + 1e-3;
     }
     found.total = dot(found.weights, vec4(1.0));

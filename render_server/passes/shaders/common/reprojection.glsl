@@ -8,7 +8,7 @@ uniform int turns;
 uniform int turn;
 
 const float OFF_PLANE = 4.0;            // pixels at the surface's depth that it may lie off this pixel's plane,
-const float APART = 8.0;                // or away from this pixel's point
+const float PIXELS_APART = 8.0;         // or away from this pixel's point
 const float LEAST_WEIGHT = 0.25;
 const int TURN_TILE = 8;                // texels
 const uint STALE_REAL = 1u, STALE_OBJECT = 2u;   // of a texel: where light must be computed
@@ -31,14 +31,17 @@ float bilinear(vec2 at, int j) {
     return ((j & 1) == 1 ? f.x : 1.0 - f.x) * ((j >> 1) == 1 ? f.y : 1.0 - f.y);
 }
 
+// Whether a point that is `away` (m) from another, at a depth, is on the plane there, and less than `pixels` at that depth from it.
+bool is_same_surface(vec3 away, float depth, vec3 normal, float pixels) {
+    float size = pixel_size * depth;
+    return abs(dot(away, normal)) < OFF_PLANE * size && dot(away, away) < pixels * pixels * size * size;
+}
+
 // 1 if the pixel of the last picture saw the plane of (position, normal) near that point, else 0.
 float same_surface(ivec2 pixel, vec4 position, vec3 normal) {
     if (any(lessThan(pixel, ivec2(0))) || any(greaterThanEqual(pixel, textureSize(last_position, 0)))) return 0.0;
     vec4 seen = texelFetch(last_position, pixel, 0);
-    vec3 away = seen.xyz - position.xyz;
-    float size = pixel_size * position.w;
-    bool same = seen.w > 0.0 && abs(dot(away, normal)) < OFF_PLANE * size && dot(away, away) < APART * APART * size * size;
-    return same ? 1.0 : 0.0;
+    return seen.w > 0.0 && is_same_surface(seen.xyz - position.xyz, position.w, normal, PIXELS_APART) ? 1.0 : 0.0;
 }
 
 // Whether it is the turn of a texel's tile, one in `turns`.
