@@ -228,10 +228,10 @@ def test_tiles_leave_out_only_beams_that_light_nothing_there(
             find_tiles(threads, *scene)
 
         monkeypatch.setattr(self._find_tiles, "run", with_endless_balls)
-        gather(self, shared, scene)
+        add_beams(self, shared, scene)
 
-    gather = Caustics._gather_wide
-    monkeypatch.setattr(Caustics, "_gather_wide", endless_balls)
+    add_beams = Caustics._add_beams
+    monkeypatch.setattr(Caustics, "_add_beams", endless_balls)
     everywhere = sums_and_beams_of_tiles(gpu, document)
     assert marked[0] == everywhere[0] != bytes(len(marked[0]))
     assert 0 < marked[1] < 0.8 * everywhere[1]
