@@ -134,7 +134,7 @@ def _parts(value: object) -> Iterator[object]:
     elif isinstance(value, dict):
         yield from value.values()
     elif type(value).__module__.startswith(OWN_CODE) and hasattr(value, "__dict__"):
-        yield from vars(value).values()
+        yield from tuple(vars(value).values())  # another thread may fill a cached property meanwhile
 
 
 def sizes_bytes(values: Sequence[object]) -> list[int]:

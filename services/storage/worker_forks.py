@@ -61,6 +61,8 @@ class WorkerForks:
                 env={**os.environ, **self._environment},
             )
         self._requests = ours
+        # It ends by itself, at any time; somebody has to wait for it.
+        threading.Thread(target=self._process.wait, name="forking process", daemon=True).start()
         return ours
 
     def close(self) -> None:

@@ -117,7 +117,7 @@ def test_jpeg_bytes_are_kept_and_decoded(tmp_path: Path) -> None:
 
 def test_a_picture_of_another_size_than_its_camera_is_told(tmp_path: Path) -> None:
     frame = replace(frames(1)[0], camera=camera(WIDTH + 2))
-    with pytest.raises(DeltalightError, match="frame 5 has a picture of another size"):
+    with pytest.raises(DeltalightError, match="frame 5 has a picture whose size differs"):
         RecordingReader(record(tmp_path / "a.mcap", [frame]))[0]
 
 

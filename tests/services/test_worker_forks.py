@@ -72,6 +72,17 @@ def test_one_process_forks_all_workers_and_another_comes_where_it_was_killed(
     assert forking(forks) != first
 
 
+def test_a_forking_process_that_ended_leaves_no_zombie(forks: WorkerForks, tmp_path: Path) -> None:
+    (tmp_path / "cup.obj").write_bytes(TETRAHEDRON)
+    probe(tmp_path / "cup.obj", "mesh", "cup.obj")
+    ended = forking(forks)
+    os.kill(ended.pid, signal.SIGKILL)
+    until_s = time.monotonic() + 60
+    while psutil.pid_exists(ended.pid):
+        assert time.monotonic() < until_s, "nobody waits for it"
+        time.sleep(0.02)
+
+
 def test_a_worker_that_takes_too_long_ends_and_others_go_on(forks: WorkerForks, tmp_path: Path) -> None:
     endless, path = tmp_path / "endless.hdr", tmp_path / "cup.obj"
     os.mkfifo(endless)  # nobody writes
