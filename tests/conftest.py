@@ -43,9 +43,6 @@ THREAD_COUNTS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_N
 PROCESSOR = Path("/proc/cpuinfo")
 if "numpy" not in sys.modules and PROCESSOR.exists() and "avx512f" in PROCESSOR.read_text():
     os.environ["OPENBLAS_CORETYPE"] = "SkylakeX"
-# Most of what tests that render cost is llvmpipe compiling kernels, which takes a third less where LLVM does not
-# optimize them. Pictures stay the same to the bit, and such kernels have entries of their own in Mesa's cache.
-os.environ.setdefault("GALLIVM_PERF", "nopt")
 WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # gw0, gw1, ...; None where tests are not spread
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 
