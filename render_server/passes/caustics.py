@@ -128,7 +128,10 @@ class Caustics:
         self._tiles = tuple(-(-edge // TILE) for edge in grid.size)
         self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
         self._tile_beams = gpu.ctx.buffer(reserve=4)
-        self._find_tiles = Kernel(gpu, "caustic_tiles")
+        # One dispatch on a GPU; in software every workgroup would pay for entering the longer kernel.
+        both = {} if gpu.is_software else {"NARROW": 1}
+        self._find_tiles = Kernel(gpu, "caustic_tiles", WIDE=1, **both)
+        self._add_narrow = Kernel(gpu, "caustic_tiles", NARROW=1) if gpu.is_software else None
         rows = 8 if gpu.is_software else 2  # software renderers read a beam once for each of few threads
         self._gather = Kernel(
             gpu, "caustic_gather", ROWS=rows, GROUP_ROWS=TILE // rows, **reuse_define(reuses)
@@ -197,8 +200,12 @@ class Caustics:
             (self._bound_threads(),), own, shared, self._grid.bindings, scene, **self._last_bindings()
         )
         walkers = list_threads(self._gpu, most)
-        rows = -(-self._threads // walkers)  # of workgroups that add narrow beams
-        self._find_tiles.run((walkers, down + rows), own, shared, scene)
+        if self._add_narrow is None:
+            rows = -(-self._threads // walkers)  # of workgroups that add narrow beams
+            self._find_tiles.run((walkers, down + rows), own, shared, scene)
+        else:
+            self._find_tiles.run((walkers, down), own, shared, scene)
+            self._add_narrow.run((self._threads,), own, shared, scene)
         self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
 
     def _bound_threads(self) -> int:
@@ -223,5 +230,6 @@ class Caustics:
             self._balls,
             self._tile_beams,
             self._find_tiles,
+            self._add_narrow,
             self._gather,
         )

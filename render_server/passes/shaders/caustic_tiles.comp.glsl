@@ -1,8 +1,10 @@
-// Finds the tiles that each wide beam may light: invocations (x) walk the beams for each row of tiles (y). Workgroups below these
-// rows add the irradiance of narrow beams to the pixels around their hits, a workgroup per beam: one dispatch, for neither waits
-// for the other. Sums are integers, so that their order does not matter.
+// WIDE: finds the tiles that each wide beam may light: invocations (x) walk the beams for each row of tiles (y). NARROW: workgroups
+// (below these rows) add the irradiance of narrow beams to the pixels around their hits, a workgroup per beam. With both it is one
+// dispatch, for neither waits for the other. Sums are integers, so that their order does not matter.
 #include "common/geometry.glsl"
+#ifdef NARROW
 #define ADDS_CAUSTICS
+#endif
 #include "common/beam_footprint.glsl"
 #include "common/beam_tiles.glsl"
 #include "common/camera.glsl"
@@ -13,6 +15,7 @@ layout(rgba32f) readonly uniform image2D tile_balls;
 layout(std430) buffer TileBeams { uint tile_beams[]; };
 uniform ivec2 picture_pixels;
 
+#ifdef WIDE
 void mark(uint i, int row) {
     BeamPlace at = place_of_beam(i);
     ivec2 low = at.low / TILE, high = at.high / TILE;
@@ -23,7 +26,9 @@ void mark(uint i, int row) {
         if (may_light(beam, imageLoad(tile_balls, ivec2(x, row + below))))
             atomicOr(tile_beams[first_word(ivec2(x, row), at.layer) + int(i >> 5u)], 1u << (i & 31u));
 }
+#endif
 
+#ifdef NARROW
 void splat(Beam beam, BeamPlace place) {
     mat3 basis = basis_around(beam.direction.xyz);
     ivec2 size = place.high - place.low + 1;
@@ -36,15 +41,22 @@ void splat(Beam beam, BeamPlace place) {
             if (part[j] != 0) atomicAdd(caustic_sums[at + j], part[j]);
     }
 }
+#endif
 
 void main() {
-    int row = int(gl_WorkGroupID.y);
-    bool is_wide = row < tiles.y;
-    uint count = beams_held(), wide = is_wide ? count : 0u, narrow = is_wide ? 0u : count;
-    for (uint i = first_item(); i < wide; i += items_apart()) mark(i, row);
-    uint rows = gl_NumWorkGroups.y - uint(tiles.y), first = uint(row - tiles.y) * gl_NumWorkGroups.x + gl_WorkGroupID.x;
-    for (uint i = first; i < narrow; i += rows * gl_NumWorkGroups.x) {
+    uint count = beams_held(), row = gl_WorkGroupID.y, rows = gl_NumWorkGroups.y;
+#ifdef WIDE
+    if (row < uint(tiles.y)) {
+        for (uint i = first_item(); i < count; i += items_apart()) mark(i, int(row));
+        return;
+    }
+    row -= uint(tiles.y);
+    rows -= uint(tiles.y);
+#endif
+#ifdef NARROW
+    for (uint i = row * gl_NumWorkGroups.x + gl_WorkGroupID.x; i < count; i += rows * gl_NumWorkGroups.x) {
         BeamPlace place = place_of_beam(i);
         if (place.layer >= 0 && place.sharp != 0) splat(beam_at(i), place);
     }
+#endif
 }
