@@ -43,10 +43,10 @@ def decoded(module: bytes) -> tuple[tuple[int, ...], list[Instruction]]:
     """Returns the header and the instructions of a module.
 
     Raises:
-        ValueError: it is none of this machine's byte order.
+        ValueError: it is not a SPIR-V module in little-endian byte order, or is cut off.
     """
     if len(module) < 4 * HEADER_WORDS or len(module) % 4 or int(np.frombuffer(module[:4], "<u4")[0]) != MAGIC:
-        raise ValueError("This is no SPIR-V module.")
+        raise ValueError("This is not a SPIR-V module.")
     words: list[int] = np.frombuffer(module, "<u4").tolist()
     found, at = [], HEADER_WORDS
     while at < len(words):
@@ -157,7 +157,7 @@ def counting(module: bytes) -> bytes:
     """Returns the module that also adds, block by block, what it executes to the variables COUNTERS.
 
     Raises:
-        ValueError: `module` is no SPIR-V module.
+        ValueError: `module` is not a SPIR-V module.
     """
     header, instructions = decoded(module)
     counters, meaning = _Counters(header, instructions), _Meaning()

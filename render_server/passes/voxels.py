@@ -267,9 +267,8 @@ class ResolveVoxels:
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu, self._threads = gpu, list_threads(gpu)
         self._mu = Kernel(gpu, "resolve_voxels")
-        spends = (
-            {} if gpu.is_software else {"SPENDS_DELTA": 1}
-        )  # clearing whole buffers is faster in software
+        # In software, clearing the whole buffer is faster than emptying the sums one by one.
+        spends = {} if gpu.is_software else {"SPENDS_DELTA": 1}
         self._rho = Kernel(gpu, "resolve_voxels", RHO=1, **spends)
 
     def resolve_mu(
