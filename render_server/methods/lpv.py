@@ -59,7 +59,7 @@ from deltalight.render_server.passes.volumes import MOST_VOLUMES, PlacedVolume, 
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
 
 STEPS_OF_A_BOUNCE = 1 / 4
-"""Share of the steps: V_rho starts with the light of V_mu, and each bounce goes on where the one before ended."""
+"""Fraction of the steps: V_rho starts with the light of V_mu, and each bounce goes on where the one before ended."""
 
 
 class Propagated:
@@ -150,7 +150,8 @@ class DifferenceVolumes:
     ) -> tuple[LightVolume, moderngl.Buffer | None]:
         """Propagates V_rho on, with the light that surfaces reflect of it.
 
-        Returns it and the sums of what they reflect; None if there is no bounce.
+        Returns it and the sums of what they reflect; None if there is no bounce. It adds to V_rho, so `propagate_rho`
+        runs before each run: whatever changes an input of this stage changes one of that stage, too.
         """
         own = {**scene, **query_bindings(self._settings)}
         last = self._settings.resolved_bounces
