@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 # The methods that `bench quality` compares by default.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
 
-# Those of `bench speed` and `bench counts`.
+# Those of `bench speed`, `bench counts` and `bench kernels`.
 TIMED_METHODS = "raster,none,exact,paper,dlpv"
 # Those of `bench views`; beams that smooth objects cast are traced for each camera.
 VIEWS_METHODS = "exact,exact:caustics=false,paper,dlpv"
@@ -94,6 +94,24 @@ def counts(
     from deltalight.benchmarks.speed.command import run_counts
 
     run_counts(job, gpu_paths=gpu_paths, out=out, as_json=as_json)
+
+
+@bench.command()
+def kernels(
+    *,
+    size: Size = None,
+    methods: Annotated[str, typer.Option(help=METHODS_HELP)] = TIMED_METHODS,
+    motions: Annotated[str, typer.Option(help=MOTIONS_HELP)] = "camera",
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames to time of each motion.")] = 8,
+    device: Device = None,
+    out: ReportFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Time each kernel and draw of a frame alone: which of a stage's kernels takes long."""
+    job = _speed_job(methods, motions, frames, size, device)
+    from deltalight.benchmarks.speed.command import run_kernels
+
+    run_kernels(job, out=out, as_json=as_json)
 
 
 @bench.command()

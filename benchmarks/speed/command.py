@@ -1,4 +1,4 @@
-"""`deltalight bench speed`, `bench counts` and `bench roofline` with parsed options."""
+"""`deltalight bench speed`, `bench counts`, `bench kernels` and `bench roofline` with parsed options."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +12,7 @@ from rich.progress import Progress
 from deltalight.benchmarks.report_output import put_report
 from deltalight.benchmarks.speed.compare import compare_reports, print_comparison
 from deltalight.benchmarks.speed.counts import count_frames, print_counts
+from deltalight.benchmarks.speed.kernel_times import print_kernels, time_kernels
 from deltalight.benchmarks.speed.measure import Keep, SpeedJob, measure_speed
 from deltalight.benchmarks.speed.report import SpeedReport
 from deltalight.benchmarks.speed.roofline import RooflineJob, count_roofline
@@ -67,6 +68,15 @@ def run_counts(job: SpeedJob, *, gpu_paths: bool, out: Path | None, as_json: boo
         report = count_frames(job, progress, gpu_paths=gpu_paths)
     put_report(
         report.model_dump_json(indent=2), lambda: print_counts(report, Console()), out=out, as_json=as_json
+    )
+
+
+def run_kernels(job: SpeedJob, *, out: Path | None, as_json: bool) -> None:
+    """Time kernels one by one, write the report to `out` if given, and print it."""
+    with _progress() as progress:
+        report = time_kernels(job, progress)
+    put_report(
+        report.model_dump_json(indent=2), lambda: print_kernels(report, Console()), out=out, as_json=as_json
     )
 
 

@@ -189,7 +189,7 @@ class _Run:
     def _motion(self, name: str, motion: str, scene: SceneDocument, renderer: SceneRenderer) -> MotionFigures:
         steps = steps_of(motion, self.take, scene)
         self.shown.frame(name, motion, 0)
-        self._warm_up(renderer, steps)
+        warm_up(self.gpu, renderer, steps)
         times: list[FrameTimes] = []
         for number, step in enumerate(islice(steps, self.job.frames), start=1):
             self.shown.frame(name, motion, number)
@@ -197,12 +197,14 @@ class _Run:
         moved = {} if renderer.graph is None else stage_bytes(renderer.graph)
         return motion_figures(times, moved, self.report.peaks, self.report.budget_ms)
 
-    def _warm_up(self, renderer: SceneRenderer, steps: Iterator[Step]) -> None:
-        until_s = time.monotonic() + (0.0 if self.gpu.is_software else GPU_WARM_UP_S)
-        for number, step in enumerate(steps, start=1):
-            time_step(renderer, step)
-            if number >= WARM_UP_FRAMES and time.monotonic() >= until_s:
-                return
+
+def warm_up(gpu: GpuContext, renderer: SceneRenderer, steps: Iterator[Step]) -> None:
+    """Render steps until drivers have compiled and a GPU runs at its full clock."""
+    until_s = time.monotonic() + (0.0 if gpu.is_software else GPU_WARM_UP_S)
+    for number, step in enumerate(steps, start=1):
+        time_step(renderer, step)
+        if number >= WARM_UP_FRAMES and time.monotonic() >= until_s:
+            return
 
 
 def time_step(renderer: SceneRenderer, step: Step) -> FrameTimes:

@@ -6,12 +6,14 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import moderngl
 import numpy as np
 import pytest
 from rich.progress import Progress
 
 from deltalight.benchmarks.cli import DEFAULT_MOTIONS, TIMED_METHODS
 from deltalight.benchmarks.speed.counts import count_motion
+from deltalight.benchmarks.speed.kernel_times import time_motion
 from deltalight.benchmarks.speed.measure import WARM_UP_FRAMES, FrameTimes, motion_figures, time_step
 from deltalight.benchmarks.speed.motions import (
     ARM_STEPS,
@@ -32,6 +34,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import open_source
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld
 from deltalight.render_server.view import output_size
@@ -44,6 +47,7 @@ pytestmark = pytest.mark.skipif(
     not RECORDING.is_file(), reason="the demo's recording is not in this checkout"
 )
 SIZE = (80, 60)  # no power of two (CONTRIBUTING.md)
+UNTOUCHED = PassTimers.measure, moderngl.ComputeShader.run
 PEAKS = Peaks(bytes_per_s=1e9, flops_per_s=1e9)
 
 
@@ -313,6 +317,7 @@ def prepared(monkeypatch: pytest.MonkeyPatch, take: Take, scene: SceneDocument) 
 
     monkeypatch.setattr("deltalight.benchmarks.speed.measure.prepare_take", small)
     monkeypatch.setattr("deltalight.benchmarks.speed.counts.prepare_take", small)
+    monkeypatch.setattr("deltalight.benchmarks.speed.kernel_times.prepare_take", small)
     monkeypatch.setattr("deltalight.benchmarks.speed.measure.measure_peaks", lambda _: PEAKS)
     monkeypatch.setattr("deltalight.benchmarks.speed.measure.demo_scene", lambda _: scene)
 
@@ -394,3 +399,28 @@ def test_a_gpu_s_paths_are_counted_without_one(capsys: pytest.CaptureFixture[str
     still = counts["still"]["per_frame"]
     assert (still["dispatches"], still["draws"]) == (2, 0)  # in software whole pictures are drawn
     assert counts["camera"]["per_frame"]["reads"] == 0  # where software waits
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("prepared")
+def test_kernels_are_timed_one_by_one(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    report = tmp_path / "kernels.json"
+    assert run(["bench", "kernels", *OPTIONS, "--out", str(report)]) == 0
+    assert "voxelize real" in capsys.readouterr().out
+    motions = json.loads(report.read_text())["methods"]["paper:cone_scale=4"]
+    still = {(each["stage"], each["kernel"].split()[0]): each["runs"] for each in motions["still"]}
+    assert still == {("(no stage)", "linearize"): 1, ("relit picture", "composite"): 1}
+    times = [each["ms"]["median"] for each in motions["camera"]]
+    assert times == sorted(times, reverse=True)
+    assert min(times) > 0
+
+
+def test_timed_kernels_are_those_that_are_counted(
+    gpu: GpuContext, renderer: SceneRenderer, take: Take, scene: SceneDocument
+) -> None:
+    steps = list(steps_of("camera", take, scene, 4))
+    counts = count_motion(renderer, steps, 1)
+    figures = time_motion(gpu, renderer, steps[2:3])  # the frame that was counted
+    assert all(each.kernel for each in figures)
+    assert sum(each.runs for each in figures) == counts.per_frame["dispatches"] + counts.per_frame["draws"]
+    assert (PassTimers.measure, moderngl.ComputeShader.run) == UNTOUCHED

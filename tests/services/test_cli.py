@@ -63,6 +63,7 @@ COMMANDS = {
     "schema",
     "bench speed",
     "bench counts",
+    "bench kernels",
     "bench roofline",
     "bench plot",
     "bench quality",
