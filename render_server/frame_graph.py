@@ -28,8 +28,8 @@ from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.lighting import Layers
 from deltalight.render_server.methods.registry import MethodChoice
+from deltalight.render_server.methods.surface_shading import Layers
 from deltalight.render_server.passes.camera_image import CameraImage
 from deltalight.render_server.passes.composite import Composite, DebugViews, RelitLayers
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid

@@ -14,7 +14,7 @@ from deltalight.protocol.scene_objects import SceneObject
 if TYPE_CHECKING:
     from deltalight.render_server.frame import FrameResources
     from deltalight.render_server.graph import Graph
-    from deltalight.render_server.methods.lighting import Layers
+    from deltalight.render_server.methods.surface_shading import Layers
     from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 
 Settings = TypeVar("Settings", bound=MethodSettings)
