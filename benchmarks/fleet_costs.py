@@ -91,7 +91,7 @@ def seconds_of(work: Callable[[], object]) -> float:
 
 
 def web_process(rooms: int) -> dict[str, float]:
-    """Return what a web process of so many rooms takes that show nothing: threads, files, and share of a core."""
+    """Return what a web process of so many rooms takes that show nothing: threads, files, and fraction of a core."""
     page, number = ports.private_ports(2)
     directory = ports.endpoint(number)
     words = ["api", "--config", os.devnull, "--port", str(page), "--rooms", directory]

@@ -29,7 +29,7 @@ RECEIVE_TIMEOUT_S = 0.5
 ANSWER_TIMEOUT_S = 1.0
 LATE_AFTER_S = 3.0  # reports come each second; whoever is late is asked
 REMEMBERED_GAPS = 10
-WORKING_SHARE = 0.02  # of a core; waiting threads take less
+WORKING_LOAD = 0.02  # of a core; waiting threads take less
 DEAF_ON_GPU_S = 60.0  # the driver links the largest shader within some seconds
 LONGEST_FRAME_ON_GPU_S = 300.0
 
@@ -182,7 +182,7 @@ class ProcessorUse:
     def grew(self) -> bool:
         """Whether it worked since the last look, or since the start."""
         used_s, now_s = processor_time_s(self._process_id), time.monotonic()
-        worked = used_s - self._used_s > WORKING_SHARE * (now_s - self._looked_s)
+        worked = used_s - self._used_s > WORKING_LOAD * (now_s - self._looked_s)
         self._used_s, self._looked_s = used_s, now_s
         return worked
 

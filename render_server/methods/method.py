@@ -53,7 +53,7 @@ def resolve_voxel_cones(settings: VoxelConeSettings, defaults: ResolvedSettings)
     """Fills in the machine's defaults where the document says null, within the limits of the quality."""
     size = settings.volume_size or defaults.volume_size
     return ResolvedSettings(
-        max(int(settings.tier.volume_share * size / VOLUME_STEP) * VOLUME_STEP, min(size, LEAST_VOLUME)),
+        max(int(settings.tier.volume_scale * size / VOLUME_STEP) * VOLUME_STEP, min(size, LEAST_VOLUME)),
         settings.cone_scale or defaults.cone_scale,
         settings.rsm_size or defaults.rsm_size,
         settings.triangle_budget or defaults.triangle_budget,
