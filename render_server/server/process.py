@@ -40,7 +40,7 @@ from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.frames import FrameReceiver, PairingSettings
-from deltalight.render_server.server.renderer import Renderer
+from deltalight.render_server.server.renderer_interface import Renderer
 from deltalight.render_server.server.session import RenderedFrame, RenderSession
 from deltalight.render_server.server.session_host import SessionHost, SessionIdentity, SourceInUse
 

@@ -34,7 +34,7 @@ from deltalight.render_server.gpu.context import is_software_renderer
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.cameras import RoomCameras, Taken
 from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceRequest
-from deltalight.render_server.server.renderer import Pending, Renderer
+from deltalight.render_server.server.renderer_interface import Pending, Renderer
 from deltalight.render_server.server.requests import PickRequest, RoomMeshRequest, WatchRequest
 from deltalight.render_server.server.session_host import SessionHost, SessionIdentity
 from deltalight.render_server.server.snapshot import SnapshotRequest, take_snapshot
