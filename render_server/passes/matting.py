@@ -57,10 +57,20 @@ class Matting:
             met = self._rectangle_around(rectangle, sight)
             scene = {**scene, "linear_picture": self._mean.add(scene["linear_picture"], met)}
         self._find_nearest(scene, rectangle, sight, -(-reach_px // BLOCK))
-        own = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}
+        own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}
         self._list_band(scene, own, rectangle)
         self._estimate_mattes(scene, own, sight)
-        self._fuse(scene, own, rectangle, coverage, unmixing)
+        self._fusion.run(
+            (self._threads,),
+            scene,
+            own,
+            rectangle=rectangle,
+            estimate=self._estimate,
+            contrast=self._contrast,
+            object_coverage=coverage.texture,
+            edge_correction=unmixing.texture,
+            Texels=self._band,
+        )
 
     def _find_nearest(self, scene: Bindings, rectangle: Rectangle, sight: int, reach: int) -> None:
         """Keeps the least depth within `reach` blocks of each block that rays from the rectangle meet."""
@@ -96,27 +106,6 @@ class Matting:
             contrast_out=self._contrast,
             Texels=self._band,
             sight=float(sight),
-        )
-
-    def _fuse(
-        self,
-        scene: Bindings,
-        own: Bindings,
-        rectangle: Rectangle,
-        coverage: ObjectCoverage,
-        unmixing: EdgeUnmixing,
-    ) -> None:
-        """Averages the estimates of near pixels, and corrects by them what coverage and unmixing hold."""
-        self._fusion.run(
-            (self._threads,),
-            scene,
-            own,
-            rectangle=rectangle,
-            estimate=self._estimate,
-            contrast=self._contrast,
-            object_coverage=coverage.texture,
-            edge_correction=unmixing.texture,
-            Texels=self._band,
         )
 
     def _blocks_around(self, rectangle: Rectangle, margin: int) -> Rectangle:

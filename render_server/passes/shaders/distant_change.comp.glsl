@@ -50,8 +50,8 @@ vec3 direct_irradiance(SurfacePoint s) {
     return sum;
 }
 
-// Upper bound of a ball's form factor: the fraction of the hemisphere about n that it fills, weighted by cosine.
-float form_factor_bound(vec3 to_ball, float radius, vec3 n) {
+// Share of the hemisphere about n, weighted by cosine, that a ball fills at most.
+float greatest_share(vec3 to_ball, float radius, vec3 n) {
     float apart = length(to_ball), sine = min(radius / apart, 1.0);
     float height = dot(to_ball, n) + radius;
     return height > 0.0 ? sine * sine * min(height / apart, 1.0) : 0.0;
@@ -78,18 +78,18 @@ vec3 change_by_volume(int number, vec3 p, vec3 n, int part) {
     vec3 q = volume_coordinate(p);
     vec4 ball = ball_around_support();
     vec3 to_ball = ball.xyz - q, sum = vec3(0.0);
-    if (form_factor_bound(to_ball, ball.w, n) < LEAST_CHANGE) return sum;
+    if (greatest_share(to_ball, ball.w, n) < LEAST_CHANGE) return sum;
     float sine = ball.w / max(length(to_ball), 1e-6);
     bool surrounds = sine >= 1.0;
-    float cap = 1.0 - sqrt(max(1.0 - sine * sine, 0.0)), cone = cap / float(AIMED_CONES);   // solid angles / 2 pi
-    float ratio = 0.5 * (surrounds ? cone_ratio() : sqrt(8.0 * cone));
+    float cap = 1.0 - sqrt(max(1.0 - sine * sine, 0.0)), share = cap / float(AIMED_CONES);   // solid angles / 2 pi
+    float ratio = 0.5 * (surrounds ? cone_ratio() : sqrt(8.0 * share));
     mat3 basis = basis_around(surrounds ? n : normalize(to_ball));
     int k = 0;
     do {
         float index = float(4 * k + part), at = (index + 0.5) / float(4 * AIMED_CONES), phi = index * GOLDEN_ANGLE;
         float z = surrounds ? sqrt(1.0 - at) : 1.0 - at * cap;
         vec3 d = basis * vec3(sqrt(max(1.0 - z * z, 0.0)) * vec2(cos(phi), sin(phi)), z);
-        float weight = surrounds ? PI / float(AIMED_CONES) : 2.0 * PI * cone * dot(d, n);
+        float weight = surrounds ? PI / float(AIMED_CONES) : 2.0 * PI * share * dot(d, n);
         if (weight > 0.0 && !counted_before(number, p, d)) sum += weight * change_along(q, d, ratio);
     } while (++k < AIMED_CONES);
     return sum;
