@@ -37,7 +37,7 @@ TIMES = 20
 WEB_S = 10.0  # that a web process is watched
 
 
-class Everywhere:
+class UnlimitedPlacer:
     """A placer with a slot for every room, which starts nothing (a `Placer`)."""
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ def kept(rooms: int) -> RoomKeeper:
     """Return a keeper of so many rooms, all of them placed."""
     node = RoomNode(name="camera", endpoint=ports.endpoint(ports.NODE_PORT))
     plans = [RoomPlan(f"room-{number}", "", (node,), Path("unused")) for number in range(rooms)]
-    keeper = RoomKeeper(plans, Everywhere())
+    keeper = RoomKeeper(plans, UnlimitedPlacer())
     keeper.poll()
     return keeper
 

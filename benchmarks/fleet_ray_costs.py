@@ -58,7 +58,7 @@ class ControlPlane:
 
     def per_actor_s(self) -> tuple[float, float]:
         """Return its processor time for a detached actor that does nothing, s, and the time until it answers, s."""
-        remote = self._ray.remote(num_cpus=0, lifetime="detached")(Nothing).remote
+        remote = self._ray.remote(num_cpus=0, lifetime="detached")(IdleActor).remote
         began_s, before_s = time.monotonic(), self.cpu_s()
         actors = [remote() for _ in range(ACTORS)]
         self._ray.get([actor.answer.remote() for actor in actors])
@@ -68,7 +68,7 @@ class ControlPlane:
         return used_s / ACTORS, elapsed_s / ACTORS
 
 
-class Nothing:
+class IdleActor:
     """An actor that does nothing."""
 
     def answer(self) -> None:

@@ -204,7 +204,7 @@ class Sender:
 
 
 class BuiltAhead(Protocol):
-    """What a process built while it was a spare (`ahead.Ahead`)."""
+    """What a process built while it was a spare (`standby.StandbyRenderer`)."""
 
     def take(
         self, settings: ServerSettings, scene: SceneDocument
