@@ -342,7 +342,7 @@ class FleetSimulation:
 
 
 def directory_load(fleet: Fleet, costs: Costs) -> float:
-    """Return the share of a directory's one thread that web processes take which each ask five times a second."""
+    """Return the fraction of a directory's one thread that web processes take which each ask five times a second."""
     processes = -(-fleet.rooms_of_keeper // fleet.rooms_per_web_process)
     return processes / FOLLOWER_POLL_S * costs.answer_for(fleet.rooms_of_keeper)
 
@@ -354,7 +354,7 @@ def web_traffic_gbit_s(fleet: Fleet, costs: Costs) -> float:
 
 
 def gcs_load(fleet: Fleet, costs: Costs) -> float:
-    """Return the share of a core that the control process of a keeper's Ray cluster takes while nothing starts."""
+    """Return the fraction of a core that the control process of a keeper's Ray cluster takes while nothing starts."""
     return costs.gcs_idle_share + -(-fleet.hosts // fleet.keepers) * costs.gcs_share_per_host
 
 
@@ -397,16 +397,16 @@ def simulate(
     fleet = Fleet(rooms=rooms, gpus=gpus, slots_per_gpu=slots_per_gpu, rooms_per_keeper=rooms_per_keeper)
     costs = Costs.measured()
     outcome = FleetSimulation(fleet, costs, seed).run(days)
-    shares = loads(fleet, costs)
+    taken = loads(fleet, costs)
     if out is not None:
-        found = {"fleet": asdict(fleet), "seed": seed, "days": days, "loads": shares}
+        found = {"fleet": asdict(fleet), "seed": seed, "days": days, "loads": taken}
         out.write_text(json.dumps({**found, "figures": figures(outcome)}, indent=1) + "\n")
     title = f"{rooms} rooms of {fleet.keepers} keepers on {gpus} GPUs, {days:g} days, seed {seed}"
     table = Table("What", title, box=None)
     for name, value in figures(outcome).items():
         table.add_row(name, value)
-    for name, share in shares.items():
-        table.add_row(f"taken: {name}", f"{100 * share:.1f} %")
+    for name, fraction in taken.items():
+        table.add_row(f"taken: {name}", f"{100 * fraction:.1f} %")
     Console(soft_wrap=True).print(table)
 
 

@@ -37,7 +37,7 @@ TIMES = 20
 WEB_S = 10.0  # that a web process is watched
 
 
-class Everywhere:
+class UnlimitedPlacer:
     """A placer with a slot for every room, which starts nothing (a `Placer`)."""
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ def kept(rooms: int) -> RoomKeeper:
     """Return a keeper of so many rooms, all of them placed."""
     node = RoomNode(name="camera", endpoint=ports.endpoint(ports.NODE_PORT))
     plans = [RoomPlan(f"room-{number}", "", (node,), Path("unused")) for number in range(rooms)]
-    keeper = RoomKeeper(plans, Everywhere())
+    keeper = RoomKeeper(plans, UnlimitedPlacer())
     keeper.poll()
     return keeper
 
@@ -91,7 +91,7 @@ def seconds_of(work: Callable[[], object]) -> float:
 
 
 def web_process(rooms: int) -> dict[str, float]:
-    """Return what a web process of so many rooms takes that show nothing: threads, files, and share of a core."""
+    """Return what a web process of so many rooms takes that show nothing: threads, files, and fraction of a core."""
     page, number = ports.private_ports(2)
     directory = ports.endpoint(number)
     words = ["api", "--config", os.devnull, "--port", str(page), "--rooms", directory]

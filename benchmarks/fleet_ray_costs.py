@@ -49,7 +49,7 @@ class ControlPlane:
         self._cluster.wait_for_nodes()
 
     def idle(self) -> tuple[float, float]:
-        """Return the share of a core, and the bytes a second, while nothing happens."""
+        """Return the fraction of a core, and the bytes a second, while nothing happens."""
         time.sleep(SETTLING_S)
         began_s, before_s, before_bytes = time.monotonic(), self.cpu_s(), self.traffic_bytes()
         time.sleep(IDLE_S)
@@ -58,7 +58,7 @@ class ControlPlane:
 
     def per_actor_s(self) -> tuple[float, float]:
         """Return its processor time for a detached actor that does nothing, s, and the time until it answers, s."""
-        remote = self._ray.remote(num_cpus=0, lifetime="detached")(Nothing).remote
+        remote = self._ray.remote(num_cpus=0, lifetime="detached")(IdleActor).remote
         began_s, before_s = time.monotonic(), self.cpu_s()
         actors = [remote() for _ in range(ACTORS)]
         self._ray.get([actor.answer.remote() for actor in actors])
@@ -68,7 +68,7 @@ class ControlPlane:
         return used_s / ACTORS, elapsed_s / ACTORS
 
 
-class Nothing:
+class IdleActor:
     """An actor that does nothing."""
 
     def answer(self) -> None:
@@ -95,14 +95,14 @@ def control_plane() -> Iterator[ControlPlane]:
 def measure_ray() -> dict[str, float]:
     """Measure and return the costs of Ray's control plane."""
     with control_plane() as plane:
-        alone_share, alone_bytes = plane.idle()
+        alone_load, alone_bytes = plane.idle()
         plane.add_hosts(MORE_HOSTS)
-        share, sent_bytes = plane.idle()
+        load, sent_bytes = plane.idle()
         gcs_s, answered_s = plane.per_actor_s()  # last, because the end of actors is work too
     return {
         "gcs_s_per_actor": gcs_s,
         "actor_answers_s": answered_s,
-        "gcs_idle_share": alone_share,
-        "gcs_share_per_host": max(0.0, share - alone_share) / MORE_HOSTS,
+        "gcs_idle_share": alone_load,
+        "gcs_share_per_host": max(0.0, load - alone_load) / MORE_HOSTS,
         "gcs_bytes_per_s_per_host": max(0.0, sent_bytes - alone_bytes) / MORE_HOSTS,
     }

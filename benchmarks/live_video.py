@@ -281,7 +281,7 @@ async def _note_captures(address: str, matched: Matched) -> None:
 
 
 async def _crowd(client: httpx.Client, way: str, viewers: int, seconds: float) -> tuple[Seen, float]:
-    """Return what viewers got together, and the web process's share of a core."""
+    """Return what viewers got together, and the web process's fraction of a core."""
     base = str(client.base_url).rstrip("/")
     socket, whep = base.replace("http", "ws", 1) + "/live", f"{base}/whep"
     seen, measures, matched = Seen(), asyncio.Event(), Matched()
@@ -343,7 +343,7 @@ def main() -> None:
                         str(viewers),
                         f"{8e-3 * seen.bytes / seconds / viewers:.0f}",
                         f"{seen.messages / seconds / viewers:.1f}",
-                        *(f"{np.percentile(seen.delays_ms or [np.nan], share):.0f}" for share in (50, 95)),
+                        *(f"{np.percentile(seen.delays_ms or [np.nan], rank):.0f}" for rank in (50, 95)),
                         f"{1e3 * cores:.0f}",
                     )
     Console(width=110).print(table)

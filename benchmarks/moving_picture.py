@@ -37,8 +37,8 @@ def moving_picture(pictures: int) -> list[UInt8[np.ndarray, "h w 3"]]:
             frame = take[number]
             if number not in shown:
                 shown[number] = renderer.render(frame, scene).color
-            share = 0.5 + 0.42 * math.cos(2 * math.pi * step / len(numbers))
-            made.append(divided(_small(frame.color), _small(shown[number]), share))
+            divide = 0.5 + 0.42 * math.cos(2 * math.pi * step / len(numbers))
+            made.append(divided(_small(frame.color), _small(shown[number]), divide))
     return made
 
 

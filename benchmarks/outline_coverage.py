@@ -65,7 +65,7 @@ def shapes(count: int, rng: np.random.Generator) -> Iterator[Shape]:
 
 
 def sampled(shape: Shape, pattern: Float64[np.ndarray, "n 2"], edge: int = EDGE) -> Coverage:
-    """Returns the share of each pixel's samples inside; `pattern` is in pixels from its middle."""
+    """Returns the fraction of each pixel's samples inside; `pattern` is in pixels from its middle."""
     rows, columns = np.mgrid[:edge, :edge] - (edge - 1) / 2
     found = [shape.inside(columns + x, rows + y) for x, y in pattern]
     return np.asarray(np.mean(found, axis=0))

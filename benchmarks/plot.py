@@ -286,8 +286,8 @@ def _along(start: Point, end: Point) -> Iterator[Point]:
     """Points of a line, a few pixels apart."""
     count = 1 + int(math.dist(start, end) / 4)
     for number in range(count + 1):
-        share = number / count
-        yield start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+        fraction = number / count
+        yield start[0] + fraction * (end[0] - start[0]), start[1] + fraction * (end[1] - start[1])
 
 
 def _around(point: Point, label: str) -> Iterator[Box]:

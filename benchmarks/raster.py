@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from deltalight.render_server.gpu.kernel import Bindings
     from deltalight.render_server.graph import Graph, Resource
     from deltalight.render_server.lights.lights import LightSet
-    from deltalight.render_server.methods.lighting import Layers
     from deltalight.render_server.methods.method import Setup
+    from deltalight.render_server.methods.surface_shading import Layers
     from deltalight.render_server.passes.cones import ConeFields, LowResGrid
     from deltalight.render_server.passes.lights import LightBuffers
 
@@ -37,7 +37,7 @@ class RasterMethod(MethodSettings):
 
 def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "Layers":
     """Declares lamps without views, even light instead of cones, and no change of light."""
-    from deltalight.render_server.methods import lighting
+    from deltalight.render_server.methods import surface_shading
     from deltalight.render_server.methods.light_maps import LitScene
     from deltalight.render_server.passes.lights import LightBuffers
     from deltalight.render_server.passes.shading import DirectLight
@@ -47,7 +47,8 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
     buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size)
     for light in (direct.light, direct.lobes):
         light.clear()  # none without objects, and none with them
-    shading = lighting.SurfaceShading(g.gpu, size, setup.resolved, buffers, direct, lighting.ShadingOptions())
+    options = surface_shading.ShadingOptions()
+    shading = surface_shading.SurfaceShading(g.gpu, size, setup.resolved, buffers, direct, options)
 
     def place(lights: "LightSet") -> "LightBuffers":
         """Gives the lamps to the shaders; without points to shine on they get no shadow maps."""
@@ -78,8 +79,8 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
     placed = g.value("volume", lambda _: volume, s.surfaces)
     g.own(volume)
     lit = LitScene(buffers, lamps, lamps, lamps)
-    own = lighting.MethodStages(placed, gather, light_directly=lambda *_: direct)
-    return lighting.shading_stages(g, s, shading, lit, own)
+    own = surface_shading.MethodStages(placed, gather, light_directly=lambda *_: direct)
+    return surface_shading.shading_stages(g, s, shading, lit, own)
 
 
 def _resolve(_settings: RasterMethod, _defaults: ResolvedSettings) -> ResolvedSettings:

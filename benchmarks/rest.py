@@ -195,7 +195,7 @@ def _request_table(report: dict[str, Any]) -> Table:
 
 
 def _print_viewers(console: Console, report: dict[str, Any]) -> None:
-    figures, shares = report["viewers"], report["viewers"]["share_of_processors"]
+    figures, used = report["viewers"], report["viewers"]["share_of_processors"]
     console.print(f"rendered beside these requests: {report['with_rendering']['frames_per_s']:.2f} frames/s")
     console.print(
         f"rendered with nobody looking {figures['rendered_per_s_without']:.2f} frames/s, with {figures['viewers']} "
@@ -203,9 +203,9 @@ def _print_viewers(console: Console, report: dict[str, Any]) -> None:
         f"{figures['frames_per_s_each']:.2f} frames/s of at most {figures['frames_per_s_each_at_most']:g}"
     )
     console.print(
-        f"for the viewers the web process took {100 * shares[WEB]:.1f} % of the processors "
+        f"for the viewers the web process took {100 * used[WEB]:.1f} % of the processors "
         f"({figures['web_ms_per_frame_and_viewer']:.2f} ms a frame and viewer), the viewers themselves "
-        f"{100 * shares[CLIENTS]:.1f} %"
+        f"{100 * used[CLIENTS]:.1f} %"
     )
 
 

@@ -45,8 +45,8 @@ class ViewsFigures(StrictModel):
     """One motion by one method; lists are by the number of cameras, from 1 on.
 
     `processor_ms` and `wall_ms`: medians of what a moment takes with all pictures. `ratios`: median over moments of
-    the processor time beside that of one camera at the same moment. `further`: what the last camera adds, as a share
-    of the first's cost.
+    the processor time beside that of one camera at the same moment. `further`: what the last camera adds, as a
+    fraction of the first's cost.
     """
 
     processor_ms: list[float]
@@ -55,7 +55,7 @@ class ViewsFigures(StrictModel):
 
     @property
     def further(self) -> list[float]:
-        """What each further camera adds, as a share of what one costs."""
+        """What each further camera adds, as a fraction of what one costs."""
         return [float(step) for step in np.diff(self.ratios)]
 
 
@@ -214,6 +214,6 @@ def _table(report: ViewsReport) -> Table:
     for method, motions in report.methods.items():
         for motion, found in motions.items():
             ratios = [f"x {ratio:.2f}" for ratio in found.ratios[1:]]
-            shares = [f"{100 * share:.0f} %" for share in found.further]
-            table.add_row(method, motion, f"{found.processor_ms[0]:.0f}", *ratios, *shares)
+            added = [f"{100 * fraction:.0f} %" for fraction in found.further]
+            table.add_row(method, motion, f"{found.processor_ms[0]:.0f}", *ratios, *added)
     return table

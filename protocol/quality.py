@@ -23,7 +23,7 @@ def require_quality(name: Quality) -> Quality:
 class QualityTier:
     """What a quality gives up while something moves.
 
-    `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_share` of its voxels an
+    `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_scale` of its voxels an
     edge. `reflection_cones` look up what a pixel of a smooth object reflects, in one of `reflection_step` x
     `reflection_step` pixels; while only the camera moves, in one tile of the picture in `reflection_turns`, and
     where nothing that the frame before looked up serves. `caustic_blocks` x `caustic_blocks` blocks of each light's
@@ -37,7 +37,7 @@ class QualityTier:
 
     cone_count: int = 64
     shadow_samples: int = 64
-    volume_share: float = 1.0
+    volume_scale: float = 1.0
     reflection_cones: Literal[2, 4] = 4
     reflection_step: Literal[1, 2] = 1
     reflection_turns: int = 1
@@ -55,7 +55,7 @@ TIERS: dict[Quality, QualityTier] = {
     "live": QualityTier(
         cone_count=8,
         shadow_samples=8,
-        volume_share=0.75,
+        volume_scale=0.75,
         reflection_cones=2,
         reflection_step=2,
         reflection_turns=4,

@@ -19,9 +19,9 @@ ROUNDED_VOXELS = 0.35
 RENEWAL_NS = 400_000_000
 # One that explains it is rebuilt after so long at rest, because a camera that only pauses must not wait for it.
 SETTLING_NS = 1_500_000_000
-# Of a depth image's pixels, every so many give a first estimate of its median, within these shares of them.
+# Of a depth image's pixels, every so many give a first estimate of its median, within these quantiles of them.
 SAMPLE_STEP = 61
-MEDIAN_SHARES = (0.45, 0.55)
+MEDIAN_QUANTILES = (0.45, 0.55)
 
 FittedOnGpu = Callable[[DepthImage], dict[str, Binding] | None]
 
@@ -170,7 +170,7 @@ def _median_depth(depth: DepthImage) -> float:
     sample = np.sort(metres.ravel()[::SAMPLE_STEP][valid.ravel()[::SAMPLE_STEP]])
     if not len(sample):
         return float(np.median(metres[valid])) if count else 1.0
-    low, high = (sample[int(share * len(sample))] for share in MEDIAN_SHARES)
+    low, high = (sample[int(quantile * len(sample))] for quantile in MEDIAN_QUANTILES)
     below = np.count_nonzero((metres < low) & valid)
     near = metres[(metres >= low) & (metres <= high) & valid]
     middle = [(count - 1) // 2 - below, count // 2 - below]

@@ -28,8 +28,8 @@ from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.lighting import Layers
 from deltalight.render_server.methods.registry import MethodChoice
+from deltalight.render_server.methods.surface_shading import Layers
 from deltalight.render_server.passes.camera_image import CameraImage
 from deltalight.render_server.passes.composite import Composite, DebugViews, RelitLayers
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -121,7 +121,7 @@ class ShownBuffers:
 
 
 @dataclass(frozen=True, eq=False)
-class RelitPicture:
+class ComposedPicture:
     """A composed picture, and what it was composed of."""
 
     composite: Composite
@@ -142,13 +142,13 @@ class Composition:
         scene: Bindings,
         options: CompositeOptions,
         *layers: Any,  # noqa: ANN401 (of RelitLayers, in their order)
-    ) -> RelitPicture:
+    ) -> ComposedPicture:
         """Composes the relit picture, and keeps by which ratio it changed."""
         return self.compose_layers(image, scene, options, RelitLayers(scene["object_coverage"], *layers))
 
     def compose_layers(
         self, image: CameraImage, scene: Bindings, options: CompositeOptions, relit: RelitLayers
-    ) -> RelitPicture:
+    ) -> ComposedPicture:
         """Composes the relit picture of layers that belong together."""
         self._composite.run(image, relit, {**scene, **options.bindings})
         view = options.output.view
@@ -167,9 +167,9 @@ class Composition:
                 relit.object_coverage,
                 effects=view == "effects",
             )
-        return RelitPicture(self._composite, relit, scene)
+        return ComposedPicture(self._composite, relit, scene)
 
-    def compose_again(self, image: CameraImage, relit: RelitPicture) -> Composite:
+    def compose_again(self, image: CameraImage, relit: ComposedPicture) -> Composite:
         """Composes the newest picture by the kept ratio, unless it is composed already."""
         if not image.is_linear:
             relit.composite.run_again(image, relit.layers, relit.scene)

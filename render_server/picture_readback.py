@@ -16,7 +16,7 @@ from deltalight.render_server.gpu.textures import AsyncReadback
 from deltalight.render_server.live_scene import LiveScene
 from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import raster_texels
-from deltalight.render_server.post_effects.bloom import bloomed
+from deltalight.render_server.post_effects.bloom import with_bloom
 from deltalight.render_server.post_effects.camera_artifacts import FrameArtifacts
 from deltalight.render_server.relit_frame import RelitFrame
 from deltalight.render_server.view import CameraView
@@ -104,7 +104,7 @@ class PictureReadback:
             coverage = self._queue.pop()[..., 0].astype(np.float32)
             depth_m = None if texels is None else self._queue.pop()[..., 3][texels]
             if radiance is not None:
-                color = bloomed(color, radiance, coverage, frame, output.bloom, tone=output.tone)
+                color = with_bloom(color, radiance, coverage, frame, output.bloom, tone=output.tone)
             return color if artifacts is None else artifacts.applied(color, coverage, depth_m)
 
         return take

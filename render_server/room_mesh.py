@@ -14,11 +14,11 @@ from deltalight.render_server.view import CameraView
 if TYPE_CHECKING:
     import trimesh
 
-# A corner that lies farther behind the measured surface than this share of its distance is hidden by it: a few
+# A corner that lies farther behind the measured surface than this fraction of its distance is hidden by it: a few
 # standard deviations of depth cameras, and what meshing rounds off.
-HIDDEN_SHARE = 0.03
-# Longest edge of a triangle, m and as a share of the room: the picture is laid on whole triangles, straight on each.
-EDGE_M, EDGE_SHARE = 0.1, 1 / 48
+HIDDEN_FRACTION = 0.03
+# Longest edge of a triangle, m and relative to the room: the picture is laid on whole triangles, straight on each.
+EDGE_M, EDGE_FRACTION = 0.1, 1 / 48
 SEEN, UNSEEN = "room", "room out of sight"
 UNSEEN_CODE = 96  # dark grey
 UNLIT_EXTENSION = "KHR_materials_unlit"  # the picture has the room's light in it
@@ -90,7 +90,7 @@ def room_mesh(corners: Corners, frame: ViewFrame, view: CameraView) -> RoomMesh:
     if frame.depth is not None:
         column, row = np.where(is_inside[:, None], pixels + 0.5, 0).astype(int).T
         before_m = frame.depth.depth_m[row, column]
-        is_hidden = frame.depth.valid[row, column] & (seen_from[:, 2] > before_m * (1 + HIDDEN_SHARE))
+        is_hidden = frame.depth.valid[row, column] & (seen_from[:, 2] > before_m * (1 + HIDDEN_FRACTION))
         is_inside &= ~is_hidden
     places = np.where(is_inside[:, None], places, 0)
     return RoomMesh(corners, places.reshape(-1, 3, 2), is_inside.reshape(-1, 3).all(axis=1), frame.color)
@@ -100,7 +100,7 @@ def _divided(corners: Corners) -> Corners:
     """Divides triangles of a model that are large for a room of its size."""
     from trimesh.remesh import subdivide_to_size
 
-    longest_m = max(EDGE_M, EDGE_SHARE * float(np.ptp(corners.reshape(-1, 3), axis=0).max()))
+    longest_m = max(EDGE_M, EDGE_FRACTION * float(np.ptp(corners.reshape(-1, 3), axis=0).max()))
     edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     if edges.max() <= longest_m:
         return corners

@@ -28,7 +28,7 @@ LEAST_OUTLINE = 0.03
 Quads = dict[int, Float64[np.ndarray, "4 2"]]
 
 
-class Seen(NamedTuple):
+class FoundMarkers(NamedTuple):
     """Corners of markers that were read, by id, and of quads of which nothing was read (pixels, clockwise)."""
 
     quads: Quads
@@ -50,14 +50,14 @@ class MarkerFinder:
         gray: UInt8[np.ndarray, "h w"],
         wanted: Collection[int],
         region: tuple[slice, slice] | None = None,
-    ) -> Seen:
+    ) -> FoundMarkers:
         """Return the wanted markers that are large enough to be read, and what may be others, of the same size.
 
         With a `region` (rows, columns), only what lies there, as the search of the whole picture finds it.
         """
         part = gray if region is None else np.ascontiguousarray(gray[region])
         if not part.size:
-            return Seen({}, _stacked(()))
+            return FoundMarkers({}, _stacked(()))
         self._parameters.minMarkerPerimeterRate = LEAST_OUTLINE * max(gray.shape) / max(part.shape)
         self._detector.setDetectorParameters(self._parameters)
         found, ids, others = self._detector.detectMarkers(part)
@@ -65,7 +65,7 @@ class MarkerFinder:
         corner = (0, 0) if region is None else (region[1].start, region[0].start)
         quads, unread = _stacked(found) + corner, _stacked(others) + corner
         read = zip(names, quads, shortest_sides(quads), strict=True)
-        return Seen(
+        return FoundMarkers(
             {name: quad for name, quad, side in read if name in wanted and side >= LEAST_SIDE_PX},
             unread[shortest_sides(unread) >= LEAST_SIDE_PX],
         )

@@ -22,9 +22,9 @@ from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.files import require_new_recording
-from deltalight.services.patient_writer import PatientWriter, reason
 from deltalight.services.raw_frames import RAW_STREAMS, RawFrameAssembler
 from deltalight.services.relit_pictures import RelitPictures
+from deltalight.services.retrying_writer import RetryingWriter, reason
 from deltalight.services.stream_queue import StreamQueue
 
 SCENE_TIMEOUT_S = 5.0
@@ -130,7 +130,7 @@ class Recorder:
         self._following = Lock()
         self._assembler = RawFrameAssembler(job.node)
         self._files = ExitStack()
-        self._writer: PatientWriter | None = None
+        self._writer: RetryingWriter | None = None
         self._relit = RelitPictures(self._write_composite)
         self._last_ns, self._idle_polls = -1, 0
         self._silent_since_s = self._checked_s = time.monotonic()
@@ -259,14 +259,14 @@ class Recorder:
         self._writer.add_composite(timestamp_ns, picture)
         self._count_written(self._writer)
 
-    def _count_written(self, writer: PatientWriter) -> None:
+    def _count_written(self, writer: RetryingWriter) -> None:
         status = self.status
         status.frames, status.composites, status.unkept = writer.frames, writer.composites, writer.unkept
 
     def _is_refused(self) -> bool:
         return self._writer is not None and self._writer.is_refused
 
-    def _end(self, writer: PatientWriter) -> None:
+    def _end(self, writer: RetryingWriter) -> None:
         try:
             writer.end()
         finally:
@@ -276,7 +276,7 @@ class Recorder:
         self.status.disk = sentence
         self._notice(sentence)
 
-    def _begin(self, frame: SensorFrame) -> PatientWriter:
+    def _begin(self, frame: SensorFrame) -> RetryingWriter:
         job, depth = self._job, frame.depth
         if depth is not None and depth.camera != frame.camera and _lacks_place(job.extrinsics):
             self._notice(
@@ -287,7 +287,7 @@ class Recorder:
         writer = RecordingWriter(
             job.out, board=self._assembler.board, extrinsics=job.extrinsics, scene=job.scene
         )
-        return PatientWriter(self._files.enter_context(writer), self._tell_of_disk)
+        return RetryingWriter(self._files.enter_context(writer), self._tell_of_disk)
 
     def _is_enough(self) -> bool:
         job, status = self._job, self.status

@@ -29,13 +29,13 @@ RECEIVE_TIMEOUT_S = 0.5
 ANSWER_TIMEOUT_S = 1.0
 LATE_AFTER_S = 3.0  # reports come each second; whoever is late is asked
 REMEMBERED_GAPS = 10
-WORKING_SHARE = 0.02  # of a core; waiting threads take less
+WORKING_LOAD = 0.02  # of a core; waiting threads take less
 DEAF_ON_GPU_S = 60.0  # the driver links the largest shader within some seconds
 LONGEST_FRAME_ON_GPU_S = 300.0
 
 
 @dataclass(frozen=True)
-class Patience:
+class WatchdogTimeouts:
     """How long signs of life may stay away, in seconds.
 
     Without any sign: `times` the longest time between the last reports, at least `floor_s`; `start_s` before the
@@ -49,7 +49,7 @@ class Patience:
     deaf_s: float = 300.0
     longest_frame_s: float = 1800.0
 
-    def on_gpu(self) -> "Patience":
+    def on_gpu(self) -> "WatchdogTimeouts":
         """Return that for a GPU, which needs no minutes for a kernel or a frame; its driver spins where it hangs."""
         return replace(self, deaf_s=DEAF_ON_GPU_S, longest_frame_s=LONGEST_FRAME_ON_GPU_S)
 
@@ -58,7 +58,7 @@ class Patience:
 class Heartbeat:
     """When a process last gave which sign of life; all times are seconds of one clock."""
 
-    patience: Patience
+    timeouts: WatchdogTimeouts
     started_s: float
     reported_s: float | None = None
     answered_s: float = field(init=False)
@@ -85,16 +85,16 @@ class Heartbeat:
         silent_s = min(unanswered_s, now_s - self.worked_s)
         if silent_s > self._allowed_s():
             return f"gave no sign of life for {silent_s:.0f} s"
-        if unanswered_s > max(self.patience.deaf_s, self._allowed_s()):
+        if unanswered_s > max(self.timeouts.deaf_s, self._allowed_s()):
             return f"neither reported nor answered for {unanswered_s:.0f} s"
-        if unreported_s > max(self.patience.longest_frame_s, self._allowed_s()):
+        if unreported_s > max(self.timeouts.longest_frame_s, self._allowed_s()):
             return f"finished nothing for {unreported_s:.0f} s"
         return None
 
     def _allowed_s(self) -> float:
         if self.reported_s is None:
-            return self.patience.start_s
-        return max(self.patience.floor_s, self.patience.times * max(self._gaps_s, default=0.0))
+            return self.timeouts.start_s
+        return max(self.timeouts.floor_s, self.timeouts.times * max(self._gaps_s, default=0.0))
 
 
 class Watchdog:
@@ -110,9 +110,9 @@ class Watchdog:
         reports: str,
         control: str,
         keys: Keys | None = None,
-        patience: Patience | None = None,
+        timeouts: WatchdogTimeouts | None = None,
     ) -> None:
-        self._heartbeat = Heartbeat(patience or Patience(), time.monotonic())
+        self._heartbeat = Heartbeat(timeouts or WatchdogTimeouts(), time.monotonic())
         self._use = ProcessorUse(process_id)
         self._client = RequestClient(control, keys=keys)
         self._receiver = Receiver([reports], ["stats"], keys=keys)
@@ -161,7 +161,7 @@ class Watchdog:
         answer = self._answer("stats")
         self._knows_device = answer is not None
         if answer is not None and answer.get("is_software") is False:
-            self._heartbeat.patience = self._heartbeat.patience.on_gpu()
+            self._heartbeat.timeouts = self._heartbeat.timeouts.on_gpu()
 
     def _answer(self, op: str) -> dict[str, Any] | None:
         request = ControlRequest(node="supervisor", id=uuid.uuid4().hex, op=op)
@@ -182,7 +182,7 @@ class ProcessorUse:
     def grew(self) -> bool:
         """Whether it worked since the last look, or since the start."""
         used_s, now_s = processor_time_s(self._process_id), time.monotonic()
-        worked = used_s - self._used_s > WORKING_SHARE * (now_s - self._looked_s)
+        worked = used_s - self._used_s > WORKING_LOAD * (now_s - self._looked_s)
         self._used_s, self._looked_s = used_s, now_s
         return worked
 

@@ -27,7 +27,7 @@ from deltalight.benchmarks.ground_truth.energy_keeping import (
 )
 from deltalight.benchmarks.ground_truth.energy_keeping_bsdf import (
     GlossySurface,
-    LobeShares,
+    LobeEnergy,
     bsdf_class,
     polynomial,
     polynomial_place,
@@ -105,7 +105,7 @@ class CoatedSurface:
     base: GlossySurface
     amount: float
     alpha: float
-    shares: LobeShares
+    energy: LobeEnergy
     facets: Numbers
     sheen: Float64[np.ndarray, "3"]
     sheen_alpha: float
@@ -118,7 +118,7 @@ class CoatedSurface:
             GlossySurface.of(props),
             float(props["coat"]),
             alpha,
-            LobeShares(lobe_albedo(alpha, (COAT_F0,) * 3, 0.0)),
+            LobeEnergy(lobe_albedo(alpha, (COAT_F0,) * 3, 0.0)),
             mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True),
             np.array(props["sheen"], np.float64).ravel(),
             max(float(props["sheen_roughness"]) ** 2, LEAST_SHEEN_ALPHA),
@@ -149,7 +149,7 @@ class CoatedSurface:
         return COAT_SAMPLES if self.amount > 0 else 0.0
 
     def _coat_albedo(self, cosine: Numbers) -> Numbers:
-        return self.amount * (1 - self.shares.below(cosine))
+        return self.amount * (1 - self.energy.below(cosine))
 
     def eval_pdf(self, si: Numbers, wo: Numbers, active: Numbers) -> Numbers:
         """Return the BSDF times cosine, and the density of `sample` per solid angle."""
@@ -159,8 +159,8 @@ class CoatedSurface:
         cosine_i, cosine_o = dr.maximum(cosine_i, 1e-6), dr.maximum(cosine_o, 1e-6)
         normal = dr.normalize(si.wi + wo)
         facing = dr.maximum(dr.dot(si.wi, normal), 1e-6)
-        matt = self.base.albedo(si, seen) * self.base.shares.base(cosine_i, cosine_o) / dr.pi * cosine_o
-        mean = self.amount * float(self.shares.lobe.mean[0])
+        matt = self.base.albedo(si, seen) * self.base.energy.base(cosine_i, cosine_o) / dr.pi * cosine_o
+        mean = self.amount * float(self.energy.lobe.mean[0])
         dimmed = (1 - self._coat_albedo(cosine_o)) / (1 - mean)
         left = 1 - self._coat_albedo(cosine_i)
         fibres = dr.clip(polynomial(sheen_albedo(self.sheen_alpha), polynomial_place(cosine_i)), 0, 1)
@@ -173,7 +173,7 @@ class CoatedSurface:
 
     def _coat(self, normal: Numbers, facing: Numbers, cosine_i: Numbers, cosine_o: Numbers) -> Numbers:
         strength = self.facets.eval(normal) * smith_visibility(cosine_i, cosine_o, self.alpha)
-        return strength * fresnel(facing, COAT_F0, 0.0) + self.shares.gaps(cosine_i, cosine_o)
+        return strength * fresnel(facing, COAT_F0, 0.0) + self.energy.gaps(cosine_i, cosine_o)
 
     def _sheen(self, normal: Numbers, cosine_i: Numbers, cosine_o: Numbers) -> Numbers:
         facing = dr.clip(mi.Frame3f.cos_theta(normal), 0, 1 - 1e-6)

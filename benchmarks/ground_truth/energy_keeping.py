@@ -59,11 +59,11 @@ def smith_visibility(cosine_i: Numbers, cosine_o: Numbers, alpha: float) -> Numb
 
 @dataclass(frozen=True, eq=False)
 class LobeAlbedo:
-    """Share of the light from one direction that a GGX lobe reflects: Chebyshev polynomials in 2 sqrt(cosine) - 1.
+    """Fraction of the light from one direction that a GGX lobe reflects: Chebyshev polynomials in 2 sqrt(cosine) - 1.
 
     `single` (R G B) is that of one reflection, `whole` as if microfacets reflected all. `further` (R G B) is the part
     of what one reflection leaves between them, `1 - whole`, that more reflections let out. `mean` (R G B) is the
-    share of light from everywhere that all reflections let out, `mean_whole` that of `whole`.
+    fraction of light from everywhere that all reflections let out, `mean_whole` that of `whole`.
     """
 
     single: Float64[np.ndarray, "3 k"]

@@ -21,7 +21,7 @@ from deltalight.benchmarks.ground_truth.parts import Triple
 
 
 @dataclass(frozen=True, eq=False)
-class LobeShares:
+class LobeEnergy:
     """How a GGX lobe divides the light from a direction (its cosine): what it reflects at once, later, or never."""
 
     lobe: LobeAlbedo
@@ -63,7 +63,7 @@ class GlossySurface:
     metallic: float
     alpha: float
     f0: Triple
-    shares: LobeShares
+    energy: LobeEnergy
     facets: Numbers
 
     @classmethod
@@ -73,7 +73,7 @@ class GlossySurface:
         alpha = max(float(props["roughness"]) ** 2, LEAST_ALPHA)
         f0 = _normal_reflectance(base, metallic, 0.08 * float(props["specular"]))
         facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
-        return cls(base, metallic, alpha, f0, LobeShares(lobe_albedo(alpha, f0, metallic)), facets)
+        return cls(base, metallic, alpha, f0, LobeEnergy(lobe_albedo(alpha, f0, metallic)), facets)
 
     @property
     def color(self) -> Numbers:
@@ -86,7 +86,7 @@ class GlossySurface:
 
     def sample(self, si: Numbers, sample1: Numbers, sample2: Numbers, active: Numbers) -> Numbers:
         """Draw a direction, of the lobe or of the base."""
-        is_glossy = sample1 < self._glossy_share(si, active)
+        is_glossy = sample1 < self._glossy_probability(si, active)
         normal, _ = self.facets.sample(si.wi, sample2)
         even = mi.warp.square_to_cosine_hemisphere(sample2)
         glossy, diffuse = (int(mi.BSDFFlags[f"{name}Reflection"]) for name in ("Glossy", "Diffuse"))
@@ -105,11 +105,11 @@ class GlossySurface:
         cosine_i, cosine_o = dr.maximum(cosine_i, 1e-6), dr.maximum(cosine_o, 1e-6)
         normal = dr.normalize(si.wi + wo)
         facing = dr.maximum(dr.dot(si.wi, normal), 1e-6)
-        even = self.shares.gaps(cosine_i, cosine_o)
-        even += self.albedo(si, seen) * self.shares.base(cosine_i, cosine_o) / dr.pi
+        even = self.energy.gaps(cosine_i, cosine_o)
+        even += self.albedo(si, seen) * self.energy.base(cosine_i, cosine_o) / dr.pi
         value = cosine_o * (self._glossy(normal, facing, cosine_i, cosine_o) + even)
-        share = self._glossy_share(si, seen)
-        pdf = share * self.facets.pdf(si.wi, normal) / (4 * facing) + (1 - share) * cosine_o / dr.pi
+        glossy = self._glossy_probability(si, seen)
+        pdf = glossy * self.facets.pdf(si.wi, normal) / (4 * facing) + (1 - glossy) * cosine_o / dr.pi
         return dr.select(seen, value, 0), dr.select(seen, pdf, 0)
 
     def _glossy(self, normal: Numbers, facing: Numbers, cosine_i: Numbers, cosine_o: Numbers) -> Numbers:
@@ -117,12 +117,12 @@ class GlossySurface:
         strength = self.facets.eval(normal) * smith_visibility(cosine_i, cosine_o, self.alpha)
         return strength * mi.Color3f(*[fresnel(facing, each, self.metallic) for each in self.f0])
 
-    def _glossy_share(self, si: Numbers, active: Numbers) -> Numbers:
-        """Return the probability of sampling the lobe: its share of what is reflected."""
+    def _glossy_probability(self, si: Numbers, active: Numbers) -> Numbers:
+        """Return the probability of sampling the lobe: its fraction of what is reflected."""
         cosine = mi.Frame3f.cos_theta(si.wi)
-        gaps = self.shares.held(cosine) * self.shares.further
-        below = self.albedo(si, active) * self.shares.below(cosine)
-        lobe, rest = dr.mean(self.shares.single(cosine)), dr.mean(gaps + below)
+        gaps = self.energy.held(cosine) * self.energy.further
+        below = self.albedo(si, active) * self.energy.below(cosine)
+        lobe, rest = dr.mean(self.energy.single(cosine)), dr.mean(gaps + below)
         return lobe / dr.maximum(lobe + rest, 1e-6)
 
 

@@ -37,10 +37,10 @@ AGREEMENT = (
     Column("changed_virtual_psnr_db", "virtual PSNR dB", 2, "the objects themselves"),
 )
 LIGHT_AND_TIME = (
-    Column("darkening", "darker", 2, "light taken away on real surfaces, share of truth's; 1 is right"),
-    Column("brightening", "brighter", 2, "light added on real surfaces, share of truth's; 1 is right"),
+    Column("darkening", "darker", 2, "light taken away on real surfaces, ratio to truth's; 1 is right"),
+    Column("brightening", "brighter", 2, "light added on real surfaces, ratio to truth's; 1 is right"),
     Column(
-        "virtual_radiance", "objects' light", 2, "mean radiance of the objects, share of truth's; 1 is right"
+        "virtual_radiance", "objects' light", 2, "mean radiance of the objects, ratio to truth's; 1 is right"
     ),
     Column("penumbra_error", "penumbra error", 2, "width of shadow edges, mean relative error; 0 is right"),
     Column(

@@ -47,8 +47,8 @@ EVEN = FoundLights((), np.ones(3), 0.0)
 class BinResult:
     """Figures of one camera, and pictures for people who look.
 
-    `kept`: share of the things' pixels that stay the camera's over the sheet; `covered`: share of the bare floor's
-    that show it. PSNR of the floor near the things, dB, without relighting and with it.
+    `kept`: fraction of the things' pixels that stay the camera's over the sheet; `covered`: of the bare floor's that
+    show it. PSNR of the floor near the things, dB, without relighting and with it.
     """
 
     camera: int

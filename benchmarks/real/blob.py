@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from scipy.optimize import minimize
 
 from deltalight.benchmarks.real.cuboid import Cuboid
-from deltalight.benchmarks.real.light_fit import Points, Shares
+from deltalight.benchmarks.real.light_fit import Fractions, Points
 
 FIRST_STEPS = np.array([0.3, 0.3, 0.5, 0.3])
 START = np.array([0.0, 0.0, 1.0, 0.3])
@@ -26,13 +26,13 @@ class Blob:
     spread: float
     darkness: Float64[np.ndarray, " 3"]
 
-    def ratios(self, points: Points, cuboid: Cuboid) -> Shares:
-        """Return what share of its light each point of the table keeps, R G B."""
+    def ratios(self, points: Points, cuboid: Cuboid) -> Fractions:
+        """Return what fraction of its light each point of the table keeps, R G B."""
         shape = _shape(np.array([*self.offset, self.widths, self.spread]), points, cuboid)
         return np.asarray(1 - shape[:, None] * self.darkness)
 
 
-def fit_blob(points: Points, ratios: Shares, cuboid: Cuboid) -> Blob:
+def fit_blob(points: Points, ratios: Fractions, cuboid: Cuboid) -> Blob:
     """Return the blob that comes nearest to a picture's ratios; arguments as for `fit_lights`."""
 
     def cost(parameters: Float64[np.ndarray, " 4"]) -> float:
@@ -57,5 +57,5 @@ def _shape(
     return np.asarray(np.exp(-0.5 * ((own / sigma) ** 2).sum(axis=1)))
 
 
-def _darkness(shape: Float64[np.ndarray, " n"], ratios: Shares) -> Float64[np.ndarray, " 3"]:
+def _darkness(shape: Float64[np.ndarray, " n"], ratios: Fractions) -> Float64[np.ndarray, " 3"]:
     return np.asarray(np.clip(shape @ (1 - ratios) / max(float(shape @ shape), 1e-12), 0, 1))

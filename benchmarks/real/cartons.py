@@ -30,7 +30,7 @@ SIZE, FOCAL_PX = (640, 480), 525.0
 """Of the range camera's maker: with it, and with no other focal length, the ranges of the table fit a plane."""
 PLATE = "plate_*.png"
 TABLE_ROWS = 0.4
-"""The table lies below this share of the picture; above is what stands behind it."""
+"""The table lies below this fraction of the picture; above is what stands behind it."""
 RIM_PX = 5
 """Colour bleeds so far over a thing's edge."""
 NEAR_HEIGHTS, FAR_HEIGHTS = 3.0, 1.5

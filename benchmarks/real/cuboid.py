@@ -12,8 +12,8 @@ from deltalight.benchmarks.real.ranges import Plane, Points
 from deltalight.protocol.errors import DeltalightError
 
 SUB_PIXEL_BITS = 4
-TOP_SHARE = 0.8
-"""Points above this share of the height are taken to lie on the top face."""
+TOP_FRACTION = 0.8
+"""Points above this fraction of the height are taken to lie on the top face."""
 MARGIN_PX = 16
 TURNS_DEG = (0.0, 30.0, 60.0)
 STEPS = np.array([0.01, 0.01, np.radians(8), 0.01, 0.01, 0.01])
@@ -100,7 +100,7 @@ def fit_cuboid(observed: Observed, plane: Plane) -> Cuboid:
 def rough_cuboid(points: Float64[np.ndarray, "n 3"]) -> Cuboid:
     """Return the cuboid over the smallest rectangle around the points of the top, m."""
     height = float(np.percentile(points[:, 2], 95))
-    top = points[points[:, 2] > TOP_SHARE * height, :2]
+    top = points[points[:, 2] > TOP_FRACTION * height, :2]
     (x, y), edges, degrees = cv2.minAreaRect(top.astype(np.float32))
     width, depth = (max(float(edge), 0.005) for edge in edges)
     return Cuboid(float(x), float(y), float(np.radians(degrees)), (width, depth, height))
@@ -149,7 +149,7 @@ class _Search:
         return cls(plane, window, low.astype(np.float64), camera, points - camera)
 
     def cost(self, parameters: Float64[np.ndarray, " 6"]) -> float:
-        """Return the share of pixels that are wrong, and a little of how far the surface is off."""
+        """Return the fraction of pixels that are wrong, and a little of how far the surface is off."""
         cuboid = _cuboid(parameters)
         drawn = np.zeros(self.window.shape, np.uint8)
         _draw(drawn, cuboid, self.plane, self.corner)

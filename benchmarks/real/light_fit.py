@@ -1,11 +1,11 @@
 """Lights from the shadows of one cuboid on a table: distant discs and even light, found greedily.
 
-Light k gives share w_k of the irradiance that the bare table receives, even light the rest. With O_k(x) the part of
-light k that the cuboid hides from x, and A(x) the part of even light, the table keeps
+Light k gives the fraction w_k of the irradiance that the bare table receives, even light the rest. With O_k(x) the
+part of light k that the cuboid hides from x, and A(x) the part of even light, the table keeps
 
     E(x) / E_bare = 1 - sum_k w_k O_k(x) - (1 - sum_k w_k) A(x)
 
-Light that the cuboid sends back is left out. Shares are found by channel, non-negative and at most 1 in sum.
+Light that the cuboid sends back is left out. Fractions are found by channel, non-negative and at most 1 in sum.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from deltalight.benchmarks.real.cuboid import Cuboid
 
 MOST_LIGHTS = 6
 LEAST_GAIN = 0.01
-"""A further light must explain this share of the squared error that is left."""
+"""A further light must explain this fraction of the squared error that is left."""
 RADII = np.radians((4.0, 12.0))
 DISC_SAMPLES, SKY_SAMPLES, CANDIDATES = 32, 512, 200
 LOWEST = np.radians(10.0)
@@ -32,31 +32,32 @@ GOLDEN = np.pi * (3 - np.sqrt(5))
 
 Direction = Float64[np.ndarray, " 3"]
 Points = Float64[np.ndarray, "n 3"]
-Shares = Float64[np.ndarray, "n 3"]
+Fractions = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class FoundLight:
-    """A distant light: unit vector towards it, angular radius (rad), share of the bare table's irradiance, R G B."""
+    """Distant light: unit vector towards it, angular radius (rad), fraction of the bare table's irradiance, R G B."""
 
     towards: Direction
     radius: float
-    share: Float64[np.ndarray, " 3"]
+    fraction: Float64[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class FoundLights:
-    """What lights the table; `even` is the share of even light, R G B. `rms` of the ratios that were fitted."""
+    """What lights the table; `even` is the fraction of even light, R G B. `rms` of the ratios that were fitted."""
 
     lights: Sequence[FoundLight]
     even: Float64[np.ndarray, " 3"]
     rms: float
 
-    def ratios(self, points: Points, cuboid: Cuboid) -> Shares:
-        """Return what share of its light each point of the table keeps beside a cuboid, R G B."""
+    def ratios(self, points: Points, cuboid: Cuboid) -> Fractions:
+        """Return what fraction of its light each point of the table keeps beside a cuboid, R G B."""
         hidden = hidden_sky(points, cuboid)[:, None] * self.even
         for light in self.lights:
-            hidden = hidden + hidden_light(points, cuboid, light.towards, light.radius)[:, None] * light.share
+            hidden_part = hidden_light(points, cuboid, light.towards, light.radius)
+            hidden = hidden + hidden_part[:, None] * light.fraction
         return np.asarray(1 - hidden)
 
 
@@ -110,26 +111,26 @@ class _Disc:
 @dataclass(frozen=True, eq=False)
 class _Problem:
     points: Points
-    ratios: Shares
+    ratios: Fractions
     cuboid: Cuboid
     sky: Float64[np.ndarray, " n"]
 
     def disc(self, towards: Direction, radius: float) -> _Disc:
         return _Disc(towards, radius, hidden_light(self.points, self.cuboid, towards, radius))
 
-    def solve(self, discs: Sequence[_Disc]) -> tuple[Shares, float]:
-        """Return each disc's shares, R G B, and the sum of squared errors."""
+    def solve(self, discs: Sequence[_Disc]) -> tuple[Fractions, float]:
+        """Return each disc's fractions, R G B, and the sum of squared errors."""
         if not discs:
             return np.zeros((0, 3)), float(((1 - self.ratios - self.sky[:, None]) ** 2).sum())
         columns = np.stack([disc.hidden - self.sky for disc in discs], axis=1)
         upper, rows = np.linalg.qr(columns)
-        shares, error = np.zeros((len(discs), 3)), 0.0
+        fractions, error = np.zeros((len(discs), 3)), 0.0
         for channel in range(3):
             wanted = 1 - self.ratios[:, channel] - self.sky
             inside = upper.T @ wanted
-            shares[:, channel], rest = _at_most_one(rows, inside)
+            fractions[:, channel], rest = _at_most_one(rows, inside)
             error += rest**2 + float(wanted @ wanted - inside @ inside)
-        return shares, error
+        return fractions, error
 
 
 def _at_most_one(
@@ -143,28 +144,28 @@ def _at_most_one(
     return found[:-1], float(rest)
 
 
-def fit_lights(points: Points, ratios: Shares, cuboid: Cuboid) -> FoundLights:
-    """Return the lights under which a cuboid leaves the table these shares of its light.
+def fit_lights(points: Points, ratios: Fractions, cuboid: Cuboid) -> FoundLights:
+    """Return the lights under which a cuboid leaves the table these fractions of its light.
 
     `points` (n, 3) lie on the table, m; `ratios` (n, 3) are picture over empty table, linear R G B.
     """
     problem = _Problem(points, ratios, cuboid, hidden_sky(points, cuboid))
     candidates = [problem.disc(towards, radius) for towards in _directions() for radius in RADII]
     discs: list[_Disc] = []
-    shares, error = problem.solve(discs)
+    fractions, error = problem.solve(discs)
     while len(discs) < MOST_LIGHTS:
         more = min(([*discs, each] for each in candidates), key=lambda tried: problem.solve(tried)[1])
         more = _refined(problem, more)
-        new_shares, new_error = problem.solve(more)
+        new_fractions, new_error = problem.solve(more)
         if new_error > (1 - LEAST_GAIN) * error:
             break
-        discs, shares, error = more, new_shares, new_error
+        discs, fractions, error = more, new_fractions, new_error
     lights = [
-        FoundLight(disc.towards, disc.radius, share)
-        for disc, share in zip(discs, shares, strict=True)
-        if share.any()
+        FoundLight(disc.towards, disc.radius, fraction)
+        for disc, fraction in zip(discs, fractions, strict=True)
+        if fraction.any()
     ]
-    return FoundLights(lights, np.maximum(1 - shares.sum(axis=0), 0), float(np.sqrt(error / ratios.size)))
+    return FoundLights(lights, np.maximum(1 - fractions.sum(axis=0), 0), float(np.sqrt(error / ratios.size)))
 
 
 def _directions() -> Points:

@@ -56,7 +56,7 @@ def _manual_lights(
         DirectionalLight(
             direction=_triple(-light.towards),
             irradiance=1,
-            color_linear=_triple(light.share * irradiance / light.towards[2]),
+            color_linear=_triple(light.fraction * irradiance / light.towards[2]),
             angular_radius_deg=float(np.degrees(light.radius)),
         )
         for light in lights.lights

@@ -58,11 +58,11 @@ def _light_rows(cartons: CartonResult) -> list[list[str]]:
         [
             str(number),
             *(f"{value:.0f}" for value in _angles_deg(light)),
-            *(f"{share:.2f}" for share in light.share),
+            *(f"{fraction:.2f}" for fraction in light.fraction),
         ]
         for number, light in enumerate(cartons.lights.lights, 1)
     ]
-    return [*discs, ["even", *3 * [MISSING], *(f"{share:.2f}" for share in cartons.lights.even)]]
+    return [*discs, ["even", *3 * [MISSING], *(f"{fraction:.2f}" for fraction in cartons.lights.even)]]
 
 
 def _angles_deg(light: FoundLight) -> tuple[float, float, float]:
@@ -100,7 +100,7 @@ def as_data(cartons: CartonResult, bins: list[BinResult]) -> dict[str, Any]:
     lights = [
         {
             **dict(zip(("azimuth_deg", "elevation_deg", "radius_deg"), _angles_deg(each), strict=True)),
-            "share": each.share.tolist(),
+            "share": each.fraction.tolist(),
         }
         for each in cartons.lights.lights
     ]

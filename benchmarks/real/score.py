@@ -18,7 +18,7 @@ CHANGE_CODES = 4.0
 
 @dataclass(frozen=True)
 class Figures:
-    """PSNR over the table and over its changed part, dB; light taken and added, shares of the photograph's."""
+    """PSNR over the table and over its changed part, dB; light taken and added, as fractions of the photograph's."""
 
     table_psnr_db: float
     changed_psnr_db: float

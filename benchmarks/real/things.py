@@ -20,7 +20,7 @@ BORDER_PX = 4
 REACH_PX = 20
 """How far colour may extend a thing beyond its depth, whose edges are some pixels off."""
 DARKER = 0.75
-"""Share of the empty table's light, in the darkest channel, below which a pixel near a thing may belong to it."""
+"""Fraction of the empty table's light, in the darkest channel, below which a pixel near a thing may belong to it."""
 CUTS = 5
 
 

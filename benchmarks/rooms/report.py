@@ -37,8 +37,8 @@ def all_figures(acts: Mapping[str, Mapping[str, Act]], records: Sequence[ActReco
             ("epoch newer", [each.epoch_after > each.epoch_before for each in own]),
             ("taken over by a spare", [each.by_spare for each in own if of_placer[each.act].is_warm]),
         ):
-            shares = [float(value) for value in values]
-            figures.append(worst(f"{placer}: {what}", "after each, 1 = yes", shares, ALL, "", smallest=True))
+            answers = [float(value) for value in values]
+            figures.append(worst(f"{placer}: {what}", "after each, 1 = yes", answers, ALL, "", smallest=True))
     return [each for each in figures if each is not None]
 
 

@@ -189,5 +189,5 @@ async def _quick(socket: ClientConnection) -> None:
         await socket.send("ack")
 
 
-def _percentile(values: Sequence[float], share: float) -> float | None:
-    return float(np.percentile(values, share)) if values else None
+def _percentile(values: Sequence[float], percent: float) -> float | None:
+    return float(np.percentile(values, percent)) if values else None

@@ -27,9 +27,9 @@ MOST_LOSSES = 8  # of one segment: the dice would allow more once in 15 000
 
 @dataclass(frozen=True)
 class Shape:
-    """What a link does to data: bits a second, seconds of delay and its jitter, share of segments that are lost.
+    """What a link does to data: bits a second, seconds of delay and its jitter, fraction of segments that are lost.
 
-    `overtaken` is the share of segments that take a way of twice the delay, so that later ones overtake them.
+    `overtaken` is the fraction of segments that take a way of twice the delay, so that later ones overtake them.
     """
 
     bits_per_s: float
@@ -74,9 +74,9 @@ class Schedule:
         self._left_s = max(self._left_s, self._free_s + way_s)
         return self._left_s
 
-    def _losses(self, share: float) -> int:
+    def _losses(self, probability: float) -> int:
         """Return how often a segment is lost before it arrives."""
-        return next((count for count in range(MOST_LOSSES) if self.dice.random() >= share), MOST_LOSSES)
+        return next((count for count in range(MOST_LOSSES) if self.dice.random() >= probability), MOST_LOSSES)
 
 
 def held_up_s(losses: int, shape: Shape) -> float:

@@ -8,7 +8,7 @@ from deltalight.benchmarks.soak.samples import processor_time_s
 from deltalight.benchmarks.soak.station import Station
 
 QUIET_S = 10.0  # longer than the server's spare waits for a calm document, and than it rests
-QUIET_SHARE = 0.05  # of a core
+QUIET_LOAD = 0.05  # of a core
 POLL_S = 0.5
 
 
@@ -25,7 +25,7 @@ class _Spare:
         while len(self.used) > 1 and self.used[1][0] <= now_s - QUIET_S:
             self.used.popleft()
         (since_s, before_s), (_, after_s) = self.used[0], self.used[-1]
-        return now_s - since_s >= QUIET_S and after_s - before_s < QUIET_SHARE * (now_s - since_s)
+        return now_s - since_s >= QUIET_S and after_s - before_s < QUIET_LOAD * (now_s - since_s)
 
 
 def wait_for_spare(station: Station, name: str, patience_s: float) -> float | None:

@@ -28,14 +28,14 @@ FRAME_NS = 10**9 // 15
 
 DRAG_STEPS = 24
 DRAG_RADIUS_M = 0.03
-LAMP_SHARES = (1.0, 0.7, 0.4, 0.1, 0.0, 0.3, 0.6, 0.9)
+LAMP_FACTORS = (1.0, 0.7, 0.4, 0.1, 0.0, 0.3, 0.6, 0.9)
 """Of a light's strength, frame by frame."""
 
 ARM_STEPS = 24
 ARM_REACH = (0.1, 0.6)
-"""Least and greatest reach, share of the picture's width."""
+"""Least and greatest reach, as a fraction of the picture's width."""
 ARM_RADIUS = 0.06
-"""Share of the picture's height."""
+"""Fraction of the picture's height."""
 ARM_DEPTH_M = (0.34, 0.42)
 """Where it enters and at its tip: nearer than everything in the demo's room."""
 ARM_RADIUS_M = 0.04
@@ -136,14 +136,14 @@ def arm_reaches(take: Take, scene: SceneDocument) -> Iterator[Step]:
 
 
 def _reach(step: int) -> float:
-    """Return how far the arm reaches, share of the width: evenly out and back."""
+    """Return how far the arm reaches, as a fraction of the width: evenly out and back."""
     out = 1 - abs(2 * step / ARM_STEPS - 1)
     least, greatest = ARM_REACH
     return least + (greatest - least) * out
 
 
 def with_arm(frame: ViewFrame, reach: float) -> ViewFrame:
-    """Paint a slanted capsule into a frame's colour and depth; `reach` is a share of the picture's width."""
+    """Paint a slanted capsule into a frame's colour and depth; `reach` is a fraction of the picture's width."""
     assert frame.depth is not None
     height, width = frame.color.shape[:2]
     entry = np.array([width, 0.9 * height])
@@ -172,15 +172,15 @@ def _on_capsule(
 def lamp_is_dimmed(take: Take, scene: SceneDocument) -> Iterator[Step]:
     """The first light that the scene declares is dimmed, off and on again."""
     first, *others = scene.lights.manual
-    for frame, share in zip(cycle(take.standing), cycle(LAMP_SHARES)):
-        lights = scene.lights.replaced(manual=[_dimmed(first, share), *others])
+    for frame, factor in zip(cycle(take.standing), cycle(LAMP_FACTORS)):
+        lights = scene.lights.replaced(manual=[_dimmed(first, factor), *others])
         yield Step(frame, scene.model_copy(update={"lights": lights}))
 
 
-def _dimmed(light: ManualLight, share: float) -> ManualLight:
+def _dimmed(light: ManualLight, factor: float) -> ManualLight:
     fields = type(light).model_fields
     strength = next(name for name in ("intensity", "irradiance", "radiance") if name in fields)
-    return light.replaced(**{strength: share * getattr(light, strength)})
+    return light.replaced(**{strength: factor * getattr(light, strength)})
 
 
 def nothing_moves(take: Take, scene: SceneDocument) -> Iterator[Step]:

@@ -28,7 +28,7 @@ class Spread(StrictModel):
 class StageFigures(StrictModel):
     """One stage, over the frames in which it ran.
 
-    `runs` is their share of all frames. `submit_ms` is what the CPU takes to issue it. `moved_bytes` are the sizes of
+    `runs` is their fraction of all. `submit_ms` is what the CPU takes to issue it. `moved_bytes` are the sizes of
     all that it reads and writes; None for what is no stage of the graph. `bench roofline` adds `flops` and
     `special_functions`, medians of what its shaders execute (`flop_weights`), and `arithmetic_floor_ms`, what both
     take at the machine's peak. `floor_ms` is that, or what moving the bytes takes if it is longer or the only one

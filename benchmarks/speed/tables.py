@@ -75,12 +75,12 @@ def _run_cells(stage: StageFigures) -> tuple[str, str, str]:
 
 
 def _arithmetic_cells(stage: StageFigures) -> tuple[str, str, str]:
-    """Return operations, the share of special functions among them, and what they take at the peak."""
+    """Return operations, the fraction of special functions among them, and what they take at the peak."""
     if stage.flops is None or stage.special_functions is None:
         return MISSING, MISSING, MISSING
     total = stage.flops + stage.special_functions
-    share = f"{stage.special_functions / total:.0%}" if total else MISSING
-    return f"{total / 1e6:.2f}", share, f"{stage.arithmetic_floor_ms:.3f}"
+    special = f"{stage.special_functions / total:.0%}" if total else MISSING
+    return f"{total / 1e6:.2f}", special, f"{stage.arithmetic_floor_ms:.3f}"
 
 
 def _both(spread: Spread, digits: int = 1) -> tuple[str, str]:

@@ -56,6 +56,9 @@ LAMP: dict[str, object] = {
 }
 POSE = ((1.0, 0.0, 0.0, 0.25), (0.0, -1.0, 0.0, -0.5), (0.0, 0.0, -1.0, 0.75), (0.0, 0.0, 0.0, 1.0))
 OTHER_POSE = ((1.0, 0.0, 0.0, 0.25), (0.0, -0.6, 0.8, -0.5), (0.0, -0.8, -0.6, 0.75), (0.0, 0.0, 0.0, 1.0))
+PIXELS = np.arange(24, dtype=np.uint8).reshape(2, 4, 3) * 10
+SHAPE = (2, 4, 3)
+RESPONSE = np.repeat(np.arange(256, dtype="<f4")[:, None] / np.float32(255), 3, axis=1)
 NODE, FRAME, CAPTURE_NS, OFFSET_NS, BOUND_NS = "desk", 7, 1_700_000_000_123_456_789, -1500, 800
 
 Example = tuple[str, Message, Sequence[bytes], Sequence[Sequence[float]]]
@@ -64,11 +67,15 @@ Example = tuple[str, Message, Sequence[bytes], Sequence[Sequence[float]]]
 def main() -> None:
     """Write every vector into the folder of this module."""
     examples = [
-        *_picture_examples(),
+        *_color_examples(),
+        *_fisheye_examples(),
+        *_composite_examples(),
         *_depth_examples(),
         *_radiance_examples(),
         *_lights_examples(),
-        *_small_examples(),
+        *_pose_examples(),
+        *_state_examples(),
+        *_command_examples(),
     ]
     for name, message, parts, values in examples:
         pieces = encode(message, parts)
@@ -91,38 +98,38 @@ def _stamps() -> dict[str, Any]:
     }
 
 
-def _picture_examples() -> Iterator[Example]:
-    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3) * 10
-    shape = (2, 4, 3)
-    response = np.repeat(np.arange(256, dtype="<f4")[:, None] / np.float32(255), 3, axis=1)
+def _color_examples() -> Iterator[Example]:
     yield (
         "color_raw",
         ColorMessage(
             node=NODE,
             **_stamps(),
             encoding="raw",
-            shape=shape,
+            shape=SHAPE,
             camera=CAMERA,
             has_response=True,
             exposure_s=0.01,
         ),
-        [pixels.tobytes(), response.tobytes()],
-        [pixels.ravel().tolist()],
+        [PIXELS.tobytes(), RESPONSE.tobytes()],
+        [PIXELS.ravel().tolist()],
     )
     yield (
         "color_jpeg",
-        ColorMessage(node=NODE, **_stamps(), encoding="jpeg", shape=shape, camera=CAMERA),
-        [encode_color(pixels)],
+        ColorMessage(node=NODE, **_stamps(), encoding="jpeg", shape=SHAPE, camera=CAMERA),
+        [encode_color(PIXELS)],
         [],
     )
-    bracket = [np.float32(exposure) * pixels for exposure in (0.5, 2.0)]
+
+
+def _fisheye_examples() -> Iterator[Example]:
+    bracket = [np.float32(exposure) * PIXELS for exposure in (0.5, 2.0)]
     yield (
         "fisheye_raw",
         FisheyeMessage(
             node=NODE,
             **_stamps(),
             encoding="raw",
-            shape=shape,
+            shape=SHAPE,
             dtype="float32",
             camera=FISHEYE,
             exposures_s=(0.005, 0.02),
@@ -133,18 +140,21 @@ def _picture_examples() -> Iterator[Example]:
     yield (
         "fisheye_coded_raw",
         FisheyeMessage(
-            node=NODE, **_stamps(), encoding="raw", shape=shape, camera=FISHEYE, has_response=True
+            node=NODE, **_stamps(), encoding="raw", shape=SHAPE, camera=FISHEYE, has_response=True
         ),
-        [pixels.tobytes(), response.tobytes()],
-        [pixels.ravel().tolist()],
+        [PIXELS.tobytes(), RESPONSE.tobytes()],
+        [PIXELS.ravel().tolist()],
     )
+
+
+def _composite_examples() -> Iterator[Example]:
     yield (
         "composite_raw",
         CompositeMessage(
             node="server",
             **_stamps(),
             encoding="raw",
-            shape=shape,
+            shape=SHAPE,
             status="ok",
             scene_id="4f0c2a9be1d37785",
             scene_revision=4,
@@ -160,8 +170,8 @@ def _picture_examples() -> Iterator[Example]:
             scale=0.5,
             others=(OtherPicture(view="rsm"),),
         ),
-        [pixels.tobytes(), pixels[::-1].tobytes()],
-        [pixels.ravel().tolist()],
+        [PIXELS.tobytes(), PIXELS[::-1].tobytes()],
+        [PIXELS.ravel().tolist()],
     )
 
 
@@ -186,7 +196,7 @@ def _depth_examples() -> Iterator[Example]:
 def _radiance_examples() -> Iterator[Example]:
     radiance = np.arange(48, dtype=np.float32).reshape(4, 4, 3) * np.float32(2.5)
     seen = np.arange(16, dtype=np.uint8).reshape(4, 4) % 3 > 0
-    picture = encode_color(np.arange(24, dtype=np.uint8).reshape(2, 4, 3) * 10)
+    picture = encode_color(PIXELS)
     encodings: tuple[Literal["raw", "blosc2"], ...] = ("raw", "blosc2")
     for encoding in encodings:
         message = RadianceMessage(
@@ -194,7 +204,7 @@ def _radiance_examples() -> Iterator[Example]:
             **_stamps(),
             encoding=encoding,
             size=4,
-            picture_shape=(2, 4, 3),
+            picture_shape=SHAPE,
             clipped_share=0.125,
             world_from_fisheye=POSE,
             camera=FISHEYE,
@@ -232,7 +242,7 @@ def _lights_examples() -> Iterator[Example]:
         yield f"lights_{encoding}", message, parts, [residual.ravel().tolist(), seen.ravel().tolist()]
 
 
-def _small_examples() -> Iterator[Example]:
+def _pose_examples() -> Iterator[Example]:
     pose = PoseMessage(
         node=NODE,
         **_stamps(),
@@ -246,6 +256,9 @@ def _small_examples() -> Iterator[Example]:
     yield "pose_no_board", PoseMessage(node=NODE, **_stamps(), status="no_board"), [], []
     lamps = (LampEntry(marker=40, world_from_marker=POSE), LampEntry(marker=41, world_from_marker=OTHER_POSE))
     yield "lamps", LampsMessage(node=NODE, **_stamps(), lamps=lamps), [], []
+
+
+def _state_examples() -> Iterator[Example]:
     cameras = CamerasMessage(
         node="server",
         capture_ns=CAPTURE_NS,
@@ -270,6 +283,9 @@ def _small_examples() -> Iterator[Example]:
         drops={"color.desk": 3},
     )
     yield "stats", stats, [], []
+
+
+def _command_examples() -> Iterator[Example]:
     request = ControlRequest(
         node="api",
         capture_ns=CAPTURE_NS,

@@ -67,7 +67,7 @@ class GpuMemoryError(DeltalightError):
 CompileWatcher = Callable[[str, Mapping[str, str]], None]
 
 
-class Program(Protocol):
+class SharedProgram(Protocol):
     """A linked program and the ids of what uses it."""
 
     users: set[int]
@@ -80,20 +80,20 @@ class SharedPrograms:
     """Linked programs by source: kernels of the same source share one, and the next ones find it again."""
 
     def __init__(self) -> None:
-        self._programs: dict[tuple[str, ...], Program] = {}  # the longest unused first
+        self._programs: dict[tuple[str, ...], SharedProgram] = {}  # the longest unused first
 
     def __len__(self) -> int:
         """Returns how many are linked."""
         return len(self._programs)
 
-    def take(self, user: object, source: tuple[str, ...], link: Callable[[], Program]) -> Program:
+    def take(self, user: object, source: tuple[str, ...], link: Callable[[], SharedProgram]) -> SharedProgram:
         """Returns the program of that source for `user`; `link` makes it where there is none."""
         program = self._programs.pop(source, None) or link()
         self._programs[source] = program
         program.users.add(id(user))
         return program
 
-    def give_back(self, user: object, program: Program) -> None:
+    def give_back(self, user: object, program: SharedProgram) -> None:
         """Takes back what `user` took; frees the oldest programs beyond SPARE_PROGRAMS that nobody uses."""
         program.users.discard(id(user))
         spare = [source for source, item in self._programs.items() if not item.users]

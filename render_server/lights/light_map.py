@@ -38,9 +38,9 @@ def _disc(
     cosine = directions @ arriving.to_light
     texel = np.sqrt(4 * np.pi) / len(directions)
     radius = max(float(arriving.angular_radius_rad), texel)
-    share = np.clip((radius - np.arccos(np.clip(cosine, -1, 1))) / texel + 0.5, 0, 1)
-    across = np.sum(share * solid_angles * np.maximum(cosine, 0))
-    return np.asarray((share / across)[..., None] * arriving.irradiance, np.float32)
+    coverage = np.clip((radius - np.arccos(np.clip(cosine, -1, 1))) / texel + 0.5, 0, 1)
+    across = np.sum(coverage * solid_angles * np.maximum(cosine, 0))
+    return np.asarray((coverage / across)[..., None] * arriving.irradiance, np.float32)
 
 
 def coefficients_around(

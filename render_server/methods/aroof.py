@@ -16,14 +16,14 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import light_stages
-from deltalight.render_server.methods.lighting import (
+from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
+from deltalight.render_server.methods.surface_shading import (
     Layers,
     MethodStages,
     ShadingOptions,
     SurfaceShading,
     shading_stages,
 )
-from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.occlusion_fields import (
     FieldTextures,

@@ -28,7 +28,14 @@ from deltalight.render_server.methods.light_maps import (
     object_lamps,
     shadow_receivers,
 )
-from deltalight.render_server.methods.lighting import (
+from deltalight.render_server.methods.method import (
+    RelightingMethod,
+    ResolvedSettings,
+    Setup,
+    march_defines,
+    resolve_joint_maps,
+)
+from deltalight.render_server.methods.surface_shading import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
     MethodStages,
@@ -36,13 +43,6 @@ from deltalight.render_server.methods.lighting import (
     SurfaceShading,
     shading_stages,
     surfel_scene,
-)
-from deltalight.render_server.methods.method import (
-    RelightingMethod,
-    ResolvedSettings,
-    Setup,
-    march_defines,
-    resolve_joint_maps,
 )
 from deltalight.render_server.methods.volume_placement import Placements, only_one, volume_placements
 from deltalight.render_server.methods.voxel_sets import FAR_SIZE, VoxelSet

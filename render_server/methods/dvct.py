@@ -14,19 +14,19 @@ from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels, dvct_paper
 from deltalight.render_server.methods.light_maps import bounced_later, light_stages
-from deltalight.render_server.methods.lighting import (
-    Layers,
-    MethodStages,
-    ShadingOptions,
-    SurfaceShading,
-    shading_stages,
-)
 from deltalight.render_server.methods.method import (
     RelightingMethod,
     ResolvedSettings,
     Setup,
     march_defines,
     resolve_voxel_cones,
+)
+from deltalight.render_server.methods.surface_shading import (
+    Layers,
+    MethodStages,
+    ShadingOptions,
+    SurfaceShading,
+    shading_stages,
 )
 from deltalight.render_server.methods.voxel_sets import (
     FAR_SIZE,

@@ -14,7 +14,9 @@ from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages
-from deltalight.render_server.methods.lighting import (
+from deltalight.render_server.methods.method import Setup
+from deltalight.render_server.methods.per_volume import PerVolume, VolumePool
+from deltalight.render_server.methods.surface_shading import (
     Layers,
     MethodStages,
     ShadingOptions,
@@ -22,8 +24,6 @@ from deltalight.render_server.methods.lighting import (
     shading_stages,
     surfel_scene,
 )
-from deltalight.render_server.methods.method import Setup
-from deltalight.render_server.methods.per_volume import PerVolume, VolumePool
 from deltalight.render_server.methods.volume_lights import VolumeLights, volume_light_stages
 from deltalight.render_server.methods.volume_placement import Placements
 from deltalight.render_server.methods.voxel_sets import VoxelSet, make_room, voxel_placements

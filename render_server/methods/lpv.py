@@ -17,17 +17,17 @@ from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages, object_extent
-from deltalight.render_server.methods.lighting import (
+from deltalight.render_server.methods.lpv_cells import cell_stages, release_held
+from deltalight.render_server.methods.lpv_memory import PrintedSizes, affordable_count, state_memory
+from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
+from deltalight.render_server.methods.per_volume import ForEachVolume, PerVolume, volume_pool
+from deltalight.render_server.methods.surface_shading import (
     Layers,
     MethodStages,
     ShadingOptions,
     SurfaceShading,
     shading_stages,
 )
-from deltalight.render_server.methods.lpv_cells import cell_stages, release_held
-from deltalight.render_server.methods.lpv_memory import PrintedSizes, affordable_count, state_memory
-from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
-from deltalight.render_server.methods.per_volume import ForEachVolume, PerVolume, volume_pool
 from deltalight.render_server.methods.volume_placement import SizeOf, outside_fractions, volume_placements
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers

@@ -14,7 +14,7 @@ from deltalight.protocol.scene_objects import SceneObject
 if TYPE_CHECKING:
     from deltalight.render_server.frame import FrameResources
     from deltalight.render_server.graph import Graph
-    from deltalight.render_server.methods.lighting import Layers
+    from deltalight.render_server.methods.surface_shading import Layers
     from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 
 Settings = TypeVar("Settings", bound=MethodSettings)
@@ -53,7 +53,7 @@ def resolve_voxel_cones(settings: VoxelConeSettings, defaults: ResolvedSettings)
     """Fills in the machine's defaults where the document says null, within the limits of the quality."""
     size = settings.volume_size or defaults.volume_size
     return ResolvedSettings(
-        max(int(settings.tier.volume_share * size / VOLUME_STEP) * VOLUME_STEP, min(size, LEAST_VOLUME)),
+        max(int(settings.tier.volume_scale * size / VOLUME_STEP) * VOLUME_STEP, min(size, LEAST_VOLUME)),
         settings.cone_scale or defaults.cone_scale,
         settings.rsm_size or defaults.rsm_size,
         settings.triangle_budget or defaults.triangle_budget,

@@ -17,7 +17,6 @@ from deltalight.render_server.methods.aroof import AROOF
 from deltalight.render_server.methods.differential import DIFFERENTIAL
 from deltalight.render_server.methods.dvct import DVCT
 from deltalight.render_server.methods.image_based import image_based_radiance
-from deltalight.render_server.methods.lighting import Layers
 from deltalight.render_server.methods.lpv import DLPV
 from deltalight.render_server.methods.method import (
     GPU_DEFAULTS,
@@ -27,6 +26,7 @@ from deltalight.render_server.methods.method import (
     Setup,
 )
 from deltalight.render_server.methods.precomputed_transfer import precomputed_radiance
+from deltalight.render_server.methods.surface_shading import Layers
 from deltalight.render_server.precomputation.light_transfers import ObjectTransfers, require_rigid_transfer
 from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 

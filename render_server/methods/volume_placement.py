@@ -159,10 +159,10 @@ def _volume_edges(groups: Sequence[ObjectExtent], gaps: Sequence[Sequence[float]
     """
     edges = [each.volume_edge for each in groups]
     for one, other in combinations(range(len(groups)), 2):
-        share = max(0.0, 1 - gaps[one][other])
-        if share > 0:
+        weight = max(0.0, 1 - gaps[one][other])
+        if weight > 0:
             joint = ObjectExtent.around([groups[one], groups[other]]).volume_edge
             for index in (one, other):
                 own = groups[index].volume_edge
-                edges[index] = max(edges[index], float(own + share * (joint - own)))
+                edges[index] = max(edges[index], float(own + weight * (joint - own)))
     return edges

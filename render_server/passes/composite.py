@@ -221,9 +221,9 @@ class Crossfade:
         self.code = texture_2d(gpu, size, 4, "u1")
         self._kernel = Kernel(gpu, "crossfade")
 
-    def run(self, before: moderngl.Texture, after: moderngl.Texture, share: float) -> None:
-        """Mixes two pictures' codes; `share` (0..1) is that of `after`."""
-        self._kernel.run(self.size, before=before, after=after, share=share, code_out=self.code)
+    def run(self, before: moderngl.Texture, after: moderngl.Texture, weight: float) -> None:
+        """Mixes two pictures' codes; `weight` (0..1) is that of `after`."""
+        self._kernel.run(self.size, before=before, after=after, weight=weight, code_out=self.code)
 
     def release(self) -> None:
         """Frees the GL objects."""

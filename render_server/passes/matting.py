@@ -52,31 +52,14 @@ class Matting:
         self._gpu.clear_start(self._band, LIST_HEADER_BYTES)
         if rectangle[2] <= 0 or rectangle[3] <= 0:
             return
-        own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}
         sight = SIGHT_PER_REACH * reach_px
         if self._mean is not None:
             met = self._rectangle_around(rectangle, sight)
             scene = {**scene, "linear_picture": self._mean.add(scene["linear_picture"], met)}
         self._find_nearest(scene, rectangle, sight, -(-reach_px // BLOCK))
-        self._band_kernel.run(
-            rectangle[2:],
-            scene,
-            own,
-            rectangle=rectangle,
-            nearest_depth=self._within_reach,
-            estimate_out=self._estimate,
-            Texels=self._band,
-        )
-        self._kernel.run(
-            (self._threads,),
-            scene,
-            own,
-            nearest_depth=self._within_reach,
-            estimate_out=self._estimate,
-            contrast_out=self._contrast,
-            Texels=self._band,
-            sight=float(sight),
-        )
+        own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}
+        self._list_band(scene, own, rectangle)
+        self._estimate_mattes(scene, own, sight)
         self._fusion.run(
             (self._threads,),
             scene,
@@ -99,6 +82,31 @@ class Matting:
             self._nearest_kernel.run(
                 blocks[2:], source=source, blocks=blocks, stride=stride, window=window, nearest_out=target
             )
+
+    def _list_band(self, scene: Bindings, own: Bindings, rectangle: Rectangle) -> None:
+        """Lists the pixels of objects whose matte is unknown."""
+        self._band_kernel.run(
+            rectangle[2:],
+            scene,
+            own,
+            rectangle=rectangle,
+            nearest_depth=self._within_reach,
+            estimate_out=self._estimate,
+            Texels=self._band,
+        )
+
+    def _estimate_mattes(self, scene: Bindings, own: Bindings, sight: int) -> None:
+        """Estimates which fraction of each listed pixel real things fill, by colours along rays of `sight` pixels."""
+        self._kernel.run(
+            (self._threads,),
+            scene,
+            own,
+            nearest_depth=self._within_reach,
+            estimate_out=self._estimate,
+            contrast_out=self._contrast,
+            Texels=self._band,
+            sight=float(sight),
+        )
 
     def _blocks_around(self, rectangle: Rectangle, margin: int) -> Rectangle:
         """Returns the blocks within `margin` pixels of a rectangle of pixels."""

@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 
 from deltalight.protocol.frames import ViewFrame, decode_lut, linear_color
 from deltalight.protocol.scene_output import Tone
-from deltalight.render_server.post_effects.tone import in_tone
+from deltalight.render_server.post_effects.tone import with_tone_curve
 
 WIDTHS = (0.01, 0.03, 0.09)
 """Of the picture's width: standard deviations of the three parts of equal light that scattered light spreads to."""
@@ -36,7 +36,7 @@ def _spread(change: Float32[np.ndarray, "h w 3"], sigma_px: float) -> Float32[np
     return change
 
 
-def bloomed(
+def with_bloom(
     color: UInt8[np.ndarray, "h w 3"],
     linear: Float32[np.ndarray, "h w 3"],
     coverage: Float32[np.ndarray, "h w"],
@@ -55,7 +55,7 @@ def bloomed(
     changed = differs.any(axis=2, keepdims=True) | (coverage[..., None] > 0)
     if not changed.any():
         return color
-    lut, scale = decode_lut(in_tone(frame, tone).response), np.float32(frame.exposure_scale)
+    lut, scale = decode_lut(with_tone_curve(frame, tone).response), np.float32(frame.exposure_scale)
     hidden = np.clip(coverage, 0, 1)[..., None]
     around = scattered(camera) / scattered(np.ones_like(camera))
     change = np.where(changed, linear - camera + hidden * (camera - around), 0).astype(np.float32)

@@ -39,7 +39,7 @@ from deltalight.render_server.post_effects.camera_mosaic import (
 from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
 from deltalight.render_server.post_effects.camera_sharpening import CameraSharpening, Sharpening, sharpened
 from deltalight.render_server.post_effects.camera_vignetting import PaperVignetting, Vignetting, vignetted
-from deltalight.render_server.post_effects.tone import in_tone
+from deltalight.render_server.post_effects.tone import with_tone_curve
 
 MOST_MEASURED = 8
 """Frames in which the lens's blur is measured."""
@@ -62,7 +62,7 @@ class FrameArtifacts:
 
     def under(self, tone: Tone) -> Self:
         """Returns what a picture gets that was made with a tone curve."""
-        return replace(self, frame=in_tone(self.frame, tone))
+        return replace(self, frame=with_tone_curve(self.frame, tone))
 
     def applied(
         self, color: Color, coverage: Coverage, depth_m: Float32[np.ndarray, "h w"] | None = None

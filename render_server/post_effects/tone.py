@@ -9,14 +9,14 @@ from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene_output import Tone
 
 
-def in_tone(frame: ViewFrame, tone: Tone) -> ViewFrame:
+def with_tone_curve(frame: ViewFrame, tone: Tone) -> ViewFrame:
     """Returns the frame with the response that relit pictures of it have, which may reach beyond sensor white."""
     if tone == "camera":
         return frame
-    return replace(frame, response=before_aces(decode_lut(frame.response)))
+    return replace(frame, response=inverse_aces(decode_lut(frame.response)))
 
 
-def before_aces(toned: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+def inverse_aces(toned: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
     """Returns what composite.comp.glsl's `aces` turns into these values, 0..1 (Narkowicz 2015); 7.2 into 1."""
     y = np.asarray(toned, np.float64)
     a, b = 2.51 - 2.43 * y, 0.03 - 0.59 * y

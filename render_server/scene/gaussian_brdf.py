@@ -12,7 +12,7 @@ MOST_LOBES = 4
 RISE_TERMS = 6  # Bernstein polynomials of degree 5, which Schlick's Fresnel term is
 COSINES = 16  # at which the shaders' table holds the lobes' albedo
 TABLE_TEXELS = 1 + MOST_LOBES * (1 + RISE_TERMS + COSINES)  # common/measured.glsl
-CONE_SHARE = 0.85  # of a lobe's energy, in the cone that stands for it (brdf.glsl, specular_half_angle)
+CONE_ENERGY = 0.85  # of a lobe's energy, in the cone that stands for it (brdf.glsl, specular_half_angle)
 _LEAST_COSINE = 0.01
 _SIDE = 48  # samples of a lobe's integral: squared
 # x^i of Bernstein polynomial j: row i, column j.
@@ -103,7 +103,7 @@ class GaussianBrdf:
     @property
     def half_angles(self) -> Float64[np.ndarray, " k"]:
         """Half-angle (rad) of the cone about the mirror direction that holds 85 % of each lobe."""
-        return np.minimum(2 * self.sigmas * math.sqrt(-2 * math.log(1 - CONE_SHARE)), 0.45 * np.pi)
+        return np.minimum(2 * self.sigmas * math.sqrt(-2 * math.log(1 - CONE_ENERGY)), 0.45 * np.pi)
 
     @property
     def roughness(self) -> float:
@@ -112,7 +112,9 @@ class GaussianBrdf:
         if not reflected.sum() > 0:
             return 1.0
         angle = float((reflected * self.half_angles).sum() / reflected.sum())
-        return float(np.clip(math.sqrt(math.tan(angle / 2) / math.sqrt(CONE_SHARE / (1 - CONE_SHARE))), 0, 1))
+        return float(
+            np.clip(math.sqrt(math.tan(angle / 2) / math.sqrt(CONE_ENERGY / (1 - CONE_ENERGY))), 0, 1)
+        )
 
     def scaled_to_conserve(self) -> "GaussianBrdf":
         """Returns it with every channel that would reflect more light than arrives scaled down to all of it."""

@@ -40,8 +40,9 @@ from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.frames import FrameReceiver, PairingSettings
-from deltalight.render_server.server.renderer import Renderer
-from deltalight.render_server.server.session import RenderedFrame, RenderSession, SourceInUse
+from deltalight.render_server.server.renderer_interface import Renderer
+from deltalight.render_server.server.session import RenderedFrame, RenderSession
+from deltalight.render_server.server.session_host import SessionHost, SessionIdentity, SourceInUse
 
 SHORT_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive
@@ -203,7 +204,7 @@ class Sender:
 
 
 class BuiltAhead(Protocol):
-    """What a process built while it was a spare (`ahead.Ahead`)."""
+    """What a process built while it was a spare (`standby.StandbyRenderer`)."""
 
     def take(
         self, settings: ServerSettings, scene: SceneDocument
@@ -268,7 +269,7 @@ def serve(
 ) -> None:
     """Opens the sockets around a renderer that shows `scene`, and serves until a `shutdown` command.
 
-    Renders in the calling thread. `count_objects` is as for `RenderSession`; `compile_watchers` are those of the
+    Renders in the calling thread. `count_objects` is as for `SessionHost`; `compile_watchers` are those of the
     renderer's context.
 
     Raises:
@@ -289,14 +290,14 @@ def serve(
             renderer,
             scene,
             pairing=settings.pairing,
-            name=settings.name,
-            epoch=settings.epoch,
-            renderer_name=renderer_name,
-            keep_scene=lambda kept: _keep(settings.session, kept),
+            identity=SessionIdentity(settings.name, settings.epoch, renderer_name),
+            host=SessionHost(
+                keep_scene=partial(_keep, settings.session),
+                mailbox_drops=partial(_drops, source, sender, replies),
+                use_source=partial(_use_source, source, sender),
+                count_objects=count_objects,
+            ),
             endpoints=len(source.endpoints),
-            use_source=partial(_use_source, source, sender),
-            count_objects=count_objects,
-            mailbox_drops=partial(_drops, source, sender, replies),
         )
         if compile_watchers is not None:
             compile_watchers.append(_Preparation(session, sender))

@@ -6,7 +6,7 @@ No sockets, no threads: process.py feeds it and sends its output; tests pass mes
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,8 +34,9 @@ from deltalight.render_server.gpu.context import is_software_renderer
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.cameras import RoomCameras, Taken
 from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceRequest
-from deltalight.render_server.server.renderer import Pending, Renderer
+from deltalight.render_server.server.renderer_interface import Pending, Renderer
 from deltalight.render_server.server.requests import PickRequest, RoomMeshRequest, WatchRequest
+from deltalight.render_server.server.session_host import SessionHost, SessionIdentity
 from deltalight.render_server.server.snapshot import SnapshotRequest, take_snapshot
 
 RATE_WINDOW_S = 5.0
@@ -73,18 +74,6 @@ class _Started:
     view: ShownView
 
 
-@dataclass(frozen=True)
-class SourceInUse:
-    """The endpoints being read, and whether they changed."""
-
-    endpoints: Sequence[str]
-    is_another: bool
-
-
-def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
-    raise DeltalightError("This render session cannot change its source; start it with other endpoints.")
-
-
 class RenderSession:
     """Holds one scene, its renderer and the frames that wait for it. Frames are rendered in the `watched` views, too.
 
@@ -97,14 +86,9 @@ class RenderSession:
         renderer: renders the frames.
         scene: the first scene.
         pairing: how frames of colour and depth, and of several cameras, are paired.
-        name: the render server's name.
-        epoch: orders the render servers of a room.
-        renderer_name: the device's, for statistics.
-        keep_scene: is called with every accepted scene, so that a restart can resume with it.
-        mailbox_drops: returns the number of messages that the receiver dropped, by topic.
+        identity: who the session says that it is.
+        host: what the process around the session does for it.
         endpoints: how many are read at first.
-        use_source: reads other endpoints (None: those configured).
-        count_objects: returns the number of objects on the GPU, by kind.
         clock_ns: the time.
     """
 
@@ -114,14 +98,9 @@ class RenderSession:
         scene: SceneDocument,
         *,
         pairing: PairingSettings | None = None,
-        name: str = "render-server",
-        epoch: int | None = None,
-        renderer_name: str = "",
-        keep_scene: Callable[[SceneDocument], None] = lambda _scene: None,
-        mailbox_drops: Callable[[], Mapping[str, int]] = dict,
+        identity: SessionIdentity | None = None,
+        host: SessionHost | None = None,
         endpoints: int = 1,
-        use_source: Callable[[Sequence[str] | None], SourceInUse] = _only_configured,
-        count_objects: Callable[[], Mapping[str, int]] = dict,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.scene = scene
@@ -138,13 +117,7 @@ class RenderSession:
             endpoints=endpoints,
         )
         self._told: Mapping[str, CameraStatus] = {}  # of the cameras, by name
-        self._name = name
-        self._epoch = epoch
-        self._renderer_name = renderer_name
-        self._keep_scene = keep_scene
-        self._mailbox_drops = mailbox_drops
-        self._use_source = use_source
-        self._count_objects = count_objects
+        self._identity, self._host = identity or SessionIdentity(), host or SessionHost()
         self._clock_ns = clock_ns
         self._newest: tuple[Taken, ...] = ()
         self._finished: deque[RenderedFrame] = deque()
@@ -211,11 +184,13 @@ class RenderSession:
         told, self._told = self._told, self._cameras.statuses
         if not (told or self._told) or (if_changed and told == self._told):
             return None
-        return CamerasMessage(node=self._name, capture_ns=self._clock_ns(), cameras=self._cameras.entries)
+        return CamerasMessage(
+            node=self._identity.name, capture_ns=self._clock_ns(), cameras=self._cameras.entries
+        )
 
     def drops(self) -> dict[str, int]:
         """Returns the numbers of lost frames, by cause; topics come last, because nodes choose their number."""
-        return as_counts({**self._cameras.counts, **self.counts, **self._mailbox_drops()})
+        return as_counts({**self._cameras.counts, **self.counts, **self._host.mailbox_drops()})
 
     def stats(self, ends_by: DeltalightError | None = None) -> StatsMessage:
         """Returns the state of the session, which may be that it ends by a fault."""
@@ -225,11 +200,12 @@ class RenderSession:
         is_running = bool(self._rendered) and self._rendered[-1][0] > now_ns - WAITING_AFTER_S * 1e9
         state: ProcessState = "degraded" if self._last_fault else "running" if is_running else "waiting"
         fault = self._last_fault if ends_by is None else str(ends_by)
+        details = self._identity.renderer_name, fault, *self._cameras.remarks
         return StatsMessage(
-            node=self._name,
+            node=self._identity.name,
             capture_ns=now_ns,
             state=state if ends_by is None else "stopping",
-            detail=as_sentence("; ".join(filter(None, (self._renderer_name, fault, *self._cameras.remarks)))),
+            detail=as_sentence("; ".join(filter(None, details))),
             rates=self._rates(),
             drops=self.drops(),
         )
@@ -240,7 +216,7 @@ class RenderSession:
             return None
         some = max(SOME_SHADERS, shaders)
         return StatsMessage(
-            node=self._name,
+            node=self._identity.name,
             capture_ns=self._clock_ns(),
             state="starting",
             detail=f"Compiling shaders, once per machine: {shaders} of about {some}.",
@@ -270,7 +246,7 @@ class RenderSession:
             "snapshot": self._snapshot,
             "set_source": self._set_source,
             "stats": self._stats,
-            "gl_objects": lambda _: dict(self._count_objects()),
+            "gl_objects": lambda _: dict(self._host.count_objects()),
             "shutdown": self._shut_down,
         }
         if request.op not in commands:
@@ -279,12 +255,12 @@ class RenderSession:
         return commands[request.op](request)
 
     def _ping(self, _request: ControlRequest) -> dict[str, object]:
-        epoch = {} if self._epoch is None else {"epoch": self._epoch}
+        epoch = {} if self._identity.epoch is None else {"epoch": self._identity.epoch}
         shown = {"scene_id": self.scene_id, "revision": self.scene.revision, "instance": self.instance}
         return {**shown, **epoch}
 
     def _stats(self, _request: ControlRequest) -> dict[str, object]:
-        is_software = is_software_renderer(self._renderer_name)
+        is_software = is_software_renderer(self._identity.renderer_name)
         return {"stats": self.stats().model_dump(mode="json"), "is_software": is_software}
 
     def _set_view(self, request: ControlRequest) -> dict[str, object]:
@@ -336,7 +312,7 @@ class RenderSession:
     def _set_source(self, request: ControlRequest) -> dict[str, object]:
         order = validate(SourceRequest, request.payload, "the command set_source")
         self._finish_started()
-        source = self._use_source(order.endpoints)
+        source = self._host.use_source(order.endpoints)
         if source.is_another:
             self._newest = ()  # of the previous source
             self._finished.clear()
@@ -369,7 +345,7 @@ class RenderSession:
         are_several = self._cameras.are_several
         return tuple(
             _Started(
-                each.camera if are_several else self._name,
+                each.camera if are_several else self._identity.name,
                 each.camera,
                 each.frame,
                 started,
@@ -448,7 +424,7 @@ class RenderSession:
         self._renderer.set_scene(scene)
         self._cameras.need_depth(needs_depth(scene))
         self.scene, self.scene_id = scene, scene_id
-        self._keep_scene(scene)
+        self._host.keep_scene(scene)
         return {"revision": scene.revision}
 
     def _log_notices(self) -> None:

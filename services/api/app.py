@@ -17,7 +17,7 @@ from deltalight.services.api.auth import AuthMiddleware, AuthRules
 from deltalight.services.api.context import Context
 from deltalight.services.api.credentials import SecretToken
 from deltalight.services.api.host_names import HostNames
-from deltalight.services.api.metrics import Meter
+from deltalight.services.api.metrics import MetricsMiddleware
 from deltalight.services.api.problems import describe_problems, responses
 from deltalight.services.api.room_paths import RoomPaths
 from deltalight.services.api.rooms import Rooms
@@ -167,7 +167,7 @@ def _middleware(settings: ApiSettings, store: Store, context: Context) -> list[M
         streams=context.streams,
         secrets=_secret_tokens(settings),
     )
-    return [Middleware(RoomPaths), Middleware(Meter, metrics=context.metrics), auth]
+    return [Middleware(RoomPaths), Middleware(MetricsMiddleware, metrics=context.metrics), auth]
 
 
 def _secret_tokens(settings: ApiSettings) -> list[SecretToken]:

@@ -101,7 +101,7 @@ class LimitedProtocol(H11Protocol):
             self._await_body()
 
 
-class Seldom(logging.Filter):
+class RateLimitedLog(logging.Filter):
     """Lets each sentence of the web server through once in a while: strangers cause them as often as they like.
 
     That a WebSocket was refused is none: refusals are answered, and counted by their kind.

@@ -61,7 +61,7 @@ class Metrics:
         return generate_latest(self._registry)
 
 
-class Meter:
+class MetricsMiddleware:
     """Middleware that measures every request, including refused ones."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:

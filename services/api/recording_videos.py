@@ -32,7 +32,7 @@ class _Job:
     """A video that is being made, waits for another, or could not be made (`future` tells)."""
 
     name: str
-    share: float = 0.0
+    progress: float = 0.0
     stopped: Event = field(default_factory=Event)
     future: "Future[Path]" = field(default_factory=Future)
 
@@ -41,7 +41,7 @@ class _Job:
         for number in numbers:
             if self.stopped.is_set():
                 raise was_stopped(self.name)
-            self.share = number / len(numbers)
+            self.progress = number / len(numbers)
             yield number
 
 
@@ -84,7 +84,7 @@ class RecordingVideos:
         """
         job = self._jobs.get(name)
         if job is not None and not job.future.done():
-            return VideoAnswer(state="making", progress=job.share)
+            return VideoAnswer(state="making", progress=job.progress)
         if self._store.made_video(name) is not None:
             return VideoAnswer(state="ready", progress=1.0)
         fault = None if job is None else job.future.exception()

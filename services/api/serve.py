@@ -19,7 +19,7 @@ from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.services.api.app import create_app
-from deltalight.services.api.connections import HEAD_TIMEOUT_S, LimitedProtocol, Seldom
+from deltalight.services.api.connections import HEAD_TIMEOUT_S, LimitedProtocol, RateLimitedLog
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host_store import FIRST_SCENE, activate_first, import_scene
 from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultError
@@ -110,7 +110,7 @@ def http_server(app: FastAPI) -> uvicorn.Server:
         ws_per_message_deflate=False,  # JPEG does not compress further
     )
     server_log = logging.getLogger("uvicorn.error")
-    server_log.filters = [Seldom()]
+    server_log.filters = [RateLimitedLog()]
     return _Server(config)
 
 

@@ -47,7 +47,7 @@ class Watcher:
 
 
 @dataclass(frozen=True)
-class Look:
+class WatchedView:
     """What is watched: a view (None = the scene's own) of a camera (None = the first one)."""
 
     view: ShownView | None
@@ -69,7 +69,7 @@ class WhepSessions:
             return NONE_ALLOWED
         return why_unavailable() or (NO_AIORTC if find_spec("aiortc") is None else None)
 
-    async def open(self, hub: LiveHub, look: Look, offer: str, watcher: Watcher) -> tuple[str, str]:
+    async def open(self, hub: LiveHub, watched: WatchedView, offer: str, watcher: Watcher) -> tuple[str, str]:
         """Begin a session; return its id and the answer to the offer.
 
         Raises:
@@ -82,7 +82,9 @@ class WhepSessions:
         with ExitStack() as held:
             held.enter_context(self._place())
             held.enter_context(self._streams.slot(watcher.client))
-            peer = peer_of(held.enter_context(hub.viewer(look.view, "h264", look.camera)), self._addresses())
+            peer = peer_of(
+                held.enter_context(hub.viewer(watched.view, "h264", watched.camera)), self._addresses()
+            )
             try:
                 answer = await peer.answer(offer)
             except BaseException:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from deltalight.services.offline import RenderSummary
 
 
-class Layers(StrEnum):
+class LayerFormat(StrEnum):
     """File format of the layers."""
 
     EXR = "exr"
@@ -52,7 +52,7 @@ def render(
     ] = Quality.BEST,
     exr: Annotated[bool, typer.Option("--exr", help="Also write linear OpenEXR files.")] = False,
     layers: Annotated[
-        Layers | None,
+        LayerFormat | None,
         typer.Option(help="Also write light and objects as layers, for a compositing program."),
     ] = None,
     allow_software: Annotated[

@@ -48,8 +48,8 @@ def server(
     """Render the frames of sensor nodes and publish the pictures, until Ctrl-C."""
     with uncollected():
         from deltalight.protocol.keys import KeySettings
-        from deltalight.render_server.server.ahead import Ahead
         from deltalight.render_server.server.process import ServerSettings, run_server
+        from deltalight.render_server.server.standby import StandbyRenderer
         from deltalight.services.settings import load_configuration
 
     configuration = load_configuration(config_file)
@@ -70,7 +70,7 @@ def server(
     keys = key_settings.load([*settings.subscribe, settings.publish, settings.control])
     spare = this_spare()
     if spare is not None and spare.is_rehearsing:
-        spare.prepared = Ahead(settings, keys, spare.is_called)
+        spare.prepared = StandbyRenderer(settings, keys, spare.is_called)
         spare.prepared.keep()
     else:
         run_server(settings, keys, None if spare is None else spare.prepared)

@@ -1,14 +1,29 @@
 """`deltalight up`: all processes of one host, supervised."""
 
-from enum import StrEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.commands.options import ConfigFile, Data, Device, NodeName, data_folder
+from deltalight.services.commands.up_options import (
+    AllowSoftware,
+    CompositePort,
+    ControlPort,
+    NodePort,
+    PagePort,
+    Placer,
+    PlacerKind,
+    RayAddress,
+    RoomsFile,
+    RoomsHostAddress,
+    RoomsPort,
+    ShownScene,
+    SourceOfNode,
+    Spares,
+)
 from deltalight.services.ports import (
     COMPOSITE_PORT,
     CONTROL_PORT,
@@ -23,66 +38,24 @@ if TYPE_CHECKING:
     from deltalight.services.host import HostCommands
 
 
-class PlacerKind(StrEnum):
-    """What runs the render servers of rooms."""
-
-    LOCAL = "local"
-    RAY = "ray"
-
-
 def up(
     *,
-    source: Annotated[
-        str | None,
-        typer.Option(
-            help="Camera, dataset folder, .mcap recording or `synthetic`; default: from the configuration."
-        ),
-    ] = None,
+    source: SourceOfNode = None,
     node: NodeName = None,
-    scene: Annotated[
-        Path | None,
-        typer.Option(
-            help="Scene document to import and show; default: the last one shown, else the recording's."
-        ),
-    ] = None,
+    scene: ShownScene = None,
     data: Data = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the dashboard.")] = PAGE_PORT,
-    node_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the node's streams.")] = NODE_PORT,
-    composite_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of the relit pictures.")
-    ] = COMPOSITE_PORT,
-    control_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the commands.")] = CONTROL_PORT,
+    port: PagePort = PAGE_PORT,
+    node_port: NodePort = NODE_PORT,
+    composite_port: CompositePort = COMPOSITE_PORT,
+    control_port: ControlPort = CONTROL_PORT,
     device: Device = None,
-    allow_software: Annotated[
-        bool, typer.Option("--allow-software", help="Render without a GPU if there is none.")
-    ] = False,
-    spares: Annotated[
-        bool,
-        typer.Option(
-            "--spares/--no-spares",
-            help="Keep a spare of each process, which replaces a dead one sooner (some 350 MB, and "
-            "as much as the render server takes, whose scene is built ahead).",
-        ),
-    ] = True,
-    rooms: Annotated[
-        Path | None,
-        typer.Option(help="Rooms file: several rooms at once, each with nodes and a scene of its own."),
-    ] = None,
-    rooms_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of the directory of rooms, with --rooms.")
-    ] = ROOMS_PORT,
-    rooms_host: Annotated[
-        str, typer.Option(help="Address of this host at which the directory answers, with --placer ray.")
-    ] = LOOPBACK,
-    placer: Annotated[
-        PlacerKind, typer.Option(help="What runs the rooms: this host, or the hosts of a Ray cluster.")
-    ] = PlacerKind.LOCAL,
-    ray_address: Annotated[
-        str | None,
-        typer.Option(
-            help="Cluster to join, HOST:PORT or `auto`, with --placer ray; default: one of this host alone."
-        ),
-    ] = None,
+    allow_software: AllowSoftware = False,
+    spares: Spares = True,
+    rooms: RoomsFile = None,
+    rooms_port: RoomsPort = ROOMS_PORT,
+    rooms_host: RoomsHostAddress = LOOPBACK,
+    placer: Placer = PlacerKind.LOCAL,
+    ray_address: RayAddress = None,
     config_file: ConfigFile = None,
 ) -> None:
     """Run node, render server and dashboard on this machine until Ctrl-C, and restart what fails.

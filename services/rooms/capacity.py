@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from deltalight.render_server.gpu.device_memory import FoundDevice
 
 GPU_LABEL, MEMORY_LABEL = "gpu", "gpu-memory-mb"  # of a host of a cluster: what it claims to be
-USED_SHARE = 0.9  # of a device's memory; the rest is for the driver, and for what else runs
-CLAIMED_SHARE = 0.95  # of the claimed memory that must be there: drivers keep some to themselves
+USED_FRACTION = 0.9  # of a device's memory; the rest is for the driver, and for what else runs
+CLAIMED_FRACTION = 0.95  # of the claimed memory that must be there: drivers keep some to themselves
 PROBE_TIMEOUT_S = 60.0
 MAKE_REPORT = "make it on this host with `deltalight gpu-check --steps memory,speed`"
 # What reading JSON of another kind raises: text that is none, other keys and types, numbers beyond all, deep nesting.
@@ -111,7 +111,7 @@ def slots_of(figures: RoomFigures, found: "FoundDevice", frames_per_s: float) ->
         raise DeltalightError(
             f"the driver of {found.name} does not report its memory; give `slots` as a number."
         )
-    by_memory = int(found.memory_bytes * USED_SHARE / figures.room_bytes)
+    by_memory = int(found.memory_bytes * USED_FRACTION / figures.room_bytes)
     if by_memory < 1:
         raise DeltalightError(
             f"{found.name} has {found.memory_bytes >> 20} MiB, and a room takes {figures.room_bytes >> 20}: no room"
@@ -169,7 +169,7 @@ def check_claim(
     has_mb = None if found.memory_bytes is None else found.memory_bytes >> 20
     if claimed is not None and claimed != label_text(found.name):
         fault = f"it claims the device {claimed} and renders on {found.name}"
-    elif memory_mb is not None and (has_mb is None or has_mb < memory_mb * CLAIMED_SHARE):
+    elif memory_mb is not None and (has_mb is None or has_mb < memory_mb * CLAIMED_FRACTION):
         has = "its driver does not tell" if has_mb is None else f"has {has_mb}"
         fault = f"it claims {memory_mb} MiB of memory and {has}"
     elif figures is not None and has_mb is not None and slots * figures.room_bytes >> 20 > has_mb:

@@ -19,8 +19,8 @@ from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultEr
 from deltalight.services.storage.feed import Feed
 from deltalight.services.storage.feed_notify import NotifyFeed
 from deltalight.services.storage.last_known import LastKnown
-from deltalight.services.storage.prompt_connection import PromptConnection
 from deltalight.services.storage.schema import stored_version
+from deltalight.services.storage.timed_connection import TimedConnection
 
 WRITER_LOCK = 0x64656C74616C6967  # of pg_advisory_xact_lock: "deltalig"
 CONNECTIONS = 16
@@ -101,9 +101,9 @@ class PostgresDatabase(Database):
 
     def _connect(
         self, _dialect: object, _entry: object, args: list[Any], options: dict[str, Any]
-    ) -> PromptConnection:
-        connection = PromptConnection.connect(*args, **options)
-        connection.is_prompt = self._is_open
+    ) -> TimedConnection:
+        connection = TimedConnection.connect(*args, **options)
+        connection.is_timed = self._is_open
         return connection
 
     @contextmanager

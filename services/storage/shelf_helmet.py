@@ -26,7 +26,7 @@ VISOR_DEG, VISOR_AT_DEG = (64.0, 25.0), -2.0  # half its width and height; eleva
 VISOR_POWER = 3.0  # of the superellipse
 EAR_DEG = 19.0
 INSET_M, RIDGE_M, EAR_M = 0.004, 0.005, 0.006
-RIM_WIDTH = 0.1  # of the visor's rim, in shares of its size
+RIM_WIDTH = 0.1  # of the visor's rim, as a fraction of its size
 PANEL_LINES_DEG = (-35.0, 45.0)  # elevations
 LINE_DEG, LINE_DEPTH_M, RIVET_HEIGHT_M = 0.8, 0.0006, 0.0008
 SEED = 7
@@ -118,8 +118,8 @@ def _image(picture: Picture) -> Any:  # noqa: ANN401 - Pillow is imported where 
 
 def _step(value: Map, width: float) -> Map:
     """Return 0 below -width, 1 above width, and a smooth way between them."""
-    share = np.clip(0.5 + value / (2 * width), 0, 1)
-    return share * share * (3 - 2 * share)
+    weight = np.clip(0.5 + value / (2 * width), 0, 1)
+    return weight * weight * (3 - 2 * weight)
 
 
 def _radius_m(at: Directions) -> Map:
@@ -186,10 +186,10 @@ def _textures(at: Directions) -> dict[str, Picture]:
         (wear, STEEL, 1.0, 0.32),
         (is_visor, GOLD, 1.0, 0.07),
     )
-    for share, layer, layer_metal, layer_rough in layers:
-        color = color + (np.asarray(layer) - color) * share[..., None]
-        metal = metal + (layer_metal - metal) * share
-        rough = rough + (layer_rough - rough) * share
+    for weight, layer, layer_metal, layer_rough in layers:
+        color = color + (np.asarray(layer) - color) * weight[..., None]
+        metal = metal + (layer_metal - metal) * weight
+        rough = rough + (layer_rough - rough) * weight
     occlusion = 1 - 0.5 * np.maximum(lines, is_rim * 0.6)
     return {
         "baseColorTexture": _bytes(srgb_code(color)),

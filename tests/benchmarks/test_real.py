@@ -33,11 +33,11 @@ def box_depth() -> np.ndarray:
     return np.where(enter <= leave, np.minimum(enter, 1), 1) * PLANE.depth_m
 
 
-def light(azimuth_deg: float, elevation_deg: float, radius_deg: float, share: float) -> FoundLight:
+def light(azimuth_deg: float, elevation_deg: float, radius_deg: float, fraction: float) -> FoundLight:
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     across = np.cos(elevation)
     towards = np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
-    return FoundLight(towards, float(np.radians(radius_deg)), np.full(3, share))
+    return FoundLight(towards, float(np.radians(radius_deg)), np.full(3, fraction))
 
 
 def around(count: int = 24) -> np.ndarray:
@@ -99,9 +99,9 @@ def test_lights_are_found_again() -> None:
     points = points[inside[0] > inside[1]]
     noise = np.random.default_rng(2).normal(0, 0.005, (len(points), 3))
     found = fit_lights(points, truth.ratios(points, BOX) + noise, BOX)
-    strongest = max(found.lights, key=lambda each: each.share.sum())
+    strongest = max(found.lights, key=lambda each: each.fraction.sum())
     assert np.degrees(np.arccos(strongest.towards @ truth.lights[0].towards)) < 3
-    assert np.abs(strongest.share - 0.45).max() < 0.08
+    assert np.abs(strongest.fraction - 0.45).max() < 0.08
     np.testing.assert_allclose(found.ratios(points, BOX), truth.ratios(points, BOX), atol=0.1)
     assert found.rms < 0.01
 

@@ -18,7 +18,7 @@ from deltalight.benchmarks.speed.measure import WARM_UP_FRAMES, FrameTimes, moti
 from deltalight.benchmarks.speed.motions import (
     ARM_STEPS,
     DRAG_STEPS,
-    LAMP_SHARES,
+    LAMP_FACTORS,
     MOTIONS,
     STANDING,
     SWING,
@@ -148,7 +148,7 @@ def test_an_object_is_dragged_and_a_lamp_dimmed_every_frame(take: Take, scene: S
     places = [each.objects[0].pose.translation_m for each in dragged]
     assert all(before != after for before, after in pairwise(places))
     assert all(each.lights == scene.lights for each in dragged)
-    dimmed = [step.scene for step in steps_of("lamps", take, scene, len(LAMP_SHARES) + 1)]
+    dimmed = [step.scene for step in steps_of("lamps", take, scene, len(LAMP_FACTORS) + 1)]
     strengths = [each.lights.manual[0].intensity for each in dimmed]
     assert all(before != after for before, after in pairwise(strengths))
     assert min(strengths) == 0

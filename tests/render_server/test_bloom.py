@@ -9,7 +9,7 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.post_effects.bloom import bloomed, scattered
+from deltalight.render_server.post_effects.bloom import scattered, with_bloom
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame
 
@@ -42,7 +42,7 @@ def test_light_is_spread_and_none_is_made() -> None:
 def test_a_bright_thing_glows_on_what_is_around_it() -> None:
     """And is itself as bright as what it keeps, beyond white or not."""
     frame, color, linear, coverage = lamp(radiance=40.0)
-    found = bloomed(color, linear, coverage, frame, 0.2)
+    found = with_bloom(color, linear, coverage, frame, 0.2)
     before, after = LUT[color, 0], LUT[found, 0]
     assert found[120, 160, 0] == 255
     assert after[120, 168, 0] > 1.5 * before[120, 168, 0]
@@ -85,15 +85,15 @@ def test_bloom_under_a_tone_curve_is_that_of_the_light(gpu: GpuContext, tmp_path
 
 def test_where_nothing_arrives_the_picture_is_the_cameras() -> None:
     frame, color, linear, coverage = lamp(radiance=1.0)
-    found = bloomed(color, linear, coverage, frame, 0.1)
+    found = with_bloom(color, linear, coverage, frame, 0.1)
     assert np.array_equal(found[:, 290:], color[:, 290:])
     assert np.array_equal(found[:30], color[:30])
-    assert bloomed(frame.color, linear, 0 * coverage, frame, 0.1) is frame.color
+    assert with_bloom(frame.color, linear, 0 * coverage, frame, 0.1) is frame.color
 
 
 def test_a_lamp_that_is_hidden_takes_its_glow_along() -> None:
     frame, color, linear, coverage = lamp(radiance=0.0, code=200)
-    found = bloomed(color, linear, coverage, frame, 0.5)
+    found = with_bloom(color, linear, coverage, frame, 0.5)
     assert found[120, 166, 0] < 200
     assert found[120, 160, 0] > color[120, 160, 0] == 0
     kept = LUT[found, 0].sum(dtype=float) / LUT[color, 0].sum(dtype=float)
@@ -108,6 +108,6 @@ def test_what_an_object_hides_does_not_shine_through() -> None:
     color, coverage = frame.color.copy(), np.zeros((HEIGHT, WIDTH), np.float32)
     inside = np.s_[60:180, 80:240]
     color[inside], linear[inside], coverage[inside] = 100, LUT[100, 0] / 0.5, 1
-    found = bloomed(color, linear, coverage, frame, 0.3)
+    found = with_bloom(color, linear, coverage, frame, 0.3)
     row = found[120, 100:220, 0].astype(int)
     assert np.abs(np.diff(row)).max() <= 1

@@ -11,7 +11,7 @@ from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.scene_output import Tone
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.post_effects.camera_mosaic import demosaicked
-from deltalight.render_server.post_effects.tone import in_tone
+from deltalight.render_server.post_effects.tone import with_tone_curve
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server import test_camera_defocus as lens
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame, look_at, plain
@@ -43,7 +43,7 @@ def test_objects_get_the_cameras_noise(gpu: GpuContext, tmp_path: Path, tone: To
     assert np.array_equal(first, plain_first)
     assert np.array_equal(second[~inside], plain_second[~inside])
     assert np.array_equal(pictures["on"][1], pictures["on"][2])
-    lut = decode_lut(in_tone(frames[0], tone).response)
+    lut = decode_lut(with_tone_curve(frames[0], tone).response)
     before, after = (lut[each, np.arange(3)][covered] for each in (plain_second, second))
     expected = np.mean(0.01**2 + 3e-4 * before)
     assert np.mean((after - before) ** 2) == pytest.approx(expected, rel=0.2)

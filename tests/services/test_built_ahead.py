@@ -17,10 +17,10 @@ from deltalight.protocol.messages import CompositeMessage, ControlReply, Control
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
-from deltalight.render_server.server.ahead import ANSWER_TIMEOUT_S, Ahead, _assets, _Built, _stamp
 from deltalight.render_server.server.cameras import RoomCameras
 from deltalight.render_server.server.pace import CalledError
 from deltalight.render_server.server.process import ServerSettings
+from deltalight.render_server.server.standby import ANSWER_TIMEOUT_S, StandbyRenderer, _assets, _Built, _stamp
 from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.supervisor import Supervisor
@@ -146,7 +146,7 @@ def test_a_spare_waits_for_a_frame_of_each_camera_longer_than_a_server_would() -
     late = threading.Timer(1.0, lambda: nodes.append(Node(other, name="right")))
     late.start()
     try:
-        taken = Ahead(settings, None, lambda _timeout_s: False)._listen(cameras)
+        taken = StandbyRenderer(settings, None, lambda _timeout_s: False)._listen(cameras)
     finally:
         late.join()
         for node in nodes:
@@ -158,7 +158,7 @@ def test_a_spare_that_is_called_waits_for_no_answer_of_the_dead_server() -> None
     node, published, control = map(ports.endpoint, ports.private_ports(3))
     settings = ServerSettings(subscribe=(node,), publish=published, control=control)
     began_s = time.monotonic()
-    ahead = Ahead(settings, None, lambda _timeout_s: time.monotonic() - began_s > 0.1)
+    ahead = StandbyRenderer(settings, None, lambda _timeout_s: time.monotonic() - began_s > 0.1)
     assert ahead._state_of_server() is None
     assert time.monotonic() - began_s < ANSWER_TIMEOUT_S / 2
 
@@ -168,7 +168,7 @@ def test_the_same_scene_sent_again_is_not_built_again(tmp_path: Path) -> None:
     document = scene(tmp_path)
     node, published, control = map(ports.endpoint, ports.private_ports(3))
     settings = ServerSettings(session=session, subscribe=(node,), publish=published, control=control)
-    ahead, built = Ahead(settings, None, lambda _timeout_s: False), list[SceneDocument]()
+    ahead, built = StandbyRenderer(settings, None, lambda _timeout_s: False), list[SceneDocument]()
 
     def build() -> None:
         built.append(settings.initial_scene())
@@ -192,7 +192,9 @@ def test_a_spare_that_is_called_after_a_picture_of_each_camera_keeps_its_rendere
     settings = ServerSettings(subscribe=(node_port,), publish=published, control=control)
     renderer, pace = Mock(), Mock()
     renderer.submit_cameras.return_value = []
-    ahead = Ahead(settings, None, lambda _timeout_s: renderer.submit_cameras.called or not has_picture)
+    ahead = StandbyRenderer(
+        settings, None, lambda _timeout_s: renderer.submit_cameras.called or not has_picture
+    )
     node = Node(node_port)
     try:
         with nullcontext() if has_picture else pytest.raises(CalledError):

@@ -11,6 +11,7 @@ from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.lost_context import GpuResetError, check_reset
 from deltalight.render_server.server.session import RenderSession
+from deltalight.render_server.server.session_host import SessionIdentity
 from deltalight.services import ports
 from deltalight.services.api.streams import ProcessWatch
 from deltalight.services.child import ChildSpec
@@ -53,7 +54,7 @@ def feed(session: RenderSession, number: int) -> None:
 
 
 def session_of(renderer: InvertingRenderer) -> RenderSession:
-    return RenderSession(renderer, SceneDocument(), renderer_name="abacus")
+    return RenderSession(renderer, SceneDocument(), identity=SessionIdentity(renderer_name="abacus"))
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ class RefusingDisk:
         self.error = 0
         self._pwrite: Callable[[int, bytes, int], int] = os.pwrite
         monkeypatch.setattr("deltalight.protocol.growing_file.os.pwrite", self._write)
-        monkeypatch.setattr("deltalight.services.patient_writer.RETRY_PERIOD_S", 0.2)
+        monkeypatch.setattr("deltalight.services.retrying_writer.RETRY_PERIOD_S", 0.2)
 
     def _write(self, handle: int, data: bytes, position: int) -> int:
         if not self.error:

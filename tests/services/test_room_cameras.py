@@ -11,7 +11,8 @@ from deltalight.protocol.envelope import decode, encode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import MAX_CAMERAS, CameraStatus, ColorMessage, ControlRequest, PoseMessage
 from deltalight.protocol.scene import SceneDocument
-from deltalight.render_server.server.session import RenderedFrame, RenderSession, SourceInUse
+from deltalight.render_server.server.session import RenderedFrame, RenderSession
+from deltalight.render_server.server.session_host import SessionHost, SessionIdentity, SourceInUse
 from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera, picture, received
 from tests.services.render_server_samples import InvertingRenderer
 
@@ -38,10 +39,10 @@ class Room:
         self.session = RenderSession(
             self.renderer,
             scene,
-            name="server",
+            identity=SessionIdentity("server"),
             clock_ns=lambda: self.now_ns,
             endpoints=endpoints,
-            use_source=lambda _: SourceInUse((), is_another=True),
+            host=SessionHost(use_source=lambda _: SourceInUse((), is_another=True)),
         )
 
     def send(

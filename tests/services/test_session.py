@@ -17,8 +17,8 @@ from deltalight.render_server.server.session import (
     MAXIMUM_FAULTS_IN_A_ROW,
     WATCHED_NS,
     RenderSession,
-    SourceInUse,
 )
+from deltalight.render_server.server.session_host import SessionHost, SessionIdentity, SourceInUse
 from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
 from tests.services.render_server_samples import InvertingRenderer
 
@@ -46,9 +46,8 @@ def session(renderer: InvertingRenderer, kept: list[SceneDocument]) -> RenderSes
     return RenderSession(
         renderer,
         SceneDocument(name="first", revision=3),
-        renderer_name="abacus",
-        keep_scene=kept.append,
-        mailbox_drops=lambda: {"color.cam": 4},
+        identity=SessionIdentity(renderer_name="abacus"),
+        host=SessionHost(keep_scene=kept.append, mailbox_drops=lambda: {"color.cam": 4}),
         clock_ns=lambda: START,
     )
 
@@ -158,9 +157,9 @@ def test_what_nodes_send_is_cut_to_the_limits_of_statistics_and_composites(
     session = RenderSession(
         renderer,
         SceneDocument(),
-        mailbox_drops=lambda: topics,
+        identity=SessionIdentity(renderer_name="abacus" * 400),
+        host=SessionHost(mailbox_drops=lambda: topics),
         clock_ns=lambda: START,
-        renderer_name="abacus" * 400,
     )
     wrong = color(1, START, START, {**camera().to_dict(), "distortion_model": "w" * 5000})
     for message in (wrong, depth(1, START), pose(1, START)):
@@ -416,7 +415,9 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
         return SourceInUse(("tcp://configured",), is_another)
 
     renderer.immediate = False
-    session = RenderSession(renderer, SceneDocument(), use_source=use_source, clock_ns=lambda: START)
+    session = RenderSession(
+        renderer, SceneDocument(), host=SessionHost(use_source=use_source), clock_ns=lambda: START
+    )
     feed(session, 1)
     session.step()  # waits for the GPU
     session.receive(color(2, START + 2, START))  # waits for its pose and depth
@@ -443,5 +444,7 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
 
 
 def test_what_the_gpu_holds_is_counted_when_asked(renderer: InvertingRenderer) -> None:
-    session = RenderSession(renderer, SceneDocument(), count_objects=lambda: {"Texture": 3, "Buffer": 5})
+    session = RenderSession(
+        renderer, SceneDocument(), host=SessionHost(count_objects=lambda: {"Texture": 3, "Buffer": 5})
+    )
     assert session.execute(request("gl_objects")) == {"Texture": 3, "Buffer": 5}

@@ -17,9 +17,9 @@ from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.host import HostPlan
 from deltalight.services.supervisor import Supervisor
-from deltalight.services.watchdog import Heartbeat, Patience, Watchdog, processor_time_s
+from deltalight.services.watchdog import Heartbeat, Watchdog, WatchdogTimeouts, processor_time_s
 
-PATIENCE = Patience(times=10, floor_s=20, start_s=120, deaf_s=300, longest_frame_s=1800)
+TIMEOUTS = WatchdogTimeouts(times=10, floor_s=20, start_s=120, deaf_s=300, longest_frame_s=1800)
 REPORTS = """
 import sys, time
 from deltalight.protocol.envelope import encode
@@ -33,7 +33,7 @@ while True:
 
 
 def heartbeat(*reports_s: float) -> Heartbeat:
-    made = Heartbeat(PATIENCE, 0.0)
+    made = Heartbeat(TIMEOUTS, 0.0)
     for each in reports_s:
         made.note_report(each)
     return made
@@ -69,7 +69,7 @@ def test_a_process_that_works_or_answers_has_longer() -> None:
 
 def test_a_gpu_needs_no_minutes_for_one_call_or_frame() -> None:
     spinning = heartbeat(1, 2)
-    spinning.patience = PATIENCE.on_gpu()
+    spinning.timeouts = TIMEOUTS.on_gpu()
     spinning.worked_s = 61
     assert spinning.fault(61.9) is None
     assert spinning.fault(63) == "neither reported nor answered for 61 s"
@@ -80,7 +80,7 @@ def test_a_gpu_needs_no_minutes_for_one_call_or_frame() -> None:
 
 def test_slow_frames_are_waited_for_on_a_gpu_too() -> None:
     slow = heartbeat(1, 41)
-    slow.patience = PATIENCE.on_gpu()
+    slow.timeouts = TIMEOUTS.on_gpu()
     slow.worked_s = 441
     assert slow.fault(440) is None
     assert slow.fault(442) == "neither reported nor answered for 401 s"
@@ -95,20 +95,20 @@ def test_processor_time_is_that_of_the_process() -> None:
 
 
 @pytest.fixture(params=[True, False], ids=["software", "gpu"])
-def answering(request: pytest.FixtureRequest) -> Iterator[tuple[ReplyServer, Patience]]:
-    """A server that says on what it renders, and the patience that it needs."""
+def answering(request: pytest.FixtureRequest) -> Iterator[tuple[ReplyServer, WatchdogTimeouts]]:
+    """A server that says on what it renders, and the timeouts that it needs."""
     server = ReplyServer("tcp://127.0.0.1:*", lambda _request: {"is_software": request.param})
-    yield server, PATIENCE if request.param else PATIENCE.on_gpu()
+    yield server, TIMEOUTS if request.param else TIMEOUTS.on_gpu()
     server.close()
 
 
 def test_answers_and_reports_are_heard(
-    answering: tuple[ReplyServer, Patience], monkeypatch: pytest.MonkeyPatch
+    answering: tuple[ReplyServer, WatchdogTimeouts], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server, needed = answering
     monkeypatch.setattr("deltalight.services.watchdog.LATE_AFTER_S", 0.0)
     publisher = Publisher("tcp://127.0.0.1:*")
-    watchdog = Watchdog(os.getpid(), publisher.endpoint, server.endpoint, patience=PATIENCE)
+    watchdog = Watchdog(os.getpid(), publisher.endpoint, server.endpoint, timeouts=TIMEOUTS)
     heard, began_s = watchdog._heartbeat, time.monotonic()
     while heard.reported_s is None or heard.answered_s <= began_s:
         publisher.send(encode(StatsMessage(node="server", capture_ns=1, state="running", frame_id=0)))
@@ -117,15 +117,15 @@ def test_answers_and_reports_are_heard(
     watchdog.close()
     publisher.close()
     assert watchdog.fault() is None
-    assert heard.patience == needed
+    assert heard.timeouts == needed
 
 
 def test_a_stopped_process_is_killed_and_started_again() -> None:
     reports, control = map(ports.endpoint, ports.private_ports(2))
-    hasty = Patience(times=0, floor_s=2.0)
+    hasty = WatchdogTimeouts(times=0, floor_s=2.0)
 
     def watch(process_id: int) -> Watchdog:
-        return Watchdog(process_id, reports, control, patience=hasty)
+        return Watchdog(process_id, reports, control, timeouts=hasty)
 
     lines: list[str] = []
     spec = ChildSpec("render server", ("-c", REPORTS, reports), watch)

@@ -59,7 +59,7 @@ float take_albedo(int slot) {
     return min(PI * float(radiance) / float(max(irradiance, 1)), WHITEST);
 }
 
-// `next`: what one more bounce adds to a group's irradiance; `returned`: which share comes back to surfaces.
+// `next`: what one more bounce adds to a group's irradiance; `returned`: which fraction comes back to surfaces.
 void add_to_tail(vec3 corner, int k, float area, vec3 next, float returned) {
     float edge = float(volume_size) / float(TAIL_CELLS), amount = dot(abs(next), LUMINANCE);
     float values[TAIL_SUMS] = float[](next.r, next.g, next.b, 1.0, amount, amount * returned);

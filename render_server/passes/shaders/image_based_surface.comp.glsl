@@ -101,9 +101,9 @@ vec3 mirrored_radiance(ivec2 pixel, vec4 position, vec4 normal, vec3 v, Material
 #endif
     vec3 seen = lobe_radiance(n, v, m.f0, m.roughness, footprint, has_interface(m.f0) ? sample_count : 0);
 #ifdef EXTENDED
-    vec3 share = coat_share(reflected_towards(m, n, v)), above = coat_normal(m.over, n);
+    vec3 coat = coat_fraction(reflected_towards(m, n, v)), above = coat_normal(m.over, n);
     footprint = mirrored_turn(pixel, position, vec4(above, normal.w), true);
-    seen = mix(seen, lobe_radiance(above, v, COAT_F0, m.over.roughness, footprint, m.over.coat > 0.0 ? sample_count : 0), share);
+    seen = mix(seen, lobe_radiance(above, v, COAT_F0, m.over.roughness, footprint, m.over.coat > 0.0 ? sample_count : 0), coat);
 #endif
     return seen;
 }

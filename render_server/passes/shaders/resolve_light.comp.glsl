@@ -26,11 +26,11 @@ void resolve(uint voxel, uint slot) {
     uint other = virtual_grid[voxel], at = slot * uint(LIGHT_SUMS), j = (other - 1u) * uint(LIGHT_SUMS);
     float own_area = float(light[at + uint(ALL_AREA)]);
     float other_area = other == 0u ? 0.0 : float(virtual_light[j + uint(ALL_AREA)]);
-    float share = other_area / max(own_area + other_area, 1.0);
+    float fraction = other_area / max(own_area + other_area, 1.0);
     float found[AREA];
     for (int k = 0; k < AREA; ++k) {
         float own = float(light[at + uint(ALL_DELTA + k)]);
-        found[k] = (share > 0.0 ? mix(own, float(virtual_light[j + uint(ALL_DELTA + k)]), share) : own) / FIXED_POINT;
+        found[k] = (fraction > 0.0 ? mix(own, float(virtual_light[j + uint(ALL_DELTA + k)]), fraction) : own) / FIXED_POINT;
     }
     store(voxel, found);
 }

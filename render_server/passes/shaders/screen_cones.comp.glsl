@@ -122,11 +122,11 @@ vec4 any_reflection(ivec2 pixel, vec4 position, vec4 normal, float roughness, bo
 vec4 reflection(ivec2 pixel, Lobe lobe) {
     ivec2 raster = raster_texel(pixel);
     Material m = coated_material(raster);
-    vec3 share = coat_share(reflected_towards(m, lobe.normal.xyz, normalize(camera_position - lobe.position.xyz)));
+    vec3 fraction = coat_fraction(reflected_towards(m, lobe.normal.xyz, normalize(camera_position - lobe.position.xyz)));
     vec4 base = any_reflection(pixel, lobe.position, lobe.normal, m.roughness, false, has_interface(m.f0));
     if (lobe.is_single) return base;
     vec4 coat = any_reflection(pixel, lobe.position, shown_normal(raster, true), m.over.roughness, true, true);
-    return vec4(mix(base.rgb, coat.rgb, share), mix(base.a, coat.a, dot(share, vec3(1.0 / 3.0))));
+    return vec4(mix(base.rgb, coat.rgb, fraction), mix(base.a, coat.a, dot(fraction, vec3(1.0 / 3.0))));
 }
 #else
 Lobe lobe_at(ivec2 pixel) {

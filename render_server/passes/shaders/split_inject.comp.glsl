@@ -90,8 +90,8 @@ void select_slot(int slot) {
 
 // Flux and area per voxel face, so that fixed point serves every scale.
 ivec3 parts_of(vec3 flux) {
-    vec3 shares = flux / (PI * voxel_edge * voxel_edge);
-    return ivec3(rounded(shares.r), rounded(shares.g), rounded(shares.b));
+    vec3 parts = flux / (PI * voxel_edge * voxel_edge);
+    return ivec3(rounded(parts.r), rounded(parts.g), rounded(parts.b));
 }
 
 void accumulate(int slot, bool shadowed, vec3 flux, float area) {

@@ -77,12 +77,12 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
 vec3 coated_specular(ivec2 texel, SurfacePoint s, vec3 q) {
     ivec2 raster = raster_texel(texelFetch(sample_pixels, texel, 0).zw);
     Material m = coated_material(raster);
-    vec3 v = normalize(camera_position - s.position), share = coat_share(reflected_towards(m, s.normal, v)), sum = vec3(0.0);
+    vec3 v = normalize(camera_position - s.position), coat = coat_fraction(reflected_towards(m, s.normal, v)), sum = vec3(0.0);
     int k = 0, lobes = m.over.coat > 0.0 ? 2 : 1;
     do {
         vec3 d = reflect(-v, k == 0 ? s.normal : coat_normal(m.over, s.normal));
         float half_angle = specular_half_angle(k == 0 ? m.roughness : m.over.roughness);
-        sum += (k == 0 ? 1.0 - share : share) * specular_cone(q, d, half_angle).rho;
+        sum += (k == 0 ? 1.0 - coat : coat) * specular_cone(q, d, half_angle).rho;
     } while (++k < lobes);
     return sum;
 }

@@ -69,8 +69,8 @@ async def recording_video(shared: Shared, recording_id: RecordingId) -> StoredFi
     deadline_s = time.monotonic() + WAIT_S
     while not making.done():
         if time.monotonic() > deadline_s:
-            share = shared.videos.state(recording_id).progress
-            sentence = f"The video of {recording_id} is being made ({share:.0%}); try again soon."
+            progress = shared.videos.state(recording_id).progress
+            sentence = f"The video of {recording_id} is being made ({progress:.0%}); try again soon."
             raise ProblemError(503, "video-is-being-made", sentence, {"Retry-After": str(RETRY_AFTER_S)})
         await asyncio.sleep(LOOK_AGAIN_S)
     if making.cancelled():

@@ -9,7 +9,7 @@ from deltalight.services.api.context import Shared
 from deltalight.services.api.credentials import principal_of
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.routes.live import WantedCamera, WantedView
-from deltalight.services.api.whep import Look, Watcher
+from deltalight.services.api.whep import WatchedView, Watcher
 
 router = APIRouter(tags=["live"])
 ROUTERS = (router,)
@@ -47,8 +47,8 @@ async def open_whep(
     client = request.client.host if request.client else ""
     watcher = Watcher(client, principal_of(request.scope).token_id)
     try:
-        look = Look(view, camera)
-        session_id, answer = await shared.whep.open(shared.live, look, await _offer(request), watcher)
+        watched = WatchedView(view, camera)
+        session_id, answer = await shared.whep.open(shared.live, watched, await _offer(request), watcher)
     except DeltalightError as fault:
         raise ProblemError(400, "sdp", str(fault)) from fault
     headers = {"Location": f"{request.app.url_path_for('open_whep')}/{session_id}"}

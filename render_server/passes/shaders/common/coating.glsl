@@ -64,8 +64,8 @@ Reflected reflected_towards(Material m, vec3 n, vec3 v) {
     return Reflected(coat, below * specular_reflectance(m.f0, m.roughness, cosine), (1.0 - coat) * sheen, below);
 }
 
-// The coat's part of what both lobes reflect.
-vec3 coat_share(Reflected r) { return r.coat / max(r.coat + r.lobe, vec3(1e-6)); }
+// The coat's fraction of what both lobes reflect.
+vec3 coat_fraction(Reflected r) { return r.coat / max(r.coat + r.lobe, vec3(1e-6)); }
 
 // BRDF times cosine; `spread` as in specular_times_cosine. The coat dims the light to a diffuse base on its way in, too, as the
 // base's own lobe does (brdf.glsl); other lobes only what leaves, as the extensions have it: so all keep the light.

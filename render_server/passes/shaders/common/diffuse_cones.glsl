@@ -72,7 +72,7 @@ vec3 diffuse_change(vec3 q, vec3 n, ConeSet set) {
 }
 
 #ifdef KEEPS_COVERAGE
-float near_coverage;   // of `diffuse`: share of the hemisphere, by cosine, where surfaces of the volume are
+float near_coverage;   // of `diffuse`: fraction of the hemisphere, by cosine, where surfaces of the volume are
 #endif
 
 // Irradiance without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not occlude

@@ -25,8 +25,8 @@ void inject_patch(Patch lit, vec3 axis, vec3 flux) {
     ivec2 first = max(ivec2(floor(low)), 0), last = min(ivec2(floor(high)), volume_size - 1);   // none outside the volume
     for (int j = first.y; j <= last.y; ++j)
         for (int i = first.x; i <= last.x; ++i) {
-            vec2 from = max(low, vec2(i, j)), to = min(high, vec2(i, j) + 1.0), share = (to - from) / extent, middle = 0.5 * (from + to);
+            vec2 from = max(low, vec2(i, j)), to = min(high, vec2(i, j) + 1.0), fraction = (to - from) / extent, middle = 0.5 * (from + to);
             vec3 part = vec3(middle, q.z + dot(slope, middle - q.xy));
-            inject_at(from_plane_axes(part, steep), axis, flux * share.x * share.y);
+            inject_at(from_plane_axes(part, steep), axis, flux * fraction.x * fraction.y);
         }
 }

@@ -10,7 +10,7 @@ const int TILE = 8, TILE_LEVELS = 4, THREADS = TILE * TILE * TILE;
 int thread() { return int(gl_LocalInvocationIndex); }
 
 // Lets the whole workgroup see what each of its invocations stored.
-void share_stores() {
+void synchronize_stores() {
     memoryBarrierImage();
     barrier();
 }
@@ -20,7 +20,7 @@ void filter_tile(ivec3 tile, int k) {
         int edge = TILE >> done, level = first_level + done, i = thread();
         ivec3 own = ivec3(i % edge, i / edge % edge, i / (edge * edge)), cell = tile * edge + own;
         if (own.z < edge && all(lessThan(cell, ivec3(volume_size >> level)))) write_cell(level, cell, k);
-        share_stores();
+        synchronize_stores();
     }
 }
 
@@ -28,7 +28,7 @@ void filter_above_tiles(int k) {
     for (int level = first_level + TILE_LEVELS; level < first_level + level_count; ++level) {
         int n = volume_size >> level;
         for (int i = thread(); i < n * n * n; i += THREADS) write_cell(level, ivec3(i % n, i / n % n, i / (n * n)), k);
-        share_stores();
+        synchronize_stores();
     }
 }
 

@@ -1,5 +1,5 @@
-// Sums up the bounces beyond those that the voxels hold (docs/method.md 4.3). Of each, about the same share returns to surfaces and
-// is the next one's amount, so all of them add share / (1 - share) times the next one. Needs bounce_tail.glsl, THREADS.
+// Sums up the bounces beyond those that the voxels hold (docs/method.md 4.3). Of each, about the same fraction returns to surfaces and
+// is the next one's amount, so all of them add ratio / (1 - ratio) times the next one. Needs bounce_tail.glsl, THREADS.
 layout(std430) coherent buffer TailSums { int tail_sums[]; };
 layout(rgba16f) writeonly uniform image3D bounce_tail;   // rgb irradiance times area, a: area
 #include "common/workgroup_sum.glsl"
@@ -18,8 +18,8 @@ vec2 summed_amounts(int first, int thread) {
 void sum_tail(int number, int thread) {
     int first = number * TAIL_PLACES;
     vec2 amounts = summed_amounts(first, thread);
-    float share = amounts.y / max(amounts.x, 1.0);   // < 1: no surface reflects all
-    vec4 scale = vec4(vec3(share / (1.0 - share)), 1.0) / TAIL_FIXED_POINT;
+    float ratio = amounts.y / max(amounts.x, 1.0);   // < 1: no surface reflects all
+    vec4 scale = vec4(vec3(ratio / (1.0 - ratio)), 1.0) / TAIL_FIXED_POINT;
     for (int place = thread; place < TAIL_PLACES; place += THREADS) {
         int at = (first + place) * TAIL_SUMS;
         vec4 sums = vec4(tail_sums[at], tail_sums[at + 1], tail_sums[at + 2], tail_sums[at + TAIL_AREA]);

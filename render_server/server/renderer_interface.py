@@ -15,7 +15,7 @@ from deltalight.render_server.camera_frames import CameraFrame
 from deltalight.render_server.frame_budget import Level
 
 
-class OtherView(Protocol):
+class FinishedView(Protocol):
     """A frame in another view (`renderer.OtherView`)."""
 
     @property
@@ -31,7 +31,7 @@ class OtherView(Protocol):
         """The camera's pose; None if the picture is not the camera's."""
 
 
-class Composite(Protocol):
+class FinishedPicture(Protocol):
     """The result of a renderer (`renderer.CompositeFrame`)."""
 
     @property
@@ -71,7 +71,7 @@ class Composite(Protocol):
         """The picture before the camera's response, if requested."""
 
     @property
-    def others(self) -> Sequence[OtherView]:
+    def others(self) -> Sequence[FinishedView]:
         """The same frame in the other views that were requested."""
 
 
@@ -97,7 +97,7 @@ class Pending(Protocol):
         """Whether starting another frame first gains nothing."""
 
     @property
-    def finish(self) -> Callable[[], Composite]:
+    def finish(self) -> Callable[[], FinishedPicture]:
         """Returns the composite; waits for the GPU if it must."""
 
 

@@ -10,7 +10,7 @@ from deltalight.protocol.recording_writer import DiskRefusesError, RecordingWrit
 RETRY_PERIOD_S = 2.0
 
 
-class PatientWriter:
+class RetryingWriter:
     """Gives frames and relit pictures to a writer; while its disk refuses, it leaves them out and tries again.
 
     `frames` and `composites` count what is in the file, `unkept` the frames that are not. `notice(sentence)` tells

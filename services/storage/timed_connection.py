@@ -14,14 +14,14 @@ Answer = TypeVar("Answer")
 Waiting = Generator[Any, Any, Answer]  # as psycopg has it: yields what it waits for, is sent what came
 
 
-class PromptConnection(psycopg.Connection[Any]):
+class TimedConnection(psycopg.Connection[Any]):
     """Closes itself when an answer does not come in time: of a server that hangs, the kernel reports no fault.
 
-    Outside of transactions (`autocommit`) an answer has `SHORT_S`, else `LONG_S`; without `is_prompt` all the time
+    Outside of transactions (`autocommit`) an answer has `SHORT_S`, else `LONG_S`; without `is_timed` all the time
     that it takes.
     """
 
-    is_prompt = True
+    is_timed = True
 
     def wait(self, gen: Waiting[Answer], *args: Any, **kwargs: Any) -> Answer:  # noqa: ANN401 (psycopg's)
         """Wait for an answer.
@@ -29,7 +29,7 @@ class PromptConnection(psycopg.Connection[Any]):
         Raises:
             psycopg.OperationalError: it did not come, and the connection is closed.
         """
-        limited = self._limited(gen, SHORT_S if self.autocommit else LONG_S) if self.is_prompt else gen
+        limited = self._limited(gen, SHORT_S if self.autocommit else LONG_S) if self.is_timed else gen
         return super().wait(limited, *args, **kwargs)
 
     def _limited(self, gen: Waiting[Answer], limit_s: float) -> Waiting[Answer]:

@@ -1,4 +1,4 @@
-"""Stages that methods share: direct light and shading of the visible surfaces (docs/method.md 3)."""
+"""Shades the visible surfaces by stages that methods share: direct light, cones, reflections (docs/method.md 3)."""
 
 import math
 from collections.abc import Callable, Mapping

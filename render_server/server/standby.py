@@ -64,7 +64,7 @@ class _Built:
     files: Stamp
 
 
-class Ahead:
+class StandbyRenderer:
     """Keeps a renderer ready to take over from a running server with these settings.
 
     `is_called` waits for so many seconds and returns whether the spare must take over. A renderer that cannot be
