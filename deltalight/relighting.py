@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from deltalight.checked_input import require_document, require_frames
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame, linear_color
 from deltalight.protocol.method_names import require_method, with_method
@@ -130,8 +131,8 @@ class Renderer:
         Without a pose (the board is out of view) or a visible object, the picture is the camera's.
 
         Raises:
-            DeltalightError: an asset cannot be read, the scene needs more memory than it allows, or the renderer is
-                closed.
+            DeltalightError: an asset cannot be read, the scene needs more memory than it allows, the renderer is
+                closed, or frame or scene are something else: arrays that do not fit the camera, an impossible pose.
         """
         return self.render_views([frame], scene)[0]
 
@@ -147,7 +148,7 @@ class Renderer:
         """
         if self._is_closed:
             raise DeltalightError("The renderer is closed; make another one.")
-        document = self._adjusted(scene.document if isinstance(scene, Scene) else scene)
+        frames, document = require_frames(frames), self._adjusted(require_document(scene))
         with self._gpu.ctx:  # another renderer's may be current
             renderer = self._prepared(document)
             composites = renderer.render_views(frames, with_linear=True)

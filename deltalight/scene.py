@@ -1,7 +1,7 @@
 """A scene that code can change: objects added, moved and removed."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -72,13 +72,11 @@ class Scene:
         Raises:
             DeltalightError: there is no such file, the name is taken, or a value does not fit.
         """
-        found = Path(resolve_asset(str(asset), Path.cwd()))
-        if not found.is_file():
-            raise DeltalightError(f"{asset} does not exist; correct the path.")
+        found = _found(asset)
         name = self._free_name(found.stem) if name is None else name
         if name in self._names():
             raise DeltalightError(f"The scene has an object `{name}` already; give another name.")
-        pose = {"translation_m": tuple(at), "rotation_wxyz": tuple(rotation_wxyz), "scale": scale}
+        pose = {"translation_m": _numbers(at), "rotation_wxyz": _numbers(rotation_wxyz), "scale": scale}
         fields = {"id": name, "asset": str(found), "pose": pose, "material": material}
         added = validate(SceneObject, fields, f"the object `{name}`")
         self.document = self.document.replaced(objects=(*self.document.objects, added))
@@ -87,10 +85,14 @@ class Scene:
     def change(self, name: str, **fields: Any) -> None:  # noqa: ANN401 (whatever an object has)
         """Changes fields of an object, such as `pose`, `material` or `visible`.
 
+        A new `asset` is relative to the working folder, as with `add`.
+
         Raises:
-            DeltalightError: there is no such object, or a field does not fit.
+            DeltalightError: there is no such object or file, or a field does not fit.
         """
         self._require(name)
+        if "asset" in fields:
+            fields["asset"] = str(_found(fields["asset"]))
         objects = [item.replaced(**fields) if item.id == name else item for item in self.document.objects]
         self.document = self.document.replaced(objects=tuple(objects))
 
@@ -100,7 +102,7 @@ class Scene:
         Raises:
             DeltalightError: there is no such object, or no such position.
         """
-        self.change(name, pose=self._require(name).pose.replaced(translation_m=tuple(to)))
+        self.change(name, pose=self._require(name).pose.replaced(translation_m=_numbers(to)))
 
     def remove(self, name: str) -> None:
         """Removes an object.
@@ -126,3 +128,17 @@ class Scene:
                 return item
         known = ", ".join(self._names()) or "none"
         raise DeltalightError(f"The scene has no object `{name}`; it has: {known}.")
+
+
+def _found(asset: str | Path) -> Path:
+    path = Path(resolve_asset(str(asset), Path.cwd()))
+    if path.is_dir():
+        raise DeltalightError(f"{asset} is a folder; name a mesh file.")
+    if not path.is_file():
+        raise DeltalightError(f"{asset} does not exist; correct the path.")
+    return path
+
+
+def _numbers(vector: object) -> object:
+    """A vector as a tuple, as documents have it; what is none stays, so that validation refuses it."""
+    return tuple(vector) if isinstance(vector, Iterable) else vector

@@ -5,12 +5,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self, SupportsIndex, overload
 
+from deltalight.protocol.documents import validate
+from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.source import Source, open_source
 from deltalight.scene import Scene
 from deltalight.sensor_node.cameras.base import Camera, EndOfStream
 from deltalight.sensor_node.cameras.drivers import SYNTHETIC
 from deltalight.sensor_node.cameras.open import is_live, open_camera
+from deltalight.sensor_node.cameras.settings import CameraSettings
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
 FRESH_S = 0.2  # age from which on a live camera's frame is skipped for a newer one
@@ -114,17 +117,26 @@ class LiveTake:
             yield build(frame)
 
 
-def open_take(source: str | Path | Camera) -> Take | LiveTake:
+def open_take(source: str | Path | Camera, *, calibration: str | Path | None = None) -> Take | LiveTake:
     """Opens a take; this is `deltalight.open`.
 
-    A recording (.mcap), a dataset folder, `synthetic`, or a live camera: `uvc:0`, `oak`, `openni2:0`, `orbbec:0`, a
-    plugin's name, or a `Camera` object.
+    Args:
+        source: a recording (.mcap), a dataset folder, `synthetic`, or a live camera: `uvc:0`, `oak`, `openni2:0`,
+            `orbbec:0`, a plugin's name, or a `Camera` object.
+        calibration: of a live camera: the folder that `deltalight calibrate ... --out FOLDER` wrote; None: what the
+            camera itself knows.
 
     Raises:
         DeltalightError: there is no such source, it cannot be read, or its calibration is missing.
     """
+    live = isinstance(source, str) and is_live(source)
+    if calibration is not None and not live:
+        raise DeltalightError(
+            f"{source} has its own calibration; `calibration` is for live cameras, leave it out."
+        )
     if isinstance(source, Camera):
         return LiveTake(source)
-    if isinstance(source, str) and (is_live(source) or source == SYNTHETIC):
-        return LiveTake(open_camera(source), newest=is_live(source))
+    if isinstance(source, str) and (live or source == SYNTHETIC):
+        settings = validate(CameraSettings, {"calibration": calibration}, "the camera's settings")
+        return LiveTake(open_camera(source, settings), newest=live)
     return Take(open_source(Path(source)))

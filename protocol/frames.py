@@ -120,7 +120,7 @@ class SensorFrame:
     composite: bytes | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ViewFrame:
     """The input of one composite.
 
@@ -143,6 +143,11 @@ class ViewFrame:
     radiance_map: RadianceMap | None = None
     lamps: tuple[LampPose, ...] = ()
     sky_lights: SkyLights | None = None
+
+    def __repr__(self) -> str:
+        has = [name for name in ("pose", "depth", "radiance_map") if getattr(self, name) is not None]
+        size = f"{self.camera.width}x{self.camera.height}"
+        return f"<ViewFrame {self.frame_id}, {', '.join([size, *has])}>"
 
 
 def decode_lut(response: Float32[np.ndarray, "256 3"] | None) -> Float32[np.ndarray, "256 3"]:

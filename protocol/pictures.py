@@ -57,10 +57,12 @@ def decode_depth_png(data: bytes, name: str) -> UInt16[np.ndarray, "h w"]:
     """Decode a 16-bit depth picture.
 
     Raises:
-        DeltalightError: the bytes are not a 16-bit picture of one channel.
+        DeltalightError: the bytes are damaged, or not a 16-bit picture of one channel.
     """
     picture = _decode(data, cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.ndim != 2 or picture.dtype != np.uint16:
+    if picture is None:
+        raise DeltalightError(f"the depth picture {name} cannot be decoded; replace it by a 16-bit PNG file.")
+    if picture.ndim != 2 or picture.dtype != np.uint16:
         raise DeltalightError(
             f"the depth picture {name} is not a 16-bit PNG of one channel; convert it to one."
         )

@@ -129,6 +129,13 @@ def _light_type(value: Any) -> Any:  # noqa: ANN401 - whatever the document hold
     return getattr(value, "type", DEFAULT_LIGHT_TYPE)
 
 
+LIGHT_TYPES: dict[str, type[StrictModel]] = {
+    "directional": DirectionalLight,
+    "sphere": SphereLight,
+    "spot": SpotLight,
+    "rectangle": RectangleLight,
+    "ambient": AmbientLight,
+}
 ManualLight = Annotated[
     Annotated[DirectionalLight, Tag("directional")]
     | Annotated[SphereLight, Tag("sphere")]

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,8 @@ import pytest
 import trimesh
 
 import deltalight as dl
+from deltalight.protocol.camera_model import save_camera_yaml
+from deltalight.protocol.frames import BoardPose
 from deltalight.protocol.scene import load_scene
 from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 from deltalight.services.demo import RECORDING, SCENE
@@ -191,10 +194,79 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
             method={"name": "dvct", "volume_siz": 32}
         ),
         "cannot be read|does not exist|no such": lambda: dl.open(tmp_path / "none.mcap"),
+        "`pose.translation_m` is wrong: must be a list": lambda: scene.add(cube, at=5),  # type: ignore[arg-type]
+        "is a folder; name a mesh file": lambda: scene.add(tmp_path),
+        "cup.glb does not exist; correct": lambda: scene.change("knot", asset="cup.glb"),
+        "has its own calibration": lambda: dl.open(RECORDING, calibration=tmp_path),
+        "has no calibration; run .* `calibration`": lambda: dl.open("uvc:0"),
+        "rgb.yaml": lambda: dl.open("uvc:0", calibration=tmp_path),
     }
     for sentence, call in cases.items():
         with pytest.raises(dl.DeltalightError, match=sentence):
             call()
+
+
+def test_a_changed_asset_is_found_from_the_working_folder(
+    scene: dl.Scene, cube: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A saved scene in another folder must still find it."""
+    monkeypatch.chdir(cube.parent)
+    scene.change("knot", asset=cube.name)
+    scene.save(tmp_path / "saved.json")
+    assert dl.Scene.load(tmp_path / "saved.json").document.objects[0].asset == str(cube)
+
+
+def test_a_live_camera_is_opened_with_its_calibration(tmp_path: Path, take: dl.Take) -> None:
+    folder = tmp_path / "calibration"
+    folder.mkdir()
+    save_camera_yaml(folder / "rgb.yaml", take[0].camera, "rgb")
+    assert isinstance(dl.open("uvc:0", calibration=str(tmp_path)), dl.LiveTake)
+
+
+def test_frames_of_a_programs_own_are_checked(take: dl.Take, scene: dl.Scene) -> None:
+    """Arrays that do not fit were read beyond their ends; one exposure of 0 spoilt all later pictures."""
+    frame = take[0]
+    assert frame.pose is not None
+    assert frame.depth is not None
+    pose, depth = frame.pose.world_from_camera, frame.depth
+    with dl.Renderer() as renderer:
+        before = renderer.render(frame, scene)
+        cases: dict[str, object] = {
+            r"color must be an array of uint8 \(480, 640, 3\), and is float32": replace(
+                frame, color=frame.color.astype(np.float32)
+            ),
+            r"uint8 \(480, 640, 3\), and is uint8 \(480, 640\)": replace(frame, color=frame.color[..., 0]),
+            r"and is uint8 \(100, 100, 3\); convert it": replace(frame, color=frame.color[:100, :100]),
+            "the frame's pose is not a rigid transform": replace(frame, pose=BoardPose(pose * np.nan)),
+            "the frame's pose must be a 4x4 matrix": replace(frame, pose=BoardPose(pose[:3])),
+            r"write `BoardPose\(world_from_camera\)`": replace(frame, pose=pose),  # type: ignore[arg-type]
+            "depth is `ndarray`; give a DepthImage": replace(frame, depth=depth.depth_m),  # type: ignore[arg-type]
+            r"depth.depth_m must be an array of float32 \(480, 640\)": replace(
+                frame, depth=replace(depth, depth_m=depth.depth_m[:100])
+            ),
+            "depth.valid must be an array of bool": replace(
+                frame, depth=replace(depth, valid=depth.valid.astype(np.uint8))
+            ),
+            "exposure_scale is 0.0; give a number above 0": replace(frame, exposure_scale=0.0),
+            "response must be an array of float32": replace(frame, response=np.zeros(256, np.float32)),
+            "A frame is needed and `ndarray` was given": frame.color,
+            "A frame is needed and None was given": None,
+        }
+        for sentence, wrong in cases.items():
+            with pytest.raises(dl.DeltalightError, match=sentence):
+                renderer.render(wrong, scene)  # type: ignore[arg-type]
+        with pytest.raises(
+            dl.DeltalightError, match=r"A list with a frame of each camera .* write `\[frame\]`"
+        ):
+            renderer.render_views(frame, scene)  # type: ignore[arg-type]
+        for no_scene in (None, "scene.json", {"objects": []}):
+            with pytest.raises(
+                dl.DeltalightError, match=r"A scene is needed and .* load one with `Scene.load`"
+            ):
+                renderer.render(frame, no_scene)  # type: ignore[arg-type]
+        (after,) = renderer.render_views((each for each in take[:1]), scene)
+    assert (after.color == before.color).all()
+    assert repr(frame) == "<ViewFrame 0, 640x480, pose, depth>"
 
 
 def test_a_closed_renderer_says_so(take: dl.Take, scene: dl.Scene) -> None:

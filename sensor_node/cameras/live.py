@@ -97,7 +97,7 @@ def colour_camera(
     if known is None and calibrated:
         raise DeltalightError(
             f"{source} has no calibration; run `deltalight calibrate camera`, then name the folder that holds "
-            "rgb.yaml with --calibration."
+            "rgb.yaml with --calibration (in Python: `calibration`)."
         )
     if known is None:
         focal = width / 2 / np.tan(NOMINAL_FIELD_RAD / 2)

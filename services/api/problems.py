@@ -159,6 +159,10 @@ class Problems:
         first = fault.errors()[0]
         if first["type"] == "json_invalid":
             return self._not_json()
+        if isinstance(fault.body, bytes):  # as curl sends it without being told the type
+            return self.response(
+                422, "invalid", "Send the body as JSON, with Content-Type: application/json."
+            )
         return self.response(422, "invalid", f"`{_place(first['loc'])}` is wrong: {wrong_in_words(first)}.")
 
 

@@ -30,6 +30,8 @@ Model = TypeVar("Model", bound=BaseModel)
 
 def _as_sent(value: object, _validate: ValidatorFunctionWrapHandler) -> object:
     """Leave the body unvalidated; its model only describes it."""
+    if isinstance(value, bytes):  # of another media type
+        raise ValueError("must be JSON")
     return value
 
 

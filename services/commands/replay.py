@@ -52,7 +52,7 @@ def replay(
         raise DeltalightError("--paused needs --control, the endpoint at which it is resumed.")
     length_s = (frames.timestamps_ns[-1] - frames.timestamps_ns[0]) / 1e9
     if start is not None and start > length_s:
-        raise DeltalightError(f"{source} is {length_s:.1f} s long; give --start less than that.")
+        raise DeltalightError(f"{source} is {length_s:.1f} s long; start it before that.")
     camera: PlaybackCamera | None = None
     if not fast:
         camera = PlaybackCamera(

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_lights import LIGHT_TYPES
 from deltalight.services.storage.faults import NotFoundError, StaleRevisionError
 
 Document = dict[str, Any]
@@ -143,10 +144,22 @@ def replace_light(index: int, value: object) -> Edit:
 
 
 def patch_light(index: int, patch: object) -> Edit:
-    """Return an edit that merges a patch into one manual light."""
-    return _edit_lights(
-        lambda lights: _with_lights(lights, index, [merge_patch(light_at(lights, index), patch)])
-    )
+    """Return an edit that merges a patch into one manual light.
+
+    A patch that names another type keeps what lights of that type have too, such as place and colour.
+    """
+
+    def edit(lights: list[Any]) -> list[Any]:
+        light = _for_new_type(light_at(lights, index), patch)
+        return _with_lights(lights, index, [merge_patch(light, patch)])
+
+    return _edit_lights(edit)
+
+
+def _for_new_type(light: Document, patch: object) -> Document:
+    named = patch.get("type") if isinstance(patch, Mapping) else None
+    model = LIGHT_TYPES.get(named) if isinstance(named, str) else None
+    return light if model is None else {key: light[key] for key in light if key in model.model_fields}
 
 
 def remove_light(index: int) -> Edit:

@@ -228,7 +228,7 @@ class SceneStore:
         with self._writing() as session:
             _scene(session, scene_id)
             document = _document(session, _newest(session, scene_id)).model_dump(mode="json")
-            document["name"] = f"{document['name']} (copy)"[-200:] if name is None else name
+            document["name"] = f"{document['name']} (copy)".lstrip()[-200:] if name is None else name
             added = self._add(session, document, f"copied from {scene_id}")
         return self._noted(added)
 

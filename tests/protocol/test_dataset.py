@@ -210,7 +210,7 @@ BAD_FOLDERS: list[tuple[Callable[[Path], None], str]] = [
     (edit("calibration/extrinsics.yaml", "depth_from_rgb: [1, 2]\n"), "4x4 matrix"),
     (edit("fisheye.txt", "1 rgb/0.png\n1 rgb/1.png\n"), "bracket without exposures"),
     (edit("rgb/0.png", "no picture"), r"0\.png cannot be decoded"),
-    (edit("depth/0.png", ""), "not a 16-bit PNG"),
+    (edit("depth/0.png", ""), "depth/0.png cannot be decoded; replace it by a 16-bit PNG"),
     (
         picture("rgb/0.png", np.zeros((8, 8, 3), np.uint8)),
         r"0\.png has 8x8 pixels but calibration/rgb\.yaml says 32x24",
@@ -352,5 +352,5 @@ def test_a_picture_that_states_more_than_its_bytes_can_hold_is_refused_undecoded
     for data in lies:
         with pytest.raises(DeltalightError, match="cannot be decoded"):
             decode_rgb(data, "picture")
-        with pytest.raises(DeltalightError, match="not a 16-bit PNG"):
+        with pytest.raises(DeltalightError, match=r"depth picture .* cannot be decoded"):
             decode_depth_png(data, "picture")

@@ -190,6 +190,7 @@ def test_a_render_server_that_comes_back_is_told_again(api: RunningApi, client: 
         ({"recording": "../take"}, 422, "recording"),
         ({"recording": "take", "rate": 0}, 422, "rate"),
         ({"recording": "take", "position_s": -1}, 422, "position_s"),
+        ({"recording": "take", "position_s": 1000}, 422, "s long; start it before that"),
         ({}, 422, "the key `recording` is missing"),
     ],
 )

@@ -164,6 +164,13 @@ def test_manual_lights_one_by_one(client: httpx.Client) -> None:
     one = client.get(f"{address}/1")
     assert (one.json()["intensity"], one.json()["position_m"], one.headers["etag"]) == (3, [0, 0, 1], '"3"')
     assert "lights.manual[1].intensity" in sentence(client.patch(f"{address}/1", json={"intensity": -1}), 422)
+    spot = client.patch(f"{address}/1", json={"type": "spot"})
+    assert spot.status_code == 200, spot.text
+    assert client.get(f"{address}/1").json()["position_m"] == [0, 0, 1]
+    even = client.patch(f"{address}/1", json={"type": "ambient"})
+    assert even.status_code == 200, even.text
+    assert "unknown kind `lamp`" in sentence(client.patch(f"{address}/1", json={"type": "lamp"}), 422)
+    assert "lights.manual[1]" in sentence(client.patch(f"{address}/1", json={"type": ["spot"]}), 422)
     client.put(f"{address}/1", json={"type": "directional", "direction": [0, 0, -1]}).raise_for_status()
     assert client.delete(f"{address}/0").status_code == 200
     assert [light["type"] for light in client.get(address).json()] == ["directional"]
@@ -291,10 +298,9 @@ def test_merge_patch_has_its_own_media_type_and_forms_are_refused(client: httpx.
     patch = {"Content-Type": "application/merge-patch+json"}
     assert client.patch(address, content=b'{"name": "a"}', headers=patch).json()["revision"] == 2
     for simple in ("text/plain", "application/x-www-form-urlencoded"):  # what pages of other sites may send
-        assert (
-            client.patch(address, content=b'{"name": "b"}', headers={"Content-Type": simple}).status_code
-            == 422
-        )
+        for send in (client.patch, client.put):  # a patch is a dictionary, a document has a model
+            refused = send(address, content=b'{"name": "b"}', headers={"Content-Type": simple})
+            assert "with Content-Type: application/json" in sentence(refused, 422)
     assert client.get(address).json()["revision"] == 2
 
 

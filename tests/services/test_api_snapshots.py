@@ -93,7 +93,16 @@ def test_the_order_names_views_and_methods(api: RunningApi, server: Recorder, fo
     listed = api.client.get("/snapshots").json()
     assert [each["files"] for each in listed] == [["paper.png", "d.png"]]
     refused = api.client.get(f"/snapshots/{listed[0]['id']}/before-after.gif")
-    assert "no file 'camera.png'" in sentence(refused, 404)
+    assert "no picture of view `camera`; take one that has" in sentence(refused, 404)
+
+
+@pytest.mark.usefixtures("server", "folder")
+def test_before_and_after_are_found_by_their_views(api: RunningApi) -> None:
+    wanted = [{"name": "after", "view": "composite"}, {"name": "plate", "view": "camera"}]
+    taken = api.client.post("/snapshots", json={"pictures": wanted})
+    assert taken.status_code == 201, taken.text
+    moving = api.client.get(f"/snapshots/{taken.json()['id']}/before-after.gif")
+    assert moving.status_code == 200, moving.text
 
 
 @pytest.mark.parametrize(

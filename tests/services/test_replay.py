@@ -81,7 +81,7 @@ def test_a_fast_replay_ends_and_takes_no_camera_from_the_configuration(cli: RunC
         (["uvc:0"], "give a dataset folder or an .mcap recording"),
         (["{folder}"], "has no rgb.txt"),
         (["{folder}/a.mcap", "--publish", "127.0.0.1"], "is not an endpoint"),
-        (["{folder}/a.mcap", "--start", "1e9"], "a.mcap is 0.0 s long; give --start less than that"),
+        (["{folder}/a.mcap", "--start", "1e9"], "a.mcap is 0.0 s long; start it before that"),
         (["{folder}/a.mcap", "--name", "a b"], "`name` is wrong: must be letters, digits, dashes"),
     ],
 )

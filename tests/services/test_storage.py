@@ -178,6 +178,10 @@ def test_scenes_are_copied_listed_and_deleted(store: Store) -> None:
         store.scenes.get(copy.head.id)
 
 
+def test_a_copy_of_a_scene_without_a_name_is_named_without_a_space(store: Store) -> None:
+    assert store.scenes.duplicate(store.scenes.create({}).head.id).document.name == "(copy)"
+
+
 def test_everything_is_there_after_reopening(tmp_path: Path, database: str | None) -> None:
     with Store(tmp_path, database=database, probe=trusting_probe) as store:
         scene_id = store.scenes.create({"name": "kept"}).head.id

@@ -22,6 +22,7 @@ from deltalight.services.api.routes.assets import UNCHANGING
 from deltalight.services.api.routes.live import NO_ANSWER
 from deltalight.services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
 from deltalight.services.before_after import before_after_gif, write_before_after_video
+from deltalight.services.storage.faults import NotFoundError
 
 router = APIRouter(tags=["snapshots"], prefix="/snapshots")
 ROUTERS = (router,)
@@ -124,7 +125,7 @@ def get_snapshot(shared: Shared, snapshot_id: SnapshotId) -> SnapshotFacts:
 @in_pool("thumbnails")
 def snapshot_before_after(shared: Shared, snapshot_id: SnapshotId) -> Response:
     """Return an animation in which a moving line divides the camera's picture from the composite."""
-    before, after = (_picture(shared.snapshots.file(snapshot_id, f"{view}.png")) for view in BEFORE_AFTER)
+    before, after = _before_and_after(shared, snapshot_id)
     return Response(before_after_gif(before, after), media_type="image/gif", headers=UNCHANGING)
 
 
@@ -136,7 +137,7 @@ def snapshot_before_after(shared: Shared, snapshot_id: SnapshotId) -> Response:
 @in_pool("thumbnails")
 def snapshot_before_after_video(shared: Shared, snapshot_id: SnapshotId) -> Response:
     """Return the same as a full-size video (H.264) of a few seconds; needs the package `av`."""
-    before, after = (_picture(shared.snapshots.file(snapshot_id, f"{view}.png")) for view in BEFORE_AFTER)
+    before, after = _before_and_after(shared, snapshot_id)
     with TemporaryDirectory(prefix=".video-", dir=shared.store.folder) as folder:
         path = FilePath(folder) / "before-after.mp4"
         write_before_after_video(path, before, after)
@@ -186,6 +187,16 @@ def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) ->
         pictures=[_described(picture, files, faults) for picture in wanted.pictures],
         files=files,
     )
+
+
+def _before_and_after(shared: Context, snapshot_id: str) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Return the camera's picture and the first composite."""
+    files = [(each.view, each.file) for each in shared.snapshots.get(snapshot_id).pictures if each.file]
+    found = dict(reversed(files))
+    for view in BEFORE_AFTER:
+        if view not in found:
+            raise NotFoundError(f"the snapshot has no picture of view `{view}`; take one that has.")
+    return [_picture(shared.snapshots.file(snapshot_id, found[view])) for view in BEFORE_AFTER]
 
 
 def _picture(path: FilePath) -> UInt8[np.ndarray, "h w 3"]:

@@ -14,7 +14,9 @@ export function SnapshotCard({ snapshot }: { readonly snapshot: Snapshot }) {
   const poster = snapshot.files.includes("composite.png")
     ? "composite.png"
     : snapshot.files.find((file) => file.endsWith(".png"));
-  const hasBoth = ["camera.png", "composite.png"].every((file) => snapshot.files.includes(file));
+  const hasBoth = ["camera", "composite"].every((view) =>
+    snapshot.pictures.some((picture) => picture.view === view && picture.file !== null),
+  );
   const files = hasBoth ? [...snapshot.files, ...MOVING] : snapshot.files;
   const entries: MenuEntry[] = [
     ...files.map((file): MenuEntry => ({

@@ -1,0 +1,86 @@
+"""Checks of the frames and scenes that a program passes to a renderer: what it made itself may be anything."""
+
+import math
+
+import numpy as np
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
+from deltalight.protocol.poses import require_rigid
+from deltalight.protocol.scene import SceneDocument
+from deltalight.scene import Scene
+
+
+def require_document(scene: object) -> SceneDocument:
+    """Returns the document of a scene.
+
+    Raises:
+        DeltalightError: it is neither a scene nor a scene document.
+    """
+    document = scene.document if isinstance(scene, Scene) else scene
+    if not isinstance(document, SceneDocument):
+        raise DeltalightError(
+            f"A scene is needed and {_kind(document)} was given; load one with `Scene.load`, or take `Scene()`."
+        )
+    return document
+
+
+def require_frames(frames: object) -> list[ViewFrame]:
+    """Returns frames as a list: one for each camera.
+
+    Raises:
+        DeltalightError: they are no frames, or one has arrays that do not fit its camera, or no possible pose.
+    """
+    if isinstance(frames, ViewFrame) or not hasattr(frames, "__iter__"):
+        raise DeltalightError(
+            f"A list with a frame of each camera is needed and {_kind(frames)} was given; write `[frame]`."
+        )
+    return [_require_frame(frame) for frame in frames]
+
+
+def _require_frame(frame: object) -> ViewFrame:
+    if not isinstance(frame, ViewFrame):
+        raise DeltalightError(
+            f"A frame is needed and {_kind(frame)} was given; take one of `deltalight.open(...)`."
+        )
+    size = (frame.camera.height, frame.camera.width)
+    _require_array(frame.color, "color", np.uint8, (*size, 3))
+    if frame.response is not None:
+        _require_array(frame.response, "response", np.floating, (256, 3))
+    if not (math.isfinite(frame.exposure_scale) and frame.exposure_scale > 0):
+        raise DeltalightError(f"The frame's exposure_scale is {frame.exposure_scale}; give a number above 0.")
+    _require_depth(frame.depth)
+    _require_pose(frame.pose)
+    return frame
+
+
+def _require_depth(depth: object) -> None:
+    if depth is None:
+        return
+    if not isinstance(depth, DepthImage):
+        raise DeltalightError(f"The frame's depth is {_kind(depth)}; give a DepthImage.")
+    size = (depth.camera.height, depth.camera.width)
+    _require_array(depth.depth_m, "depth.depth_m", np.floating, size)
+    _require_array(depth.valid, "depth.valid", np.bool_, size)
+
+
+def _require_pose(pose: object) -> None:
+    if pose is None:
+        return
+    if not isinstance(pose, BoardPose):
+        raise DeltalightError(f"The frame's pose is {_kind(pose)}; write `BoardPose(world_from_camera)`.")
+    require_rigid(pose.world_from_camera, "the frame's pose")
+
+
+def _require_array(array: object, name: str, kind: type[np.generic], shape: tuple[int, ...]) -> None:
+    if isinstance(array, np.ndarray) and np.issubdtype(array.dtype, kind) and array.shape == shape:
+        return
+    found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else _kind(array)
+    wanted = {np.floating: "float32", np.bool_: "bool"}.get(kind, kind.__name__)
+    raise DeltalightError(
+        f"The frame's {name} must be an array of {wanted} {shape}, and is {found}; convert it."
+    )
+
+
+def _kind(value: object) -> str:
+    return "None" if value is None else f"`{type(value).__name__}`"
