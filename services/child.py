@@ -154,20 +154,22 @@ def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subproces
     return open_process(arguments, subprocess.PIPE, spare_environment(prepared))
 
 
-def fork_spares(commands: Mapping[str, str]) -> dict[str, Process]:
-    """Fork a spare of each command, by the name of its process, for a `Supervisor` (`ending_spares`).
+def fork_spares(
+    commands: Mapping[str, str], earlier: Mapping[str, Process] | None = None
+) -> dict[str, Process]:
+    """Fork a spare of each command, by the name of its process, and return them with the `earlier` ones.
 
-    They share what this process has imported. Only Linux forks safely; elsewhere they are started.
+    They are for a `Supervisor` (`ending_spares`), and share what this process has imported. Only Linux forks safely,
+    and only a process with one thread; elsewhere they are started.
 
     Raises:
         InForkedChild: in each of them.
     """
-    spares: dict[str, Process] = {}
-    forked: list[ForkedProcess] = []
+    spares = dict(earlier or {})
     for name, command in commands.items():
-        if sys.platform.startswith("linux"):
-            forked.append(fork((command,), spare_environment(PREPARED[command]), forked))
-            spares[name] = forked[-1]
+        if sys.platform.startswith("linux") and threading.active_count() == 1:
+            forked = [each for each in spares.values() if isinstance(each, ForkedProcess)]
+            spares[name] = fork((command,), spare_environment(PREPARED[command]), forked)
         else:
             spares[name] = open_spare(ChildSpec.deltalight(name, command).arguments, PREPARED[command])
     return spares

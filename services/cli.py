@@ -51,7 +51,7 @@ from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
 LIVE_COMMANDS = frozenset(
-    {"node", "server", "api", "demo"}
+    {"node", "server", "api", "demo", "up"}
 )  # they do the same for each frame, or fork who does
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
