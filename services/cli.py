@@ -42,7 +42,6 @@ from deltalight.services.commands.server import server
 from deltalight.services.commands.stream import stream
 from deltalight.services.commands.up import up
 from deltalight.services.commands.virtual_camera import virtual_camera
-from deltalight.services.logs import configure_logging
 from deltalight.services.open_files import allow_many_connections
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.process import InForkedChild
@@ -128,6 +127,8 @@ def _global_options(
     ] = False,
 ) -> None:
     del debug, version
+    from deltalight.services.logs import configure_logging  # as long as `--help` itself
+
     configure_logging(log_level)
 
 
