@@ -22,8 +22,9 @@ from deltalight.services import ports
 from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import demo_plan, demo_scene
 from deltalight.services.host import HostPlan
-from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.host_store import activate_document
 from deltalight.services.offline import with_output
+from deltalight.services.session_file import session_file
 from deltalight.services.storage.store import Store
 from deltalight.services.supervisor import Supervisor
 

@@ -30,12 +30,19 @@ def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, 
 
 
 def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
-    """Return the map coordinates in 0..1 of directions of any length."""
-    d = np.asarray(direction)
-    d = d / np.abs(d).sum(axis=-1, keepdims=True)
-    p = d[..., :2]
-    folded = np.copysign(1 - np.abs(p[..., ::-1]), p)
-    return np.asarray(np.where(d[..., 2:] < 0, folded, p) / 2 + 0.5)
+    """Return the map coordinates in 0..1 of directions of any length.
+
+    Components apart take numpy half the time that vectors of three do.
+    """
+    x, y, z = np.moveaxis(np.asarray(direction), -1, 0)
+    length = np.abs(x) + np.abs(y) + np.abs(z)
+    u, v, is_below = x / length, y / length, z / length < 0
+    uv = np.empty((*u.shape, 2), u.dtype)
+    uv[..., 0] = np.where(is_below, np.copysign(1 - np.abs(v), u), u)
+    uv[..., 1] = np.where(is_below, np.copysign(1 - np.abs(u), v), v)
+    uv /= 2
+    uv += 0.5
+    return uv
 
 
 @cache

@@ -21,6 +21,7 @@ from deltalight.services.warm_spare import PREPARED, rehearse_spare, spare_envir
 
 NODE, SERVER, WEB = "sensor node", "render server", "web process"  # names of a host's processes
 SPARE_AFTER_S = 4.0  # of a process's life: most have started by then
+FIRST_PICTURE_S = 30.0  # how long spares wait for it at most: there may be no camera
 STOP_TIMEOUT_S = 1.5  # then SIGKILL; all are gone within 2 s
 KEPT_LINES = 20
 
@@ -30,6 +31,9 @@ class Watch(Protocol):
 
     def fault(self) -> str | None:
         """Return what shows that it hangs, None while nothing does."""
+
+    def is_starting(self) -> bool:
+        """Whether it has not done yet what it is for."""
 
     def close(self) -> None:
         """Stop watching."""
@@ -86,6 +90,11 @@ class Child:
             self.watch = self.spec.watch(self.process.pid)
         self.reader = threading.Thread(target=self._read, args=(self.process,), daemon=True)
         self.reader.start()
+
+    def is_starting(self) -> bool:
+        """Whether it is young and not seen to do yet what it is for."""
+        is_young = time.monotonic() - self.started_s < FIRST_PICTURE_S
+        return is_young and self.watch is not None and self.watch.is_starting()
 
     def start_spare_if_due(self) -> None:
         """Start a spare once the process itself has had the time to start; none again for one that died."""
@@ -154,20 +163,22 @@ def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subproces
     return open_process(arguments, subprocess.PIPE, spare_environment(prepared))
 
 
-def fork_spares(commands: Mapping[str, str]) -> dict[str, Process]:
-    """Fork a spare of each command, by the name of its process, for a `Supervisor` (`ending_spares`).
+def fork_spares(
+    commands: Mapping[str, str], earlier: Mapping[str, Process] | None = None
+) -> dict[str, Process]:
+    """Fork a spare of each command, by the name of its process, and return them with the `earlier` ones.
 
-    They share what this process has imported. Only Linux forks safely; elsewhere they are started.
+    They are for a `Supervisor` (`ending_spares`), and share what this process has imported. Only Linux forks safely,
+    and only a process with one thread; elsewhere they are started.
 
     Raises:
         InForkedChild: in each of them.
     """
-    spares: dict[str, Process] = {}
-    forked: list[ForkedProcess] = []
+    spares = dict(earlier or {})
     for name, command in commands.items():
-        if sys.platform.startswith("linux"):
-            forked.append(fork((command,), spare_environment(PREPARED[command]), forked))
-            spares[name] = forked[-1]
+        if sys.platform.startswith("linux") and threading.active_count() == 1:
+            forked = [each for each in spares.values() if isinstance(each, ForkedProcess)]
+            spares[name] = fork((command,), spare_environment(PREPARED[command]), forked)
         else:
             spares[name] = open_spare(ChildSpec.deltalight(name, command).arguments, PREPARED[command])
     return spares

@@ -42,7 +42,6 @@ from deltalight.services.commands.server import server
 from deltalight.services.commands.stream import stream
 from deltalight.services.commands.up import up
 from deltalight.services.commands.virtual_camera import virtual_camera
-from deltalight.services.logs import configure_logging
 from deltalight.services.open_files import allow_many_connections
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.process import InForkedChild
@@ -51,7 +50,7 @@ from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
 LIVE_COMMANDS = frozenset(
-    {"node", "server", "api", "demo"}
+    {"node", "server", "api", "demo", "up"}
 )  # they do the same for each frame, or fork who does
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
@@ -128,6 +127,8 @@ def _global_options(
     ] = False,
 ) -> None:
     del debug, version
+    from deltalight.services.logs import configure_logging  # as long as `--help` itself
+
     configure_logging(log_level)
 
 

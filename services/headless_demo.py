@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ from deltalight.services import ports
 from deltalight.services.child import NODE, SERVER
 from deltalight.services.collector import CompositeCollector, summarize
 from deltalight.services.demo import demo_plan, demo_scene
-from deltalight.services.files import make_output_folder
-from deltalight.services.host_store import session_file
+from deltalight.services.process import Process
 from deltalight.services.progress import Progress
+from deltalight.services.session_file import session_file
 from deltalight.services.supervisor import POLL_INTERVAL_S, Supervisor
 
 FIRST_FRAME_PATIENCE_S = 120.0  # in which no process is at work
@@ -21,22 +22,26 @@ PATIENCE_S = 60.0
 LONGEST_FRAME_S = 1800.0  # after it whoever is still at work hangs
 
 
-def run_headless(method: str, frames: int, out: Path, *, as_json: bool) -> None:
-    """Collect `frames` composites in `out`, with a contact sheet and a video, and print a summary.
+def run_headless(
+    method: str, frames: int, out: Path, *, as_json: bool, spares: Mapping[str, Process]
+) -> None:
+    """Collect `frames` composites in the folder `out`, with a contact sheet and a video, and print a summary.
+
+    `spares` become the demo's processes, by name.
 
     Raises:
         DeltalightError: the output cannot be written, a process died for good, or no composites came.
     """
-    scene = demo_scene(method)
-    make_output_folder(out)
-    summary = collect_composites(scene, frames, out)
+    summary = collect_composites(demo_scene(method), frames, out, spares)
     if as_json:
         print(json.dumps(summary))
     else:
         _print_summary(summary, out)
 
 
-def collect_composites(scene: SceneDocument, frames: int, out: Path | None) -> dict[str, Any]:
+def collect_composites(
+    scene: SceneDocument, frames: int, out: Path | None, spares: Mapping[str, Process] | None = None
+) -> dict[str, Any]:
     """Play the demo's recording through real processes and collect composites (into `out`, if given).
 
     Raises:
@@ -46,7 +51,7 @@ def collect_composites(scene: SceneDocument, frames: int, out: Path | None) -> d
         plan = demo_plan(session)
         composites = ports.endpoint(plan.composite_port)
         with (
-            Supervisor(plan.specs()) as supervisor,
+            Supervisor(plan.specs(), spares=spares) as supervisor,
             Progress({NODE: ports.endpoint(plan.node_port), SERVER: composites}) as progress,
         ):
             collector = CompositeCollector(composites, ports.endpoint(plan.control_port), out)

@@ -76,6 +76,8 @@ class HostCommands:
 class HostPlan:
     """The processes of this host; `session_file` holds the scene document, which survives a server's restart.
 
+    It is None until there is one: only `specs` needs it.
+
     `source` is what the node of this host captures; None = there is no node, and the server looks for the one called
     `remote_node` on the network. `config` is the configuration file of all processes; None = the one they find, which
     overrides the defaults here. `data` is the folder of scenes of the web process, which runs only if it is given.
@@ -85,7 +87,7 @@ class HostPlan:
     """
 
     source: str | None
-    session_file: Path
+    session_file: Path | None
     remote_node: str = ""
     config: Path | None = Path(os.devnull)
     node_port: int = ports.NODE_PORT
@@ -99,6 +101,12 @@ class HostPlan:
     loop: bool = True
     log_level: str = "info"
     spares: bool = False
+
+    @property
+    def commands(self) -> dict[str, str]:
+        """The commands that the processes run, by their names; the one that takes longest to start comes first."""
+        node = {} if self.source is None else {NODE: "node" if self.playback_port is None else "replay"}
+        return {SERVER: "server", **node, **({} if self.data is None else {WEB: "api"})}
 
     def specs(self) -> list[ChildSpec]:
         """Return the children to supervise, in the order of the stream."""
@@ -134,6 +142,7 @@ class HostPlan:
         return self._commands.node(NODE, source, publish, clock, *loop)
 
     def _server(self) -> ChildSpec:
+        assert self.session_file is not None
         publish, control = ports.endpoint(self.composite_port), ports.endpoint(self.control_port)
         spec = self._commands.server(SERVER, self.session_file, publish, control, self.device, *self._frames)
         return replace(spec, watch=self._watchdog)

@@ -3,12 +3,9 @@
 Only the command line imports files by their paths, never a REST client.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from deltalight.protocol.files import write_bytes
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument, load_scene
 from deltalight.protocol.source import Source
 from deltalight.services.api.settings import ApiSettings
@@ -29,20 +26,6 @@ def open_store(folder: Path, config_file: Path | None = None, database: str | No
     """
     settings = load_configuration(config_file).section("api", ApiSettings)
     return Store(folder, database=database or settings.database, assets=settings.assets)
-
-
-@contextmanager
-def session_file(scene: SceneDocument) -> Iterator[Path]:
-    """Yield a temporary file with the scene document, for the render server's `--session`."""
-    with TemporaryDirectory(prefix="deltalight-") as folder:
-        path = Path(folder) / "scene.json"
-        write_scene(path, scene)
-        yield path
-
-
-def write_scene(path: Path, scene: SceneDocument) -> None:
-    """Write a scene document for the render server's `--session`."""
-    write_bytes(path, scene.model_dump_json(indent=1).encode())
 
 
 def activate_document(store: Store, document: SceneDocument) -> SceneDocument:

@@ -68,9 +68,14 @@ class Supervisor:
         return {child.spec.name: max(child.started - 1, 0) for child in self._children}
 
     def poll(self) -> None:
-        """Check every child once; kill one that hangs and restart one that died, but not one that ended well."""
+        """Check every child once; kill one that hangs and restart one that died, but not one that ended well.
+
+        Spares would take the processor from whoever still starts, so they come afterwards.
+        """
+        are_starting = any(child.is_starting() for child in self._children)
         for child in self._children:
-            child.start_spare_if_due()
+            if not are_starting:
+                child.start_spare_if_due()
             child.end_if_hanging()
             code = None if child.process is None else child.process.poll()
             if code is not None:

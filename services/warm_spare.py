@@ -20,6 +20,13 @@ PREPARED = {  # by spares of a command
     "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings", "blosc2"),
     "api": ("deltalight.services.api.serve", "pydantic_settings"),
 }
+SHARED = (  # what all of them import: whoever forks them imports it once
+    "deltalight.protocol.codecs",
+    "deltalight.services.host",
+    "deltalight.services.watchdog",
+    "pydantic_settings",
+    "blosc2",
+)
 ENDED_BY_SIGNAL = 128  # and the signal's number is the exit code
 
 
@@ -115,8 +122,7 @@ def wait_if_spare(run: Callable[[list[str]], int]) -> None:
     prepared = os.environ.pop(SPARE_VARIABLE, None)
     if prepared is None:
         return
-    with uncollected():
-        _prepare([name for name in prepared.split(",") if name])
+    prepare([name for name in prepared.split(",") if name])
     _spare = Spare(sys.stdin.fileno())
     while (told := _spare.next_line()).startswith(REHEARSE):
         _spare.rehearse(json.loads(told[len(REHEARSE) :]), run)
@@ -129,8 +135,10 @@ def wait_if_spare(run: Callable[[list[str]], int]) -> None:
     os.close(nothing)
 
 
-def _prepare(names: Sequence[str]) -> None:
-    for name in names:
-        found = pkgutil.resolve_name(name)
-        if callable(found):
-            found()
+def prepare(names: Sequence[str]) -> None:
+    """Prepare these (`spare_environment`) in this process."""
+    with uncollected():
+        for name in names:
+            found = pkgutil.resolve_name(name)
+            if callable(found):
+                found()

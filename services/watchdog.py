@@ -126,6 +126,10 @@ class Watchdog:
         """Return what shows that the process hangs, None while nothing does (any thread)."""
         return self._heartbeat.fault(time.monotonic())
 
+    def is_starting(self) -> bool:
+        """Whether it has reported neither pictures nor a fault yet (any thread)."""
+        return self.newest is None or self.newest.state in ("starting", "waiting")
+
     def close(self) -> None:
         """Stop listening; does not wait for an answer that is still expected."""
         self._closing.set()

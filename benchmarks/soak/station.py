@@ -28,7 +28,8 @@ from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.demo import RECORDING, demo_scene
 from deltalight.services.host import HostPlan
-from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.host_store import activate_document
+from deltalight.services.session_file import session_file
 from deltalight.services.storage.store import Store
 from deltalight.services.supervisor import Supervisor
 

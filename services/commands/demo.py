@@ -11,8 +11,7 @@ from deltalight.services.child import NODE, SERVER, WEB, ending_spares, fork_spa
 from deltalight.services.commands.options import MethodName
 from deltalight.services.ports import PAGE_PORT, require_free
 from deltalight.services.uncollected import uncollected
-
-EARLY = {SERVER: "server", NODE: "replay", WEB: "api"}
+from deltalight.services.warm_spare import SHARED, prepare
 
 
 def demo(
@@ -40,16 +39,23 @@ def demo(
     if out is not None or as_json:
         raise DeltalightError("--out and --json are for a headless demo; add --headless, or leave them out.")
     require_free(port, "dashboard", "--port")
+    prepare(SHARED)
+    early = fork_spares({SERVER: "server", NODE: "replay"})  # they need not wait for the storage's libraries
     with uncollected():
-        from deltalight.services.demo import run_live
+        from deltalight.services.live_demo import run_live
 
-    with ending_spares(fork_spares(EARLY)) as spares:  # each imports what else it needs while the others do
+    with ending_spares(fork_spares({WEB: "api"}, early)) as spares:
         run_live(method, port=port, with_browser=not no_browser, spares=spares)
 
 
 def _write(method: str, frames: int, out: Path | None, *, as_json: bool) -> None:
     if out is None:
         raise DeltalightError("A headless demo writes files; give a folder for them with --out.")
-    from deltalight.services.headless_demo import run_headless
+    prepare(SHARED)
+    with uncollected():
+        from deltalight.services.files import make_output_folder
+        from deltalight.services.headless_demo import run_headless
 
-    run_headless(method, frames, out, as_json=as_json)
+    make_output_folder(out)
+    with ending_spares(fork_spares({SERVER: "server", NODE: "node"})) as spares:
+        run_headless(method, frames, out, as_json=as_json, spares=spares)

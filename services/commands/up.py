@@ -1,5 +1,7 @@
 """`deltalight up`: all processes of one host, supervised."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -7,6 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.child import ending_spares, fork_spares
 from deltalight.services.commands.options import ConfigFile, Data, Device, NodeName, data_folder
 from deltalight.services.commands.up_options import (
     AllowSoftware,
@@ -33,9 +36,13 @@ from deltalight.services.ports import (
     ROOMS_PORT,
     answers,
 )
+from deltalight.services.process import Process
+from deltalight.services.uncollected import uncollected
+from deltalight.services.warm_spare import SHARED, prepare
 
 if TYPE_CHECKING:
-    from deltalight.services.host import HostCommands
+    from deltalight.protocol.scene import SceneDocument
+    from deltalight.services.host import HostCommands, HostPlan
 
 
 def up(
@@ -63,9 +70,10 @@ def up(
     With --node, no node is started: the render server uses one that is found on the network. With --rooms, a file
     says which nodes and render servers there are.
     """
-    from deltalight.services.host import HostCommands, HostPlan, recording_of
-    from deltalight.services.host_store import open_store, scene_to_show, session_file
-    from deltalight.services.supervisor import Supervisor
+    prepare(SHARED)
+    with uncollected():
+        from deltalight.services.host import HostCommands, HostPlan, recording_of
+        from deltalight.services.host_store import open_store, scene_to_show
 
     on_cluster = placer is PlacerKind.RAY
     _require_fitting(rooms, ray_address, rooms_host, on_cluster=on_cluster)
@@ -96,26 +104,37 @@ def up(
     folder = data_folder(data, config_file)
     with open_store(folder, config_file) as store:
         shown = scene_to_show(store, recording_of(source), scene)
-    with session_file(shown) as session:
-        plan = HostPlan(
-            source,
-            session,
-            remote_node=node or "",
-            config=config_file,
-            node_port=node_port,
-            composite_port=composite_port,
-            control_port=control_port,
-            data=folder,
-            page_port=port,
-            device=device,
-            allow_software=allow_software,
-            spares=spares,
-        )
-        plan.require_free_ports()
-        with Supervisor(plan.specs()) as supervisor:
-            supervisor.run(until=lambda: answers(port))
-            typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (press Ctrl-C to stop).")
-            supervisor.run()
+    plan = HostPlan(
+        source,
+        None,
+        remote_node=node or "",
+        config=config_file,
+        node_port=node_port,
+        composite_port=composite_port,
+        control_port=control_port,
+        data=folder,
+        page_port=port,
+        device=device,
+        allow_software=allow_software,
+        spares=spares,
+    )
+    plan.require_free_ports()
+    with ending_spares(fork_spares(plan.commands)) as early:
+        _run_plan(plan, shown, early)
+
+
+def _run_plan(plan: "HostPlan", scene: "SceneDocument", early: Mapping[str, Process]) -> None:
+    """Run the processes of a plan until Ctrl-C; `early` ones are those of their names."""
+    from deltalight.services.session_file import session_file
+    from deltalight.services.supervisor import Supervisor
+
+    with (
+        session_file(scene) as session,
+        Supervisor(replace(plan, session_file=session).specs(), spares=early) as supervisor,
+    ):
+        supervisor.run(until=lambda: answers(plan.page_port))
+        typer.echo(f"The dashboard is at http://{LOOPBACK}:{plan.page_port} (press Ctrl-C to stop).")
+        supervisor.run()
 
 
 def _require_fitting(

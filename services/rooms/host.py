@@ -15,7 +15,7 @@ from deltalight.services import ports
 from deltalight.services.child import ChildSpec
 from deltalight.services.discovery import node_endpoint
 from deltalight.services.host import HostCommands, recording_of
-from deltalight.services.host_store import activate_document, open_store, write_scene
+from deltalight.services.host_store import activate_document, open_store
 from deltalight.services.rooms.capacity import load_figures
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.keeper import RoomKeeper, RoomPlan
@@ -25,6 +25,7 @@ from deltalight.services.rooms.ray_cluster import RayCluster
 from deltalight.services.rooms.ray_placer import RayPlacer, reachable_endpoint
 from deltalight.services.rooms.rooms_file import RoomEntry, RoomsFile
 from deltalight.services.rooms.status import RoomNode
+from deltalight.services.session_file import write_scene
 from deltalight.services.settings import load_configuration
 from deltalight.services.storage.store import Store
 from deltalight.services.supervisor import POLL_INTERVAL_S, Supervisor

@@ -34,7 +34,8 @@ from deltalight.protocol.source import open_source
 from deltalight.services import ports
 from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import NAME, demo_plan, demo_scene
-from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.host_store import activate_document
+from deltalight.services.session_file import session_file
 from deltalight.services.storage.store import Store
 from deltalight.services.supervisor import Supervisor
 from tests.services.live_samples import live_socket, read_frame, wait_for_frames

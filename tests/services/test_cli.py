@@ -254,7 +254,7 @@ def test_up_names_the_page_once_it_answers(
     cli: RunCli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Supervisor:
-        def __init__(self, _specs: object) -> None:
+        def __init__(self, _specs: object, *, spares: object) -> None:
             pass
 
         def __enter__(self) -> "Supervisor":
@@ -267,6 +267,7 @@ def test_up_names_the_page_once_it_answers(
             print("waits until it answers" if until else "runs")
 
     monkeypatch.setattr("deltalight.services.supervisor.Supervisor", Supervisor)
+    monkeypatch.setattr("deltalight.services.commands.up.fork_spares", lambda _commands: {})
     options = ("--port", "--node-port", "--composite-port", "--control-port")
     chosen = [word for pair in zip(options, ports.private_ports(4), strict=True) for word in pair]
     done = cli("up", "--source", "synthetic", "--data", tmp_path, *chosen)

@@ -25,7 +25,7 @@ from deltalight.services import ports
 from deltalight.services.api.serve import listening
 from deltalight.services.demo import POSTER, POSTER_BEFORE, RECORDING, SCENE, demo_plan, demo_scene
 from deltalight.services.host import HostPlan
-from deltalight.services.host_store import session_file
+from deltalight.services.session_file import session_file
 from deltalight.services.supervisor import Supervisor
 from tests.services.conftest import ROOT, RunCli
 from tests.services.live_samples import live_socket, read_frame, wait_for_frames

@@ -12,7 +12,8 @@ from deltalight.services import ports
 from deltalight.services.api.serve import make_first_scene
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host import HostPlan
-from deltalight.services.host_store import FIRST_SCENE, scene_to_show, session_file
+from deltalight.services.host_store import FIRST_SCENE, scene_to_show
+from deltalight.services.session_file import session_file
 from deltalight.services.storage.store import Store
 from tests.services.api_samples import RenderServer
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe

@@ -212,6 +212,46 @@ def test_a_dead_spare_is_nobodys_replacement(monkeypatch: pytest.MonkeyPatch) ->
         assert supervisor.process_ids()["a"] not in {first, spare}
 
 
+class Starting:
+    """Watches a process that does not do yet what it is for."""
+
+    def __init__(self, _process_id: int) -> None:
+        self.has_started = False
+
+    def fault(self) -> None:
+        return None
+
+    def is_starting(self) -> bool:
+        return not self.has_started
+
+    def close(self) -> None:
+        pass
+
+
+def test_spares_wait_for_the_first_picture_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deltalight.services.child.SPARE_AFTER_S", 0.0)
+    watches: list[Starting] = []
+
+    def watch(process_id: int) -> Starting:
+        watches.append(Starting(process_id))
+        return watches[-1]
+
+    specs = [
+        ChildSpec("a", ("-c", WARM_CHILD), watch),
+        ChildSpec("b", ("-c", WARM_CHILD), warm=("colorsys",)),
+    ]
+    with Supervisor(specs, forward=lambda _line: None) as supervisor:
+        supervisor.poll()
+        assert not supervisor.spare_ids()
+        watches[0].has_started = True
+        supervisor.poll()
+        assert supervisor.spare_ids().keys() == {"b"}
+    monkeypatch.setattr("deltalight.services.child.FIRST_PICTURE_S", 0.0)
+    with Supervisor(specs, forward=lambda _line: None) as supervisor:
+        supervisor.poll()
+        assert supervisor.spare_ids().keys() == {"b"}
+
+
 FORKS = """
 import time
 from deltalight.services import cli

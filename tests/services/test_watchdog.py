@@ -110,12 +110,14 @@ def test_answers_and_reports_are_heard(
     publisher = Publisher("tcp://127.0.0.1:*")
     watchdog = Watchdog(os.getpid(), publisher.endpoint, server.endpoint, timeouts=TIMEOUTS)
     heard, began_s = watchdog._heartbeat, time.monotonic()
+    assert watchdog.is_starting()
     while heard.reported_s is None or heard.answered_s <= began_s:
         publisher.send(encode(StatsMessage(node="server", capture_ns=1, state="running", frame_id=0)))
         time.sleep(0.7)  # longer than the watchdog waits for a report before it asks
         assert time.monotonic() < began_s + 30
     watchdog.close()
     publisher.close()
+    assert not watchdog.is_starting()
     assert watchdog.fault() is None
     assert heard.timeouts == needed
 
