@@ -34,8 +34,8 @@ SERVER = "render server"
 USES_IT = "goes on with the scene that was built ahead"
 COMMAND_LINE = "from deltalight.services.cli import main\nmain()"
 WITHOUT_MEMORY = f"""
-from deltalight.render_server.server import ahead
-ahead.NEEDED_BYTES = 2**62
+from deltalight.render_server.server import standby
+standby.NEEDED_BYTES = 2**62
 {COMMAND_LINE}
 """
 
