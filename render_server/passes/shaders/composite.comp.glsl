@@ -17,7 +17,7 @@ layout(rgba16f) readonly uniform image2D lobe_rho;
 layout(rgba16f) readonly uniform image2D virtual_radiance;
 #pragma switch DISTANT_CHANGE
 #ifdef DISTANT_CHANGE
-layout(rgba16f) readonly uniform image2D distant_change;   // distant_upsample.comp.glsl
+layout(rgba16f) readonly uniform image2D distant_change;   // change_ratio.comp.glsl
 #endif
 uniform usampler2D picture;
 uniform sampler2D linear_picture;
