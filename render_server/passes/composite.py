@@ -121,9 +121,9 @@ class Composite:
     def run(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:
         """Composes the picture.
 
-        Besides camera, geometry (with `edge_correction`) and declared surfaces, `scene` brings the options
-        `additive`, `relights_real`, `filmic`, `store_linear` (fills `linear`) and `whole` (composes every pixel, not
-        only those near a change).
+        Besides camera, geometry (with `edge_correction` and `interior_edges`) and declared surfaces, `scene` brings
+        the options `additive`, `relights_real`, `filmic`, `store_linear` (fills `linear`) and `whole` (composes every
+        pixel, not only those near a change).
         """
         self.code.write(image.codes, alignment=1)
         cones, direct = layers.cones, layers.direct
