@@ -209,7 +209,7 @@ class SurfaceShading:
         return SELF_SHADOW_TEXELS * self._texel_m((low + high) / 2)
 
     def choose_pixels(self, scene: Bindings) -> LowResGrid:
-        """Selects the pixel that represents each block of the picture."""
+        """Selects the pixel that represents each block of the picture; lists blocks where light may change."""
         self.grid.run(scene)
         return self.grid
 
