@@ -44,7 +44,7 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
     from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 
     size = setup.picture_size
-    buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size)
+    buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size, objects_shadow=False)
     for light in (direct.light, direct.lobes):
         light.clear()  # none without objects, and none with them
     options = surface_shading.ShadingOptions()

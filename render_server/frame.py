@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import moderngl
 import numpy as np
 
 from deltalight.protocol.frames import DepthImage, ViewFrame
@@ -16,8 +15,6 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.passes.camera_image import CameraImage
 from deltalight.render_server.passes.coverage import (
-    EdgeUnmixing,
-    InteriorEdgeAA,
     ObjectCoverage,
     SampleCoverage,
 )
@@ -85,13 +82,12 @@ class Measurement:
 class ObjectSurface:
     """The objects as the camera sees them: their geometry buffer and how much of each pixel they cover.
 
-    `edge_correction` unmixes the edges of real things in front of the objects. `samples` are the samples that an
-    antialiased geometry buffer was resolved from; `rectangle` encloses the objects.
+    `samples` are the samples that an antialiased geometry buffer was resolved from;
+    `rectangle` encloses the objects.
     """
 
     buffer: GeometryBuffer
     coverage: ObjectCoverage
-    edge_correction: moderngl.Texture
     samples: SampleCoverage | None
     rectangle: Rectangle
 
@@ -194,8 +190,6 @@ class PictureBuffers:
         self.coverage = ObjectCoverage(gpu, size)
         self._raster = GeometryBuffer(gpu, raster_size)
         self._samples: SampleCoverage | None = None
-        self._interior_edges: InteriorEdgeAA | None = None
-        self._unmixing = EdgeUnmixing(gpu, size)
         self._matting: Matting | None = None
         self._surfaces = gpu.ctx.buffer(reserve=MAX_ROWS * 80)
 
@@ -237,28 +231,25 @@ class PictureBuffers:
 
     def draw_objects(self, objects: GeometryState, seen: Observation, view: CameraView) -> ObjectSurface:
         """Rasters the objects, computes their coverage of pixels, and unmixes the edges of real things."""
-        rectangle, correction = view.rectangle_around(objects.points), self._unmixing.texture
+        rectangle = view.rectangle_around(objects.points)
         if view.antialiased:
             samples = self._draw_samples(objects, seen, view, rectangle)
-            surface = ObjectSurface(samples.surface, self.coverage, correction, samples, rectangle)
+            surface = ObjectSurface(samples.surface, self.coverage, samples, rectangle)
         else:
             scene = {**seen.bindings, **objects.materials.bindings}
             self._geometry.run(self._raster, objects.buffers, view, scene)
-            surface = ObjectSurface(self._raster, self.coverage, correction, None, rectangle)
+            surface = ObjectSurface(self._raster, self.coverage, None, rectangle)
         scene = {**seen.bindings, **surface.buffer.bindings}
-        covered = None if surface.samples is None else surface.samples.texture
-        self.coverage.run(rectangle, scene, covered)
-        self._unmixing.run(self.coverage, scene, covered)
+        self.coverage.run(rectangle, scene, surface.samples)
         if view.matting_px:
             if self._matting is None:
                 self._matting = Matting(self._gpu, view.size, averages=self.measured is not None)
             self._matting.run(
                 self.coverage,
-                self._unmixing,
                 view.matting_px,
                 rectangle=rectangle,
                 scene=scene,
-                sample_coverage=covered,
+                sample_coverage=None if surface.samples is None else surface.samples.texture,
             )
         return surface
 
@@ -283,26 +274,15 @@ class PictureBuffers:
         )
         return self._samples
 
-    def antialias_interior(self, radiance: moderngl.Texture, surface: ObjectSurface) -> moderngl.Texture:
-        """Antialiases the edges between objects in their shaded radiance, if samples were drawn."""
-        if surface.samples is None:
-            return radiance
-        if self._interior_edges is None:
-            self._interior_edges = InteriorEdgeAA(self._gpu, surface.buffer.size)
-        self._interior_edges.run(radiance, surface.samples, surface.rectangle)
-        return self._interior_edges.radiance
-
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(
-            self._unmixing,
             self._matting,
             self._observed,
             self.measured,
             self.coverage,
             self._raster,
             self._samples,
-            self._interior_edges,
             self._geometry,
             self._surfaces,
         )
@@ -385,5 +365,6 @@ def _geometry_bindings(
         **surface.buffer.bindings,
         **objects.materials.bindings,
         "object_coverage": surface.coverage.texture,
-        "edge_correction": surface.edge_correction,
+        "edge_correction": surface.coverage.edge_correction,
+        "interior_edges": surface.coverage.interior_edges,
     }

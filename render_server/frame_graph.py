@@ -33,6 +33,7 @@ from deltalight.render_server.methods.surface_shading import Layers
 from deltalight.render_server.passes.camera_image import CameraImage
 from deltalight.render_server.passes.composite import Composite, DebugViews, RelitLayers
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.coverage import mixed_radiance
 from deltalight.render_server.passes.gbuffer import GeometryBuffer
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.shading import DirectLight
@@ -213,16 +214,13 @@ class FrameGraph:
 
     def _declare_composition(self, composition: Composition) -> Resource[Composite]:
         g, s, layers = self.graph, self.resources, self.layers
-        radiance = self._radiance = g.stage(
-            "interior edges", self.buffers.antialias_interior, layers.radiance, s.object_surface
-        )
         relit = self._relit = g.stage(
             "relit picture",
             composition.compose,
             self._linear,
             "shading scene",
             self._options,
-            radiance,
+            layers.radiance,
             layers.direct,
             layers.cones,
             layers.grid,
@@ -308,8 +306,10 @@ class FrameGraph:
 
     def radiance(self) -> Float64[np.ndarray, "h w 3"]:
         """Radiance of the virtual objects as composed, camera units; undefined where they cover nothing."""
-        self._run(self._radiance)
-        return read_texture(self._radiance.value)[..., :3]
+        radiance, surface = self.layers.radiance, self.resources.object_surface
+        self._run(radiance, surface)
+        edges = surface.value.coverage.interior_edges
+        return mixed_radiance(read_texture(radiance.value)[..., :3], read_texture(edges))
 
     def evaluate(self, lights: LightSet) -> Fields:
         """Evaluates the light without objects under other lights, at every pixel and not only near the objects.

@@ -170,7 +170,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
 
     volume = g.value("volume", placed_volume, "voxelize real")
-    distant: Callable[..., moderngl.Texture] | None = None
+    distant: Callable[..., Bindings] | None = None
     if settings.tier.distant_light:
         distant = DistantChange(g.gpu, shading.grid.size, march_defines(settings)).trace
     refract = cones.refract if settings.tier.glass_rays else None

@@ -153,7 +153,9 @@ class SurfaceShading:
         self.size, self._scale = size, resolved.cone_scale
         self.reuses_light = options.tier.refresh_tiles > 0
         lists_quads = options.screen_space and options.tier.reflection_step > 1
-        self.grid = LowResGrid(gpu, size, resolved.cone_scale, lists_quads=lists_quads)
+        self.grid = LowResGrid(
+            gpu, size, resolved.cone_scale, shadow_defines=direct.defines, lists_quads=lists_quads
+        )
         self.cones = ConeFields(gpu, self.grid.size, remembers=self.reuses_light)
         self._history: LightHistory | None = None
         if self.reuses_light:
@@ -207,7 +209,7 @@ class SurfaceShading:
         return SELF_SHADOW_TEXELS * self._texel_m((low + high) / 2)
 
     def choose_pixels(self, scene: Bindings) -> LowResGrid:
-        """Selects the pixel that represents each block of the picture."""
+        """Selects the pixel that represents each block of the picture; lists blocks where light may change."""
         self.grid.run(scene)
         return self.grid
 
@@ -291,7 +293,7 @@ class SurfaceShading:
         direct: DirectLight,
         cones: ConeFields,
         reflection: moderngl.Texture | None,
-        distant: moderngl.Texture | None = None,
+        distant: Bindings | None = None,
     ) -> ChangeRatio:
         """Computes where light changes, and by which ratio."""
         self._change.run(grid, direct, cones, reflection, distant)
@@ -403,7 +405,7 @@ class MethodStages:
     voxels: Resource[VoxelMipmap] | None = None
     marching: Resource[dict[str, Binding]] | None = None
     light_directly: Callable[..., DirectLight] | None = None
-    find_distant: Callable[..., moderngl.Texture] | None = None
+    find_distant: Callable[..., Bindings] | None = None
     refract: Callable[..., ConeFields] | None = None
 
 
@@ -455,12 +457,12 @@ def _change_stages(
     shading: SurfaceShading,
     grid: Resource[LowResGrid],
     rays: RayInputs,
-    find_distant: Callable[..., moderngl.Texture] | None,
+    find_distant: Callable[..., Bindings] | None,
 ) -> tuple[Resource[moderngl.Texture | None], Resource[ChangeRatio]]:
     """Declares what smooth real surfaces reflect, and the change of light."""
     _, scene, direct, cones, bvh, _, marching = rays
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
-    distant: list[Resource[moderngl.Texture]] = []
+    distant: list[Resource[Bindings]] = []
     if find_distant is not None:
         distant.append(g.stage("distant change", find_distant, scene, grid, direct, cones, marching))
     return reflection, g.stage("change of light", shading.compare, grid, direct, cones, reflection, *distant)

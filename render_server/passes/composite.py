@@ -14,6 +14,7 @@ from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.camera_image import CameraImage, rgba
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.coverage import SURFACE_REACH
+from deltalight.render_server.passes.distant import LATTICE_STEP
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
 from deltalight.render_server.passes.shading import DirectLight
@@ -27,15 +28,16 @@ class ChangeRatio:
     """The change of light on the reduced grid: extends into holes of the depth map, limits composition to changes.
 
     `ratio`: rgb E_rho / E_mu, a: 0 unknown, 1 unchanged, 2 changed. `texels`: work list of texels near a change.
-    `distant`: the relative change beyond the volumes, of the last run (`DistantChange`).
+    `distant`: the relative change beyond the volumes (RGBA16F), if that was found.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._gpu = gpu
+        self._size = size
         self.ratio = texture_2d(gpu, size, 4, "f2")
         self.distant: moderngl.Texture | None = None
         self.texels = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
-        self._ratio = Kernel(gpu, "change_ratio", RATIO=1)
+        self._ratio = Kernel(gpu, "change_ratio", RATIO=1, REAL=1, LATTICE_STEP=LATTICE_STEP)
         self._near = Kernel(gpu, "change_ratio", FILL_RADIUS=FILL_RADIUS)
 
     def run(
@@ -44,14 +46,15 @@ class ChangeRatio:
         direct: DirectLight,
         cones: ConeFields,
         reflection: moderngl.Texture | None,
-        distant: moderngl.Texture | None = None,
+        distant: Bindings | None = None,
     ) -> None:
-        """Computes the ratio from one frame's fields; `reflection` as in RelitLayers."""
-        self.distant = distant
+        """Computes the ratio from one frame's fields; `reflection` as in RelitLayers, `distant` of DistantChange."""
+        if distant is not None and self.distant is None:
+            self.distant = texture_2d(self._gpu, self._size, 4, "f2")
         self._ratio.run(
             grid.size,
-            sample_pixels=grid.pixels,
-            scale=grid.scale,
+            distant or {},
+            grid.bindings,
             direct_mu=direct.light.mu,
             direct_rho=direct.light.rho,
             cone_mu=cones.mu,
@@ -60,8 +63,8 @@ class ChangeRatio:
             cone_specular_rho=cones.specular_rho,
             reflection=reflection,
             has_reflection=reflection is not None,
-            distant_change=distant,
             DISTANT_CHANGE=distant is not None,
+            distant_change_out=self.distant,
             change_ratio_out=self.ratio,
             Texels=None,
         )
@@ -70,7 +73,7 @@ class ChangeRatio:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.ratio, self.texels, self._ratio, self._near)
+        release_all(self.ratio, self.distant, self.texels, self._ratio, self._near)
 
 
 @dataclass(frozen=True)
@@ -118,9 +121,9 @@ class Composite:
     def run(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:
         """Composes the picture.
 
-        Besides camera, geometry (with `edge_correction`) and declared surfaces, `scene` brings the options
-        `additive`, `relights_real`, `filmic`, `store_linear` (fills `linear`) and `whole` (composes every pixel, not
-        only those near a change).
+        Besides camera, geometry (with `edge_correction` and `interior_edges`) and declared surfaces, `scene` brings
+        the options `additive`, `relights_real`, `filmic`, `store_linear` (fills `linear`) and `whole` (composes every
+        pixel, not only those near a change).
         """
         self.code.write(image.codes, alignment=1)
         cones, direct = layers.cones, layers.direct

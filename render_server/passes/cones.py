@@ -19,20 +19,29 @@ class LowResGrid:
 
     -1 marks a block that shows none; -2 - pixel represents real surfaces that objects hide. `virtual_texels` lists
     the texels that show an object (count, then indices), `shown_pixels` the picture's pixels that do; `quads`, if
-    `lists_quads`, one pixel that does of each 2 x 2.
+    `lists_quads`, one pixel that does of each 2 x 2. `reached_texels` lists those in which objects may change the
+    direct light of a pixel: `shadow_defines` say how they cast shadows (`DirectLight.defines`).
     """
 
     def __init__(
-        self, gpu: GpuContext, picture_size: tuple[int, int], scale: int, *, lists_quads: bool = False
+        self,
+        gpu: GpuContext,
+        picture_size: tuple[int, int],
+        scale: int,
+        *,
+        shadow_defines: Mapping[str, float | str],
+        lists_quads: bool = False,
     ) -> None:
         self._gpu = gpu
         self.picture_size, self.scale = picture_size, scale
         self.size = (-(-picture_size[0] // scale), -(-picture_size[1] // scale))
         self.pixels = texture_2d(gpu, self.size, 4, "i2")
-        self.virtual_texels = gpu.ctx.buffer(bytes(4 * (1 + self.texel_count)))
+        self.virtual_texels, self.reached_texels = (
+            gpu.ctx.buffer(bytes(4 * (1 + self.texel_count))) for _ in range(2)
+        )
         self.shown_pixels = gpu.ctx.buffer(bytes(4 * (1 + math.prod(picture_size))))
         self.quads = gpu.ctx.buffer(bytes(self.shown_pixels.size)) if lists_quads else None
-        self._kernel = Kernel(gpu, "low_res_grid", **({"QUADS": 1} if lists_quads else {}))
+        self._kernel = Kernel(gpu, "low_res_grid", **({"QUADS": 1} if lists_quads else {}), **shadow_defines)
 
     @property
     def texel_count(self) -> int:
@@ -52,8 +61,9 @@ class LowResGrid:
         self._gpu.clear_start(texels, LIST_HEADER_BYTES)
 
     def run(self, scene: Bindings) -> None:
-        """Selects the pixels."""
+        """Selects the pixels, and lists texels; `scene` brings lights and volumes too."""
         self.empty_list(self.virtual_texels)
+        self.empty_list(self.reached_texels)
         self._gpu.clear_start(self.shown_pixels, LIST_HEADER_BYTES)
         quads: dict[str, Binding] = {}
         if self.quads is not None:
@@ -66,13 +76,15 @@ class LowResGrid:
             sample_pixels_out=self.pixels,
             Texels=self.virtual_texels,
             ShownPixels=self.shown_pixels,
+            Reached=self.reached_texels,
             picture_pixels=self.picture_size,
             scale=self.scale,
         )
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.pixels, self.virtual_texels, self.shown_pixels, self.quads, self._kernel)
+        lists = self.virtual_texels, self.reached_texels, self.shown_pixels, self.quads
+        release_all(self.pixels, *lists, self._kernel)
 
 
 class ConeFields:

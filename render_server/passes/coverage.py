@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 
 import moderngl
+import numpy as np
+from jaxtyping import Float, Float64
 
 from deltalight.render_server.gpu.clearing import Start, clear_ahead, clear_buffers
 from deltalight.render_server.gpu.context import GpuContext
@@ -212,101 +214,69 @@ def _as_glsl(pattern: Sequence[tuple[int, int]]) -> str:
 
 
 class ObjectCoverage:
-    """Fraction of each pixel that shows an object (R16F); a work list of the pixels at `edges` of real things."""
+    """How objects share pixels with real things, and with each other.
+
+    `texture` (R16F) is the fraction of each pixel that shows an object. Pixels at the edge of a real thing before one
+    are unmixed: their coverage is corrected by the fraction that the thing fills, and `edge_correction` (RGBA16F)
+    removes the old background from their radiance, and says which pixel shows the thing's surface. `interior_edges`
+    (RG16F, of pixels that show an object): where samples show two surfaces of the objects, the share of the second
+    one and the neighbour that shows it (shaders/common/interior_edges.glsl).
+    """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._gpu = gpu
-        self.texture = texture_2d(gpu, size, 1, "f2")
-        self._target = gpu.ctx.framebuffer([self.texture])
-        self.edges = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
-        self._kernel = Kernel(gpu, "object_coverage")
+        self._gpu, self._threads = gpu, list_threads(gpu)
+        self.texture, self.edge_correction = texture_2d(gpu, size, 1, "f2"), texture_2d(gpu, size, 4, "f2")
+        self.interior_edges = texture_2d(gpu, size, 2, "f2", data=bytes(4 * math.prod(size)))
+        self._targets = [gpu.ctx.framebuffer([each]) for each in (self.texture, self.edge_correction)]
+        reach = {"RIM_SIGHT": RIM_SIGHT, "SURFACE_REACH": SURFACE_REACH}
+        # One dispatch on a GPU; in software every workgroup would pay for entering the longer kernel.
+        self._compare = Kernel(gpu, "object_coverage", **({} if gpu.is_software else {"UNMIXES": 1, **reach}))
+        self._unmix = Kernel(gpu, "edge_unmixing", **reach) if gpu.is_software else None
+        self._edges = gpu.ctx.buffer(bytes(4 * (1 + math.prod(size)))) if gpu.is_software else None
 
-    def run(
-        self, rectangle: Rectangle, scene: Bindings, sample_coverage: moderngl.Texture | None = None
-    ) -> None:
-        """Compares depths within `rectangle`, and softens the result along edges of the picture.
+    def run(self, rectangle: Rectangle, scene: Bindings, samples: SampleCoverage | None = None) -> None:
+        """Compares depths within `rectangle`; coverage is softened along edges of the picture, and unmixed.
 
-        `sample_coverage` is the texture of `SampleCoverage`; None: the geometry buffer has one sample per pixel.
+        `samples`: those of each pixel; None: the geometry buffer has one.
         """
-        self._target.use()
-        self._target.clear()
-        self._gpu.clear_start(self.edges, LIST_HEADER_BYTES)
+        for target in self._targets:
+            target.use()
+            target.clear()
         x, y, width, height = rectangle
         if width <= 0 or height <= 0:
             return
-        self._kernel.run(
-            (width, height),
-            scene,
-            first_pixel=(x, y),
-            sample_coverage=sample_coverage,
-            antialiased=sample_coverage is not None,
-            object_coverage_out=self.texture,
-            Texels=self.edges,
-        )
+        own: Bindings = {
+            **scene,
+            "sample_coverage": None if samples is None else samples.texture,
+            "second_surface": None if samples is None else samples.second_surface,
+            "antialiased": samples is not None,
+            "object_coverage": self.texture,
+            "edge_correction": self.edge_correction,
+        }
+        if self._edges is not None:
+            self._gpu.clear_start(self._edges, LIST_HEADER_BYTES)
+            own = {**own, "Texels": self._edges}
+        self._compare.run((width, height), own, first_pixel=(x, y), interior_edges=self.interior_edges)
+        if self._unmix is not None:
+            self._unmix.run((self._threads,), own)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_target(self._target)
-        release_all(self.texture, self.edges, self._kernel)
+        for target in self._targets:
+            release_target(target)
+        release_all(self.texture, self.edge_correction, self.interior_edges)
+        release_all(self._compare, self._unmix, self._edges)
 
 
-class EdgeUnmixing:
-    """Unmixes pixels at the edge of a real thing in front of an object.
+def mixed_radiance(
+    radiance: Float[np.ndarray, "h w 3"], interior_edges: Float[np.ndarray, "h w 2"]
+) -> Float64[np.ndarray, "h w 3"]:
+    """Mixes the objects' shaded radiance at edges between them, as shaders/common/interior_edges.glsl does.
 
-    Corrects the objects' coverage by the fraction of the pixel that the thing fills. `texture` (RGBA16F) removes the
-    old background from a pixel's radiance, and says which pixel shows the thing's surface.
+    `interior_edges` as of `ObjectCoverage`.
     """
-
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._threads = list_threads(gpu)
-        self.texture = texture_2d(gpu, size, 4, "f2")
-        self._target = gpu.ctx.framebuffer(color_attachments=[self.texture])
-        self._kernel = Kernel(gpu, "edge_unmixing", RIM_SIGHT=RIM_SIGHT, SURFACE_REACH=SURFACE_REACH)
-
-    def run(
-        self, coverage: ObjectCoverage, scene: Bindings, sample_coverage: moderngl.Texture | None = None
-    ) -> None:
-        """Unmixes the pixels that `coverage` listed; pass the other arguments as to it."""
-        self._target.use()
-        self._target.clear()
-        self._kernel.run(
-            (self._threads,),
-            scene,
-            sample_coverage=sample_coverage,
-            antialiased=sample_coverage is not None,
-            object_coverage=coverage.texture,
-            edge_correction=self.texture,
-            Texels=coverage.edges,
-        )
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_target(self._target)
-        release_all(self.texture, self._kernel)
-
-
-class InteriorEdgeAA:
-    """Antialiases edges between objects.
-
-    `radiance` (RGBA16F) is the objects' light, mixed where a pixel's samples show two surfaces.
-    """
-
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self.radiance = texture_2d(gpu, size, 4, "f2")
-        self._kernel = Kernel(gpu, "interior_edge_aa")
-
-    def run(self, radiance: moderngl.Texture, coverage: SampleCoverage, rectangle: Rectangle) -> None:
-        """Mixes `radiance`, which was shaded at one representative sample per pixel."""
-        self._kernel.run(
-            rectangle[2:],
-            coverage.surface.bindings,
-            radiance=radiance,
-            sample_coverage=coverage.texture,
-            second_surface=coverage.second_surface,
-            radiance_out=self.radiance,
-            rectangle=rectangle,
-        )
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(self.radiance, self._kernel)
+    height, width = radiance.shape[:2]
+    share, code = interior_edges[..., :1], interior_edges[..., 1].astype(int)
+    row = np.clip(np.arange(height)[:, None] + (code >> 2) - 1, 0, height - 1)
+    column = np.clip(np.arange(width) + (code & 3) - 1, 0, width - 1)
+    return np.asarray(radiance + share * (radiance[row, column] - radiance), np.float64)

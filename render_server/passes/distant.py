@@ -1,11 +1,9 @@
-"""Change of light beyond the objects' volumes, found on a sparse lattice and interpolated on the reduced grid."""
+"""Change of light beyond the objects' volumes, found on a sparse lattice."""
 
 from collections.abc import Mapping
 
-import moderngl
-
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.shading import DirectLight
@@ -15,24 +13,23 @@ AIMED_CONES = 16  # of a point of the lattice, at each volume
 
 
 class DistantChange:
-    """Relative change of the light at real surfaces beyond the volumes (RGBA16F, docs/method.md 4.5).
+    """Relative change of the light at real surfaces beyond the volumes (docs/method.md 4.5).
 
-    `size` is that of the reduced grid, `defines` are those of march.glsl.
+    `ChangeRatio` interpolates the lattice (shaders/common/distant_change.glsl). `size` is that of the reduced grid,
+    `defines` are those of march.glsl.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
         self._points = (-(-size[0] // LATTICE_STEP), -(-size[1] // LATTICE_STEP))
-        self._change = texture_2d(gpu, size, 4, "f2")
         self._lattice = texture_2d(gpu, self._points, 4, "f2")
         self._pixels = texture_2d(gpu, self._points, 4, "i2")
-        own = {"REAL": 1, "LATTICE_STEP": LATTICE_STEP}
-        self._find = Kernel(gpu, "distant_change", **own, **defines, ENDS_AHEAD=1, AIMED_CONES=AIMED_CONES)
-        self._upsample = Kernel(gpu, "distant_upsample", **own)
+        own = {"REAL": 1, "LATTICE_STEP": LATTICE_STEP, "ENDS_AHEAD": 1, "AIMED_CONES": AIMED_CONES}
+        self._find = Kernel(gpu, "distant_change", **own, **defines)
 
     def trace(
         self, scene: Bindings, grid: LowResGrid, direct: DirectLight, cones: ConeFields, marching: Bindings
-    ) -> moderngl.Texture:
-        """Aims cones at the volumes from surfaces beyond them, and returns the relative change of light there."""
+    ) -> dict[str, Binding]:
+        """Aims cones at the volumes from surfaces beyond them; returns what shaders read of the lattice."""
         self._find.run(
             self._points,
             grid.bindings,
@@ -44,17 +41,8 @@ class DistantChange:
             lattice_change=self._lattice,
             lattice_pixels=self._pixels,
         )
-        self._upsample.run(
-            grid.size,
-            grid.bindings,
-            scene,
-            marching,
-            lattice_change=self._lattice,
-            lattice_pixels=self._pixels,
-            distant_change_out=self._change,
-        )
-        return self._change
+        return {**scene, "lattice_change": self._lattice, "lattice_pixels": self._pixels}
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._change, self._lattice, self._pixels, self._find, self._upsample)
+        release_all(self._lattice, self._pixels, self._find)

@@ -6,7 +6,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
-from deltalight.render_server.passes.coverage import SURFACE_REACH, EdgeUnmixing, ObjectCoverage
+from deltalight.render_server.passes.coverage import SURFACE_REACH, ObjectCoverage
 from deltalight.render_server.passes.temporal_mean import TemporalMean
 from deltalight.render_server.view import Rectangle
 
@@ -38,16 +38,15 @@ class Matting:
     def run(
         self,
         coverage: ObjectCoverage,
-        unmixing: EdgeUnmixing,
         reach_px: int,
         *,
         rectangle: Rectangle,
         scene: Bindings,
         sample_coverage: moderngl.Texture | None,
     ) -> None:
-        """Corrects what both hold of the pixels of `rectangle`, which encloses the objects.
+        """Corrects what `coverage` holds of the pixels of `rectangle`, which encloses the objects.
 
-        `reach_px` is rounded up to whole blocks; the other arguments are those of `ObjectCoverage.run`.
+        `reach_px` is rounded up to whole blocks; `sample_coverage` is the texture of `SampleCoverage`.
         """
         self._gpu.clear_start(self._band, LIST_HEADER_BYTES)
         if rectangle[2] <= 0 or rectangle[3] <= 0:
@@ -68,7 +67,7 @@ class Matting:
             estimate=self._estimate,
             contrast=self._contrast,
             object_coverage=coverage.texture,
-            edge_correction=unmixing.texture,
+            edge_correction=coverage.edge_correction,
             Texels=self._band,
         )
 

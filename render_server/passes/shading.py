@@ -44,9 +44,9 @@ class DirectLight:
 
     With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
     do. With `ray_shadows`, rays find penumbrae where some objects are transparent. Without `objects_shadow` other
-    passes find shadows, and E_rho is E_mu. Pixels that objects do not reach are 0. `texels` lists the blocks of
-    pixels to shade; with `reuses`, LightHistory fills it beforehand, in software apart from `spared` ones, whose
-    light without the objects is known, and of which they block none.
+    passes find shadows, and E_rho is E_mu. Pixels that objects do not reach are 0. The blocks of pixels that the grid
+    lists are shaded; with `reuses`, those of `texels`, which LightHistory fills beforehand, in software apart from
+    `spared` ones, whose light without the objects is known, and of which they block none.
     """
 
     def __init__(
@@ -68,7 +68,6 @@ class DirectLight:
         traced = {"RAY_SHADOWS": 1} if ray_shadows else {}
         self._kernel = Kernel(gpu, "direct_light", **defines, **traced)
         self._spared = Kernel(gpu, "direct_light", SPARED=1) if reuses and gpu.is_software else None
-        self._select = Kernel(gpu, "select_direct_texels", **defines)
         self._reuses = reuses
         self.texels = gpu.ctx.buffer(reserve=4)
         self.spared = gpu.ctx.buffer(reserve=4) if self._spared is not None else None
@@ -98,7 +97,7 @@ class DirectLight:
         """
         voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
         if not self._reuses:
-            self.select(grid, self.texels, voxels, scene)
+            self.clear(scene)
         traced = {} if objects is None else objects.bindings
         shared = voxels, _caustics_on(grid, caustics), traced, scene
         self._shade(grid, self.bindings, *shared)
@@ -106,24 +105,21 @@ class DirectLight:
             listed: Bindings = {**self.bindings, **grid.bindings, "Texels": self.spared}
             self._spared.run((list_threads(self._gpu, math.prod(self._size)),), listed, *shared)
 
-    def select(self, grid: LowResGrid, texels: moderngl.Buffer, *scene: Bindings) -> None:
-        """Lists the texels where objects may change light, and clears all light."""
+    def clear(self, scene: Bindings) -> None:
+        """Sets all light to zero."""
         self.light.clear()
-        if any(each.get("specular_surfaces") for each in scene):
+        if scene["specular_surfaces"]:
             self.lobes.clear()
-        grid.empty_list(texels)
-        self._select.run(grid.size, grid.bindings, *scene, Texels=texels)
 
     def _shade(self, grid: LowResGrid, targets: Bindings, *scene: Bindings) -> None:
         """Shades the texels of the list."""
-        listed: Bindings = {**targets, **grid.bindings, "Texels": self.texels}
+        texels = self.texels if self._reuses else grid.reached_texels
+        listed: Bindings = {**targets, **grid.bindings, "Texels": texels}
         self._kernel.run((list_threads(self._gpu, math.prod(self._size)),), listed, *scene, NOTHING_KEPT)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(
-            self.light, self.lobes, self._kernel, self._spared, self._select, self.texels, self.spared
-        )
+        release_all(self.light, self.lobes, self._kernel, self._spared, self.texels, self.spared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +148,6 @@ class LightHistory:
         self, gpu: GpuContext, grid: LowResGrid, direct: DirectLight, cones: ConeFields, turns: int
     ) -> None:
         self._gpu, self._grid, self._direct, self._cones, self._turns = gpu, grid, direct, cones, turns
-        self._reached = gpu.ctx.buffer(reserve=4)
         size = grid.picture_size
         self._last_light = LightPair(gpu, size)
         self._positions: tuple[Binding, int] = None, 0  # of the last frame, and how often they were filled
@@ -204,7 +199,7 @@ class LightHistory:
     def _fill(self, scene: Bindings, found: Bindings, *, knows_direct: bool) -> None:
         grid, direct = self._grid, self._direct
         shared: Bindings = {**found, **grid.bindings}
-        direct.select(grid, self._reached, scene)
+        direct.clear(scene)
         grid.empty_list(direct.texels)
         apart: dict[str, Binding] = {}
         if direct.spared is not None:
@@ -220,7 +215,7 @@ class LightHistory:
             direct_rho_out=direct.light.rho,
             last_direct_mu=self._last_light.mu,
             last_direct_rho=self._last_light.rho,
-            Texels=self._reached,
+            Texels=grid.reached_texels,
             Needed=direct.texels,
         )
         self._find_stale.run(
@@ -246,7 +241,6 @@ class LightHistory:
             self._last_light,
             *self._real_texels,
             *self._object_texels,
-            self._reached,
             self._stale,
             self._reproject,
             self._find_stale,

@@ -183,7 +183,7 @@ def corrections(objects: ObjectsRenderer) -> np.ndarray:
     """Of the picture that was drawn last."""
     graph = objects.renderer.graph
     assert graph is not None
-    return array_of(graph["object surface"].edge_correction)
+    return array_of(graph["object surface"].coverage.edge_correction)
 
 
 def test_the_floor_is_not_unmixed_where_an_object_stands_on_it(

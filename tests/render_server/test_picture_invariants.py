@@ -255,7 +255,7 @@ def test_noise_in_the_picture_passes_through_the_caches(gpu: GpuContext, stage: 
     cached = renderer.render(frame(grainy)).color
     fields = fields_of(renderer)
     assert renderer.graph is not None
-    beyond = (read_texture(renderer.graph["distant change"])[..., :3] != 0).any(axis=-1)
+    beyond = (read_texture(renderer.graph["change of light"].distant)[..., :3] != 0).any(axis=-1)
     renderer.release()
     fresh = composite(gpu, document, frame(grainy))
     assert np.abs(cached.astype(int) - fresh.astype(int)).max() <= 2
@@ -392,7 +392,7 @@ def test_only_visible_changes_of_light_are_composed(gpu: GpuContext) -> None:
     change = ChangeRatio(gpu, (width, 1))
     cones: Any = SimpleNamespace(mu=plain, rho=brighter, specular_mu=plain, specular_rho=plain)
     light: Any = SimpleNamespace(light=SimpleNamespace(mu=plain, rho=darker))
-    grid: Any = SimpleNamespace(size=(width, 1), pixels=seen, scale=1)
+    grid: Any = SimpleNamespace(size=(width, 1), pixels=seen, bindings={"sample_pixels": seen, "scale": 1})
     change.run(grid, light, cones, None)
     listed = np.frombuffer(change.texels.read(), np.uint32)
     assert set(listed[1 : 1 + listed[0]]) == set(range(20 - FILL_RADIUS, 21 + FILL_RADIUS))

@@ -7,8 +7,7 @@
 #include "common/work_list.glsl"
 
 #include "common/pixel_group.glsl"
-uniform isampler2D sample_pixels;
-#pragma texels rgba16i sample_pixels
+#include "common/sample_pixels.glsl"
 #ifdef RATIO
 layout(rgba16f) writeonly uniform image2D change_ratio_out;
 uniform sampler2D direct_mu;
@@ -20,12 +19,13 @@ uniform sampler2D cone_specular_rho;
 uniform sampler2D reflection;   // a: fraction of a smooth surface's lobe that objects fill
 #pragma texels rgba16f direct_mu direct_rho cone_mu cone_rho cone_specular_mu cone_specular_rho reflection
 #pragma switch bool has_reflection
+#include "common/least_change.glsl"
 #pragma switch DISTANT_CHANGE
 #ifdef DISTANT_CHANGE
-layout(rgba16f) readonly uniform image2D distant_change;   // distant_upsample.comp.glsl
+#include "common/distant_change.glsl"
+layout(rgba16f) writeonly uniform image2D distant_change_out;   // rgb: relative, beyond the objects' volumes
 #endif
 uniform int scale;
-#include "common/least_change.glsl"
 
 const float LEAST_IRRADIANCE = 1e-4;
 
@@ -55,7 +55,8 @@ vec4 value(ivec2 texel) {
         || block_changed(texel, mu.rgb);
     vec3 ratio = (e_rho + LEAST_IRRADIANCE) / (e_mu + LEAST_IRRADIANCE);
 #ifdef DISTANT_CHANGE
-    vec3 distant = imageLoad(distant_change, texel).rgb;
+    vec3 distant = distant_change(texel);
+    imageStore(distant_change_out, texel, vec4(distant, 0.0));
     ratio = max(ratio + distant, vec3(0.0));
     changed = changed || distant != vec3(0.0);
 #endif

@@ -14,10 +14,10 @@ layout(rgba32f) writeonly uniform image2D ratio_out;   // a: 1 where the picture
 // Images, because OpenGL guarantees no more than sixteen samplers.
 layout(rgba16f) readonly uniform image2D lobe_mu;
 layout(rgba16f) readonly uniform image2D lobe_rho;
-layout(rgba16f) readonly uniform image2D virtual_radiance;
+#include "common/interior_edges.glsl"
 #pragma switch DISTANT_CHANGE
 #ifdef DISTANT_CHANGE
-layout(rgba16f) readonly uniform image2D distant_change;   // distant_upsample.comp.glsl
+layout(rgba16f) readonly uniform image2D distant_change;   // change_ratio.comp.glsl
 #endif
 uniform usampler2D picture;
 uniform sampler2D linear_picture;
@@ -201,7 +201,7 @@ void compose(ivec2 pixel) {
         if (ratio != vec3(1.0)) { result = b * ratio; changed = true; }
     }
     if (shown > 0.0) {
-        result = mix(result, imageLoad(virtual_radiance, pixel).rgb, shown);
+        result = mix(result, objects_radiance(pixel), shown);
         changed = true;
     }
     if (changed) {

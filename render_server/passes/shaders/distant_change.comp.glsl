@@ -20,7 +20,7 @@ uniform float noise_sigma;   // m at 1 m
 
 const float LEAST_IRRADIANCE = 1e-4, GREATEST_CHANGE = 1e4;   // half floats hold it
 
-// As in trace_cones: four adjacent points share four times as many directions, and distant_upsample takes the mean.
+// As in trace_cones: four adjacent points share four times as many directions, and common/distant_change.glsl takes the mean.
 int part_of(ivec2 point) { return (point.x & 1) + 2 * (point.y & 1); }
 
 // The texel with a real surface that lies nearest to the middle of a block; negative if there is none.

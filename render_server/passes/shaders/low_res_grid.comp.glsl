@@ -1,6 +1,7 @@
 // For each texel of the reduced grid, the picture pixel nearest to its centre that shows a real surface with depth,
-// and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel.
-#include "common/geometry.glsl"
+// and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel. Lists the texels that show
+// an object, and those in which objects may change the direct light of a pixel.
+#include "common/light_reach.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
 #define APPENDS_PIXELS
@@ -26,6 +27,42 @@ void append_quads(ivec2 texel) {
     }
 }
 #endif
+
+layout(std430) buffer Reached { uint reached_count; uint reached_texels[]; };   // as Texels
+
+// What the pixels of a texel show of the real scene; nearest > deepest: nothing.
+struct Block { vec3 low; vec3 high; float nearest; float deepest; bool reached; };
+
+ivec2 block_pixel(ivec2 texel, int i) { return min(pixel_in_block(texel, i, scale), picture_pixels - 1); }
+
+// Until a pixel is found in which cones change light, or light is asked for.
+Block block_at(ivec2 texel) {
+    Block b = Block(vec3(1e30), vec3(-1e30), 1e30, 0.0, false);
+    for (int i = 0; i < scale * scale && !b.reached; ++i) {
+        ivec2 pixel = block_pixel(texel, i);
+        vec4 position = texelFetch(real_surface_position, pixel, 0);
+        if (position.w <= 0.0) continue;
+        b = Block(min(b.low, position.xyz), max(b.high, position.xyz), min(b.nearest, position.w), max(b.deepest, position.w),
+            is_in_lit_area(pixel) || cones_may_reach(position, texelFetch(real_surface_normal, pixel, 0).xyz));
+    }
+    return b;
+}
+
+bool shadow_reaches_pixel(ivec2 pixel) {
+    vec4 position = texelFetch(real_surface_position, pixel, 0);
+    vec3 normal = texelFetch(real_surface_normal, pixel, 0).xyz;
+    return position.w > 0.0 && shadow_may_reach(position.xyz, normal, shadow_bias(position.w));
+}
+
+void append_reached(ivec2 texel, int width) {
+    Block b = block_at(texel);
+    bool reached = b.reached;
+    // Most blocks are far from every shadow, as their bounds tell.
+    bool near = !reached && b.nearest <= b.deepest
+        && shadow_may_reach_sphere(0.5 * (b.low + b.high), 0.5 * distance(b.low, b.high), shadow_bias(b.nearest));
+    for (int i = 0; i < (near ? scale * scale : 0) && !reached; ++i) reached = shadow_reaches_pixel(block_pixel(texel, i));
+    if (reached) reached_texels[atomicAdd(reached_count, 1u)] = uint(texel.y * width + texel.x);
+}
 
 // Lists the `count` pixels of a texel that show an object.
 void append_shown(ivec2 texel, uint count) {
@@ -65,4 +102,5 @@ void main() {
     if (best.z >= 0) append_quads(texel);
 #endif
     append_shown(texel, shown_here);
+    append_reached(texel, low.x);
 }

@@ -6,7 +6,7 @@
 layout(local_size_x = 64) in;
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 layout(rgba32f) readonly uniform image2D relit_ratio;
-layout(rgba16f) readonly uniform image2D virtual_radiance;
+#include "common/interior_edges.glsl"
 uniform sampler2D object_coverage;
 uniform sampler2D edge_correction;   // common/edge_sides.glsl
 uniform isampler2D sample_pixels;
@@ -20,7 +20,7 @@ void recompose(ivec2 pixel) {
     vec4 ratio = imageLoad(relit_ratio, pixel);
     vec3 b = max(radiance_of(code.rgb) + texelFetch(edge_correction, pixel, 0).rgb, vec3(0.0));
     float shown = texelFetch(object_coverage, pixel, 0).r;
-    vec3 result = mix(b * ratio.rgb, imageLoad(virtual_radiance, pixel).rgb, shown);
+    vec3 result = mix(b * ratio.rgb, objects_radiance(pixel), shown);
     if (ratio.a > 0.0) code.rgb = encode(result * exposure_scale);
     imageStore(code_out, pixel, code);
 }

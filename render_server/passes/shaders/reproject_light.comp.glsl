@@ -1,4 +1,4 @@
-// Direct light of the last frame in the texels that select_direct_texels listed, at the pixels that see the same surfaces
+// Direct light of the last frame in the texels that low_res_grid listed, at the pixels that see the same surfaces
 // as then, and no edge of a shadow. Lists the texels that have others; and in turn one tile in `turns`, so that errors of
 // resampling do not add up. Where objects moved, these are also those that keep all of their light without the objects, and that
 // no shadow reaches: listed apart in software, where they would wait for the loop over lights of others.

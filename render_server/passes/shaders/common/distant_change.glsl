@@ -1,15 +1,11 @@
-// The lattice's change of light (distant_change) on the reduced grid, by distance and by how well surfaces continue each
-// other; it fades out where the volume's own cones fade in.
+// The lattice's change of light (distant_change.comp.glsl) on the reduced grid, by distance and by how well surfaces continue each
+// other; it fades out where the volume's own cones fade in. Needs REAL.
 #include "common/volume.glsl"
 #include "common/low_res_grid.glsl"
 #include "common/continuation.glsl"
 #include "common/least_change.glsl"
-
-#include "common/pixel_group.glsl"
-layout(rgba16f) writeonly uniform image2D distant_change_out;
 uniform sampler2D lattice_change;
 uniform isampler2D lattice_pixels;
-#include "common/camera.glsl"
 
 // A tent over 4 x 4 points weights the four parts of their directions equally.
 vec3 interpolated(ivec2 texel, SurfacePoint s) {
@@ -32,15 +28,10 @@ vec3 interpolated(ivec2 texel, SurfacePoint s) {
     return sum / total;
 }
 
-void main() {
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(texel, low_resolution_size))) return;
+vec3 distant_change(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
-    vec3 change = vec3(0.0);
-    if (s.present) {
-        enter_volume(s.position);
-        change = (1.0 - volume_fade(volume_coordinate(s.position))) * interpolated(texel, s);
-        if (all(lessThan(abs(change), vec3(LEAST_CHANGE)))) change = vec3(0.0);
-    }
-    imageStore(distant_change_out, texel, vec4(change, 0.0));
+    if (!s.present) return vec3(0.0);
+    enter_volume(s.position);
+    vec3 change = (1.0 - volume_fade(volume_coordinate(s.position))) * interpolated(texel, s);
+    return any(greaterThanEqual(abs(change), vec3(LEAST_CHANGE))) ? change : vec3(0.0);
 }
