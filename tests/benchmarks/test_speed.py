@@ -273,9 +273,9 @@ def test_counted_frames_agree_with_what_the_graph_ran(
 
 MOST_ASKED = {  # dispatches and uploads in a frame on a GPU, while the camera moves and while an object does
     "exact:quality=live,volume_size=32": ((31, 37), (3, 6)),
-    "exact:volume_size=32": ((70, 66), (8, 10)),
+    "exact:volume_size=32": ((62, 61), (8, 10)),
     "paper:volume_size=32": ((36, 35), (4, 7)),
-    "dlpv:volume_size=16": ((72, 64), (4, 8)),
+    "dlpv:volume_size=16": ((67, 63), (4, 8)),
 }
 
 
