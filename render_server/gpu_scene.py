@@ -86,15 +86,22 @@ class DrawnMesh:
 
     `filled` are its buffers, or a function that has the GPU fill them; they hold it until another mesh is written
     there. `made` is the mesh that was uploaded, or a function that makes on the CPU what the GPU made of depth.
+    `is_behind`: it is the coarse mesh of these buffers, behind the one that is drawn.
     """
 
     filled: MeshBuffers | Callable[[], MeshBuffers]
     made: GpuMesh | Callable[[], GpuMesh]
+    is_behind: bool = False
 
     @cached_property
     def buffers(self) -> MeshBuffers:
         """Vertices and triangles on the GPU."""
         return self.filled() if callable(self.filled) else self.filled
+
+    @property
+    def triangles(self) -> range:
+        """Which of the buffers' triangles it has."""
+        return self.buffers.coarse if self.is_behind else range(self.buffers.triangle_count)
 
     @cached_property
     def mesh(self) -> GpuMesh:
@@ -172,7 +179,7 @@ class GeometryState:
     @property
     def coarse_parts(self) -> tuple[VoxelizedMesh, ...]:
         """Fewer triangles, for distant voxels."""
-        return (VoxelizedMesh(self.coarse_mesh.buffers),)
+        return (VoxelizedMesh(self.coarse_mesh.buffers, triangles=self.coarse_mesh.triangles),)
 
     def solid_parts(self, voxel_edge: float) -> tuple[VoxelizedMesh, ...]:
         """Returns `parts` for voxels of that edge (m), with coarse back faces if cameras saw only the fronts.
@@ -183,7 +190,8 @@ class GeometryState:
             return self.parts
         coarse = self.coarse_mesh
         chosen = None if self.choose_backs is None else self.choose_backs(coarse, voxel_edge)
-        return *self.parts, VoxelizedMesh(coarse.buffers, BACK_OFFSET_VOXELS * voxel_edge, chosen)
+        behind_m = BACK_OFFSET_VOXELS * voxel_edge
+        return *self.parts, VoxelizedMesh(coarse.buffers, behind_m, chosen, coarse.triangles)
 
     @cached_property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

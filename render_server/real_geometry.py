@@ -207,18 +207,17 @@ class RealGeometry:
 
         def filled() -> MeshBuffers:
             mesher.fill(self._buffers, empty)
-            mesher.fill(self._coarse_buffers, empty, coarse=True)  # takes as good as no time
             return self._buffers
 
         def made(budget: int) -> GpuMesh:
             return merge_for_gpu(seen.meshes(budget))
 
         def choose_backs(mesh: DrawnMesh, voxel_edge: float) -> Chosen:
-            return mesher.backs_of(mesh.buffers, BACK_OFFSET_VOXELS * voxel_edge)
+            return mesher.backs_of(mesh.buffers, mesh.triangles, BACK_OFFSET_VOXELS * voxel_edge)
 
         # Filled as late as the triangles are needed: grazing surfaces are searched for meanwhile.
         fine = DrawnMesh(filled, partial(made, budgets[0]))
-        coarse = DrawnMesh(self._coarse_buffers, partial(made, budgets[1]))
+        coarse = DrawnMesh(lambda: fine.buffers, partial(made, budgets[1]), is_behind=True)
         self._show(fine, points, empty, lambda: coarse, is_open=True, choose_backs=choose_backs)
 
     def _begun_coarse(self, make: Callable[[], GpuMesh]) -> Callable[[], DrawnMesh]:

@@ -122,11 +122,11 @@ class SolutionVoxels(DirectionalVoxels):
 
     def _light_mu(self, scene: Bindings, *, gathered: bool) -> None:
         real = self.real
-        self._light.light_solution(real.store, scene, real.groups, with_objects=False, gathered=gathered)
-        if gathered:
-            self._filter_mu()
-        else:
-            self._filter_first_mu()
+        occupied = None if gathered else self.mu.occupied
+        self._light.light_solution(
+            real.store, scene, real.groups, with_objects=False, gathered=gathered, occupied=occupied
+        )
+        self._fill_mu(is_first=not gathered)
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         real, objects, light = self.real, self.objects, self._light
@@ -134,9 +134,9 @@ class SolutionVoxels(DirectionalVoxels):
         light.light_virtual(objects.store, scene, objects.groups, gathered=gathered)
         clear_buffer(self._gpu, real.store.delta_sums)
         if gathered:
-            self._filter_rho()
+            self._fill_rho()
         else:
-            self._filter_first_rho()
+            self._fill_first_rho()
 
     def set_support(self, *, everywhere: bool) -> None:
         """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""

@@ -42,9 +42,7 @@ from deltalight.render_server.passes.voxel_light import (
 )
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
-    FilterVoxels,
-    RefilterVoxels,
-    ResolveVoxels,
+    FillMipmap,
     VoxelMipmap,
 )
 
@@ -64,8 +62,7 @@ class FarScene:
         self.mipmap = VoxelMipmap(gpu, FAR_SIZE, DIRECTIONS)
         self._set = VoxelSet(gpu, FAR_SIZE, [self.mipmap], own=self.mipmap)
         self._light = light
-        self._resolve = ResolveVoxels(gpu)
-        self._filter = FilterVoxels(gpu)
+        self._fill = FillMipmap(gpu)
         self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
 
     def voxelize(self, real: GeometryState) -> VoxelSet:
@@ -81,9 +78,9 @@ class FarScene:
         """Lights the voxels by the radiance that the camera measured, and filters them."""
         if self._is_used:
             voxels.forget_light()
-            self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
-            self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume, occupies=True)
-            self._filter.run(self.mipmap, voxels.volume, voxels.store)
+            own = {**scene, **voxels.volume.bindings}
+            self._light.light_real(voxels.store, own, occupied=self.mipmap.occupied)
+            self._fill.fill_mu(self.mipmap, voxels.store, voxels.volume, is_first=True)
             clear_ahead(self._gpu, (voxels.store.sums, voxels.store.sums.size))
         return voxels
 
@@ -98,7 +95,7 @@ class FarScene:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.mipmap, self._set, self._resolve, self._filter, self._block)
+        release_all(self.mipmap, self._set, self._fill, self._block)
 
 
 class DirectionalVoxels:
@@ -115,9 +112,7 @@ class DirectionalVoxels:
         self._group = GroupSurfels(gpu)
         self._gather = GatherVoxels(gpu, march_defines(settings))
         self._tail = BounceTail(gpu, march_defines(settings))
-        self._resolve = ResolveVoxels(gpu)
-        self._filter = FilterVoxels(gpu)
-        self._refilter = RefilterVoxels(gpu, self._resolve, self._filter)
+        self._fill = FillMipmap(gpu)
 
     def _make_room(self, placements: Placements) -> None:
         make_room(self.real, (self.mu, self.rho, self.objects), placements)
@@ -137,22 +132,16 @@ class DirectionalVoxels:
             self._group.run(self.objects.store, self.objects.groups, self.objects.volume.bindings)
         return self.objects
 
-    def _filter_mu(self) -> None:
-        """Filters mu anew; its occupancy is known."""
-        self._refilter.run_mu(self.mu, self.real.store, self.real.volume)
+    def _fill_mu(self, *, is_first: bool) -> None:
+        self._fill.fill_mu(self.mu, self.real.store, self.real.volume, is_first=is_first)
 
-    def _filter_rho(self) -> None:
-        """Filters rho anew; its occupancy is known."""
-        self._refilter.run_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
+    def _fill_rho(self, *, is_last: bool = False) -> None:
+        sets = self.real.store, self.objects.store
+        if self._fill.fill_rho(self.rho, *sets, self.real.volume, is_last=is_last):
+            self.objects.is_lit = False
 
-    def _filter_first_mu(self) -> None:
-        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume, occupies=True)
-        self._filter.run(self.mu, self.real.volume, self.real.store)
-
-    def _filter_first_rho(self) -> None:
-        real, virtual = self.real.store, self.objects.store
-        self._resolve.resolve_rho(self.rho, real, virtual, self.real.volume, mu=self.mu)
-        self._filter.run(self.rho, self.real.volume, real, virtual)
+    def _fill_first_rho(self) -> None:
+        self._fill.fill_first_rho(self.rho, self.real.store, self.objects.store, self.real.volume, self.mu)
 
     def _find_tail(self, scene: Bindings) -> None:
         """Finds what bounces change beyond those that were gathered."""
@@ -184,9 +173,7 @@ class DirectionalVoxels:
             self._group,
             self._gather,
             self._tail,
-            self._resolve,
-            self._filter,
-            self._refilter,
+            self._fill,
         )
 
 
@@ -227,12 +214,18 @@ class DeltaVoxels(DirectionalVoxels):
         voxels.forget_light()
         voxels.groups.reset(voxels.store)
         own = {**scene, **voxels.volume.bindings}
-        self._light.light_real(voxels.store, own, voxels.groups, finds_groups=self._bounces > 0)
+        self._light.light_real(
+            voxels.store,
+            own,
+            voxels.groups,
+            finds_groups=self._bounces > 0,
+            occupied=self.mu.occupied,
+        )
         return voxels
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
         """Filters the lit voxels into mu."""
-        self._filter_first_mu()
+        self._fill_mu(is_first=True)
         return self.mu
 
     def bounce_real(
@@ -246,7 +239,7 @@ class DeltaVoxels(DirectionalVoxels):
         for _ in range(self._bounces):
             self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)}, only_unseen=True)
             self._light.light_real(store, own, groups, gathered=True)
-            self._filter_mu()
+            self._fill_mu(is_first=False)
         self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)})
         return self.mu, voxels
 
@@ -290,7 +283,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_joint(self, lit: LitVoxels) -> tuple[VoxelMipmap, LitVoxels]:
         """Filters the lit voxels of both sets into rho, which uses up the sums of changed light."""
-        self._filter_first_rho()
+        self._fill_first_rho()
         return self.rho, lit
 
     def bounce_joint(
@@ -298,11 +291,11 @@ class DeltaVoxels(DirectionalVoxels):
     ) -> tuple[VoxelMipmap, LitVoxels]:
         """Gathers light from rho, relights the objects and what real surfaces change with it; finds the tail."""
         marching = {**scene, **self.march_bindings(1)}
-        for _ in range(self._bounces):
+        for number in range(1, self._bounces + 1):
             self._gather.gather_change(self.real.store, self.real.groups, self.mu, self.rho, marching)
             self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_rho(scene, gathered=True)
-            self._filter_rho()
+            self._fill_rho(is_last=number == self._bounces)
         self._find_tail(marching)
         return self.rho, lit
 

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 
-import moderngl
 import numpy as np
 from jaxtyping import Float32
 
@@ -17,10 +17,14 @@ from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.depth_fit import DepthFit
 from deltalight.render_server.passes.depth_views import DepthViewLayers, FittedDepth
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
+from deltalight.render_server.passes.voxelize import WriteChosen
 from deltalight.render_server.scene.depth_mesh import node_rays, stride_for_budget
 from deltalight.render_server.scene.depth_surface import jump_terms
 from deltalight.render_server.scene.triangle_mesh import GpuMesh
 from deltalight.render_server.view import CameraView
+
+Strides = tuple[int, int]
+"""Pixels of a cell of a fine mesh and of a coarse one, which is no less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,32 +50,37 @@ class DepthFrame:
         """The terms of `jump_threshold`, by pixel."""
         return jump_terms(self.depth, self.view.camera)
 
-    def stride(self, triangle_budget: int) -> int:
-        """Returns the pixels of a cell of its mesh within a budget."""
-        return stride_for_budget(*self.view.size, triangle_budget)
+    def strides(self, budgets: tuple[int, int]) -> Strides:
+        """Returns the pixels of a cell of its meshes within their budgets, fine and coarse."""
+        fine, coarse = (stride_for_budget(*self.view.size, each) for each in budgets)
+        return fine, coarse
 
 
-class _NodeGrid:
-    """Textures at the nodes of a mesh, one for each cell of stride x stride pixels."""
+class _NodeGrids:
+    """Textures at the nodes of both meshes of a depth image (shaders/common/node_grids.glsl)."""
 
-    def __init__(self, gpu: GpuContext, camera: CameraModel, stride: int) -> None:
-        _, rays = node_rays(camera, stride)
-        _, rows, columns = rays.shape
-        self.size, self.stride = (columns, rows), stride
-        self.quads = columns - 1, rows - 1
-        texels = np.ascontiguousarray(rays.transpose(1, 2, 0)).tobytes()
-        self.rays = texture_2d(gpu, self.size, 2, "f4", data=texels)
-        self.nodes = texture_2d(gpu, self.size, 4, "f4")
-
-    @property
-    def node_count(self) -> int:
-        """How many vertices there are."""
-        return int(self.size[0] * self.size[1])
+    def __init__(self, gpu: GpuContext, camera: CameraModel, strides: Strides) -> None:
+        fine, coarse = (node_rays(camera, stride)[1].transpose(1, 2, 0) for stride in strides)
+        self.strides = strides
+        self.sizes = fine.shape[1::-1], coarse.shape[1::-1]  # columns, rows
+        rays = np.zeros((len(fine) + len(coarse), fine.shape[1], 2), np.float32)
+        rays[: len(fine)] = fine
+        rays[len(fine) :, : coarse.shape[1]] = coarse
+        size = rays.shape[1], rays.shape[0]
+        self.rays = texture_2d(gpu, size, 2, "f4", data=rays.tobytes())
+        self.nodes = texture_2d(gpu, size, 4, "f4")
 
     @property
-    def triangle_count(self) -> int:
-        """How many triangles there could be."""
-        return int(2 * self.quads[0] * self.quads[1])
+    def node_counts(self) -> tuple[int, int]:
+        """How many vertices each has."""
+        fine, coarse = (columns * rows for columns, rows in self.sizes)
+        return fine, coarse
+
+    @property
+    def triangle_counts(self) -> tuple[int, int]:
+        """How many triangles each could have."""
+        fine, coarse = (2 * (columns - 1) * (rows - 1) for columns, rows in self.sizes)
+        return fine, coarse
 
     def release(self) -> None:
         release_all(self.rays, self.nodes)
@@ -87,7 +96,7 @@ class _CameraTextures:
         self._grazing = texture_2d(gpu, size, 1, "f4")
         self._rays = texture_2d(gpu, size, 2, "f4", data=camera.rays().astype(np.float32).tobytes())
         self._fit = DepthFit(gpu, size)
-        self._grids: dict[int, _NodeGrid] = {}
+        self._grids: dict[Strides, _NodeGrids] = {}
         self._taken: DepthImage | None = None
         self.fitted: dict[str, Binding] = {}
         self._is_grazing: bool | None = None
@@ -100,10 +109,10 @@ class _CameraTextures:
     def holds(self, depth: DepthImage) -> bool:
         return self._taken is depth and self.camera == depth.camera
 
-    def grid(self, stride: int) -> _NodeGrid:
-        if stride not in self._grids:
-            self._grids[stride] = _NodeGrid(self._gpu, self.camera, stride)
-        return self._grids[stride]
+    def grids(self, strides: Strides) -> _NodeGrids:
+        if strides not in self._grids:
+            self._grids[strides] = _NodeGrids(self._gpu, self.camera, strides)
+        return self._grids[strides]
 
     @property
     def pixels(self) -> dict[str, Binding]:
@@ -127,7 +136,8 @@ class DepthMesher:
     """Makes triangles of the depth images that a room's cameras took at one moment, without a wait for the GPU.
 
     Of each as scene/depth_mesh.py does; of several, those stay that scene/depth_views.py keeps. Buffers have room for
-    every node and triangle that could be, one camera's after the other's; triangles that are not there have no area.
+    every node and triangle that could be, one camera's after the other's, those of coarse meshes behind all of the
+    fine ones; triangles that are not there have no area.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -152,8 +162,7 @@ class DepthMesher:
             )
 
     def _fitted(self, camera: _CameraTextures, frame: DepthFrame) -> FittedDepth:
-        fine, coarse = (frame.stride(budget) for budget in self._budgets)
-        return FittedDepth(frame.view, camera.pixels, frame.jump_terms, (fine, coarse))
+        return FittedDepth(frame.view, camera.pixels, frame.jump_terms, frame.strides(self._budgets))
 
     def _set_cameras(self, lenses: Sequence[CameraModel]) -> None:
         self._forget_cameras()
@@ -164,49 +173,51 @@ class DepthMesher:
         """Returns what DepthFit found in a depth image if it is among those taken last, until the next are."""
         return next((camera.fitted for camera in self._cameras if camera.holds(depth)), None)
 
-    def fill(self, buffers: MeshBuffers, materials: GpuMesh, *, coarse: bool = False) -> None:
+    def fill(self, buffers: MeshBuffers, materials: GpuMesh) -> None:
         """Writes the triangles of the depth images that were taken; `materials`: their only one."""
-        strides = [each.stride(self._budgets[coarse]) for each in self._frames]
-        grids = [camera.grid(stride) for camera, stride in zip(self._cameras, strides, strict=True)]
-        nodes, triangles = (
-            [getattr(grid, name) for grid in grids] for name in ("node_count", "triangle_count")
-        )
-        buffers.reserve(sum(nodes), sum(triangles), materials)
-        for number, grid in enumerate(grids):
+        strides = [each.strides(self._budgets) for each in self._frames]
+        grids = [camera.grids(each) for camera, each in zip(self._cameras, strides, strict=True)]
+        vertices = _starts([each.node_counts for each in grids])
+        triangles = _starts([each.triangle_counts for each in grids])
+        coarse = range(triangles[0][1], triangles[-1][1])
+        buffers.reserve(vertices[-1][1], triangles[0][1], materials, coarse)
+        for number, each in enumerate(grids):
             place: Bindings = {
-                "first_vertex": sum(nodes[:number]),
-                "first_triangle": sum(triangles[:number]),
+                "grid_sizes": (*each.sizes[0], *each.sizes[1]),
+                "first_vertices": vertices[number],
+                "first_triangles": triangles[number],
                 "depth_view_number": number,
-                "coarseness": int(coarse),
             }
-            self._write(buffers, number, grid, place)
+            self._write(buffers, number, each, place)
 
-    def _write(self, buffers: MeshBuffers, number: int, grid: _NodeGrid, place: Bindings) -> None:
+    def _write(self, buffers: MeshBuffers, number: int, grids: _NodeGrids, place: Bindings) -> None:
         """Writes one camera's triangles."""
         camera, frame = self._cameras[number], self._frames[number]
+        columns, rows = grids.sizes[0]
         slope, least = frame.jump_terms
         self._make_nodes.run(
-            grid.size,
+            (columns, rows, len(grids.sizes)),
             camera.with_grazing(frame.grazing),
             {"SEVERAL_DEPTHS": False} if self._views is None else self._views.bindings,
             buffers.solid,
             place,
-            node_rays=grid.rays,
-            nodes_out=grid.nodes,
-            stride=grid.stride,
+            node_rays=grids.rays,
+            nodes_out=grids.nodes,
+            node_strides=grids.strides,
             world_from_camera=frame.view.world_from_camera,
         )
         self._make_triangles.run(
-            grid.quads,
+            (columns - 1, rows - 1, len(grids.sizes)),
             buffers.solid,
             place,
-            nodes=grid.nodes,
-            node_threshold=(grid.stride * slope, least),
+            nodes=grids.nodes,
+            node_slopes=tuple(slope * stride for stride in grids.strides),
+            least_step=least,
         )
 
-    def backs_of(self, mesh: MeshBuffers, behind_m: float) -> Callable[[moderngl.Buffer], None] | None:
+    def backs_of(self, mesh: MeshBuffers, triangles: range, behind_m: float) -> WriteChosen | None:
         """Returns what lists the triangles that have backs (DepthViewLayers); None with one camera: all have."""
-        return None if self._views is None else self._views.backs_of(mesh, behind_m)
+        return None if self._views is None else self._views.backs_of(mesh, triangles, behind_m)
 
     def _forget_cameras(self) -> None:
         release_all(*self._cameras, self._views)
@@ -216,3 +227,9 @@ class DepthMesher:
         """Frees the GL objects."""
         self._forget_cameras()
         release_all(self._make_nodes, self._make_triangles)
+
+
+def _starts(counts: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Returns where each camera's fine and coarse items begin, coarse ones behind all fine ones; last, the ends."""
+    fine, coarse = ([count[coarseness] for count in counts] for coarseness in range(2))
+    return list(zip(accumulate(fine, initial=0), accumulate(coarse, initial=sum(fine)), strict=True))

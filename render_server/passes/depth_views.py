@@ -1,6 +1,6 @@
 """Depth images of several cameras in one room: on the GPU what render_server/scene/depth_views.py does in numpy."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,6 +12,7 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.measured_views import packed_view
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
+from deltalight.render_server.passes.voxelize import WriteChosen
 from deltalight.render_server.view import CameraView
 
 VIEW_TEXELS = 8  # of a DepthView in shaders/common/depth_views.glsl
@@ -78,14 +79,22 @@ class DepthViewLayers:
         for layer, each in enumerate(seen):
             self._copy.run(each.view.size, each.bindings, inverse_out=self._inverse, layer=layer)
 
-    def backs_of(self, mesh: MeshBuffers, behind_m: float) -> Callable[[moderngl.Buffer], None]:
-        """Returns what lists the triangles of a mesh whose backs, so far behind, do not lie where nothing is."""
-        return partial(self._write_backs, mesh, behind_m)
+    def backs_of(self, mesh: MeshBuffers, triangles: range, behind_m: float) -> WriteChosen:
+        """Returns what lists those triangles of a mesh whose backs, so far behind, do not lie where nothing is."""
+        return partial(self._write_backs, mesh, triangles, behind_m)
 
-    def _write_backs(self, mesh: MeshBuffers, behind_m: float, chosen: moderngl.Buffer) -> None:
-        count = mesh.triangle_count
+    def _write_backs(
+        self, mesh: MeshBuffers, triangles: range, behind_m: float, chosen: moderngl.Buffer, first: int
+    ) -> None:
         self._list_backs.run(
-            (count,), self.bindings, mesh.solid, behind=behind_m, triangle_count=count, Chosen=chosen
+            (len(triangles),),
+            self.bindings,
+            mesh.solid,
+            behind=behind_m,
+            first_triangle=triangles.start,
+            triangle_count=len(triangles),
+            first_chosen=first,
+            Chosen=chosen,
         )
 
     def release(self) -> None:

@@ -39,6 +39,7 @@ BASE_MAPS, ALL_MAPS = 5, 13  # of a material, as materials.glsl has them
 
 NO_CUTOUTS: Bindings = {"CUTOUTS": False}
 NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
+NO_COARSE = range(0)
 VERTEX_BYTES, TRIANGLE_BYTES = 48, 12  # of a row of VERTEX_LAYOUT, and of three indices
 CORNERS_ROW = 1024  # triangles in a row of their corners' texels
 
@@ -68,6 +69,7 @@ class MeshBuffers:
         self._arrays: dict[int, moderngl.VertexArray] = {}
         self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
         self.triangle_count = 0  # of those that are drawn, with any without area
+        self.coarse = NO_COARSE  # triangles behind these, of a coarser mesh, which are not drawn
         self.cutouts = NO_CUTOUTS
 
     @property
@@ -117,13 +119,21 @@ class MeshBuffers:
         self._held_triangles = self.triangles
         self._write_placement(mesh.placement)
 
-    def reserve(self, vertex_count: int, triangle_count: int, materials: GpuMesh) -> None:
-        """Makes room for triangles of the materials of a mesh, which a kernel is to write (`solid`)."""
-        self._held_triangles = NO_TRIANGLES
-        self._reserve(vertex_count, triangle_count, materials)
+    def reserve(
+        self, vertex_count: int, triangle_count: int, materials: GpuMesh, coarse: range = NO_COARSE
+    ) -> None:
+        """Makes room for triangles of the materials of a mesh, which a kernel is to write (`solid`).
 
-    def _reserve(self, vertex_count: int, triangle_count: int, materials: GpuMesh) -> None:
-        vertex_bytes, index_bytes = vertex_count * VERTEX_BYTES, triangle_count * TRIANGLE_BYTES
+        `coarse`: those of a coarser mesh, if there is one, behind the `triangle_count` that are drawn.
+        """
+        self._held_triangles = NO_TRIANGLES
+        self._reserve(vertex_count, triangle_count, materials, coarse)
+
+    def _reserve(
+        self, vertex_count: int, triangle_count: int, materials: GpuMesh, coarse: range = NO_COARSE
+    ) -> None:
+        vertex_bytes = vertex_count * VERTEX_BYTES
+        index_bytes = (triangle_count + len(coarse)) * TRIANGLE_BYTES
         if vertex_bytes > self._vertices.size or index_bytes > self._indices.size:
             self.release()
             self._vertices = self._ctx.buffer(reserve=max(vertex_bytes, 4))
@@ -131,6 +141,7 @@ class MeshBuffers:
             self._sides = self._ctx.buffer(reserve=4)
             self._held_triangles, self._held_sides = NO_TRIANGLES, b""
         self.triangles, self.triangle_count, self._written = NO_TRIANGLES, triangle_count, None
+        self.coarse = coarse
         self._shows_corners = False
         if triangle_count:
             self._write_sides(materials.material_table[:, DOUBLE_SIDED])

@@ -142,10 +142,18 @@ class LightVoxels:
         *,
         gathered: bool = False,
         finds_groups: bool = False,
+        occupied: moderngl.Buffer | None = None,
     ) -> None:
-        """Sums c_mu and a_real; `groups` keep each surfel's light. `finds_groups`: gives groups slots on the way."""
-        more = ("FINDS_GROUPS",) if finds_groups else ()
-        self._run("REAL", store, groups, scene, *more, gathered=gathered)
+        """Sums c_mu and a_real; `groups` keep each surfel's light. `finds_groups`: gives groups slots on the way.
+
+        On a GPU, also marks the voxels in the occupancy of their mipmap, which is empty; in software,
+        `ResolveVoxels` does, because that walks fewer.
+        """
+        more = [*["FINDS_GROUPS"] * finds_groups, *["MARKS"] * self._marks(occupied)]
+        self._run("REAL", store, groups, scene, *more, gathered=gathered, occupied=occupied)
+
+    def _marks(self, occupied: moderngl.Buffer | None) -> bool:
+        return occupied is not None and not self._gpu.is_software
 
     def light_real_delta(
         self,
@@ -180,13 +188,15 @@ class LightVoxels:
         *,
         with_objects: bool,
         gathered: bool = False,
+        occupied: moderngl.Buffer | None = None,
     ) -> None:
-        """Sums all light and opacity of real surfaces under the maps of `scene`.
+        """Sums all light and opacity of real surfaces under the maps of `scene`; `occupied` as of `light_real`.
 
         Run it without objects first, so that `groups` hold E_mu for the other solution.
         """
         clear_buffer(self._gpu, store.sums)
-        self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, scene, gathered=gathered)
+        kind, more = "REAL_RHO" if with_objects else "REAL_MU", ["MARKS"] * self._marks(occupied)
+        self._run(kind, store, groups, scene, *more, gathered=gathered, occupied=occupied)
 
     def _run(
         self,
@@ -197,11 +207,13 @@ class LightVoxels:
         *more: str,
         gathered: bool,
         from_mu: bool = False,
+        occupied: moderngl.Buffer | None = None,
     ) -> None:
         self._kernel(kind, *more, *["GATHERED"] * gathered, *["FROM_MU"] * from_mu).run(
             (self._threads,),
             store.bindings,
             NO_GROUPS if groups is None else groups.bindings,
+            {"Occupied": occupied},
             scene,
             keep_light=groups is not None,
             DeltaSums=store.delta_sums,

@@ -268,7 +268,7 @@ class ResolveVoxels:
         self._gpu, self._threads = gpu, list_threads(gpu)
         self._mu = Kernel(gpu, "resolve_voxels")
         # In software, clearing the whole buffer is faster than emptying the sums one by one.
-        spends = {} if gpu.is_software else {"SPENDS_DELTA": 1}
+        spends = {} if gpu.is_software else {"SPENDS": 1}
         self._rho = Kernel(gpu, "resolve_voxels", RHO=1, **spends)
 
     def resolve_mu(
@@ -302,6 +302,7 @@ class ResolveVoxels:
             marks=mu is not None,
             VirtualTouched=virtual.touched,
             **_joint_sums(real, virtual),
+            **({} if self._gpu.is_software else {"spends_virtual": False}),
         )
         note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
 
@@ -389,36 +390,64 @@ class FilterVoxels:
         release_all(self._levels, self._listed)
 
 
-class RefilterVoxels:
-    """Resolves and filters mipmaps anew whose occupancy is known: on a GPU in one dispatch, which skips by it."""
+class FillMipmap:
+    """Fills mipmaps from the sums of lit voxels; where their occupancy is known, on a GPU in one dispatch."""
 
-    def __init__(self, gpu: GpuContext, resolve: ResolveVoxels, filtering: FilterVoxels) -> None:
-        self._gpu, self._resolve, self._filter = gpu, resolve, filtering
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._resolve, self._filter = ResolveVoxels(gpu), FilterVoxels(gpu)
         self._mu: LevelFilter | None = None
         self._rho: LevelFilter | None = None
         if not gpu.is_software:
             self._mu = LevelFilter(gpu, "filter_voxels", RESOLVES=1)
-            self._rho = LevelFilter(gpu, "filter_voxels", RESOLVES=1, RHO=1, SPENDS_DELTA=1)
+            self._rho = LevelFilter(gpu, "filter_voxels", RESOLVES=1, RHO=1, SPENDS=1)
 
-    def run_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
-        """Rebuilds mu, as `ResolveVoxels.resolve_mu` and `FilterVoxels` do."""
+    def fill_mu(
+        self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume, *, is_first: bool = False
+    ) -> None:
+        """Writes (c_mu, a_real), and filters it.
+
+        `is_first`: of these voxels; then their occupancy is that which `LightVoxels` marked, or is marked here.
+        """
         if self._mu is None:
-            self._resolve.resolve_mu(mu, real, volume)
+            self._resolve.resolve_mu(mu, real, volume, occupies=is_first)
             self._filter.run(mu, volume, real)
         else:
             own: Bindings = {"Occupied": mu.occupied}
             self._mu.run(volume, DIRECTIONS, own, real.bindings, mipmap=mu.texture)
 
-    def run_rho(self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume) -> None:
-        """Rebuilds rho, as `ResolveVoxels.resolve_rho` and `FilterVoxels` do."""
+    def fill_first_rho(
+        self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume, mu: VoxelMipmap
+    ) -> None:
+        """Writes (c_rho, a_real + a_virtual) and filters it, with the occupancy of mu and what objects add to it.
+
+        It uses up the sums of changed light.
+        """
+        self._resolve.resolve_rho(rho, real, virtual, volume, mu=mu)
+        self._filter.run(rho, volume, real, virtual)
+
+    def fill_rho(
+        self,
+        rho: VoxelMipmap,
+        real: VoxelStore,
+        virtual: VoxelStore,
+        volume: PlacedVolume,
+        *,
+        is_last: bool = False,
+    ) -> bool:
+        """Does the same again, of the same voxels; returns whether it used up the virtual sums, too.
+
+        On a GPU it does where `is_last`: nothing reads them before the objects are lit anew.
+        """
         if self._rho is None:
             self._resolve.resolve_rho(rho, real, virtual, volume)
             self._filter.run(rho, volume, real, virtual)
-        else:
-            own: Bindings = {"Occupied": rho.occupied, **_joint_sums(real, virtual)}
-            self._rho.run(volume, DIRECTIONS, own, real.bindings, mipmap=rho.texture)
-            note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
+            return False
+        own: Bindings = {"Occupied": rho.occupied, "spends_virtual": is_last, **_joint_sums(real, virtual)}
+        self._rho.run(volume, DIRECTIONS, own, real.bindings, mipmap=rho.texture)
+        note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
+        return is_last
 
     def release(self) -> None:
-        """Frees its own programs."""
-        release_all(self._mu, self._rho)
+        """Frees the programs."""
+        release_all(self._resolve, self._filter, self._mu, self._rho)

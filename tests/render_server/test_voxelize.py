@@ -1,7 +1,8 @@
 """Voxelisation is exact: no area is lost or made, and a closed mesh gives a closed shell (docs/method.md 4.2)."""
 
 import math
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from scipy import ndimage
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.clearing import clear_buffer, clear_volume
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.passes.split_injection import FilterIsotropic
@@ -212,6 +214,37 @@ def test_chosen_triangles_alone_are_voxelised(lab: VoxelLab) -> None:
     chosen = np.array([3, 17, 18, 44], np.int32)
     wanted = sorted_surfels(lab, replace(mesh, triangles=mesh.triangles[chosen]))
     assert np.array_equal(sorted_surfels(lab, mesh, chosen=chosen), wanted)
+
+
+def test_parts_of_a_mesh_fill_several_volumes_together(gpu: GpuContext) -> None:
+    """A part and backs of a mesh, long triangles among them, in two volumes: as each alone in each volume."""
+    placements = VolumePlacement((0.0, 0.0, 0.0), 1.0, SIZE), VolumePlacement((7.0, 3.0, 11.0), 0.5, SIZE)
+    volume, voxelize, mesh = PlacedVolume(gpu, *placements), Voxelize(gpu), MeshBuffers(gpu)
+    mesh.write(gpu_mesh(soup(np.random.default_rng(11), 60, (14.0, 14.0, 14.0))))
+    chosen = np.array([0, 4, 19], np.int32)
+    parts = (
+        VoxelizedMesh(mesh, triangles=range(5, 40)),
+        VoxelizedMesh(mesh, 2.0, chosen, range(40, 60)),
+    )
+    store = VoxelStore(gpu, SIZE)
+
+    def surfels(*meshes: Sequence[VoxelizedMesh]) -> np.ndarray:
+        store.resize(SIZE, len(placements))
+        voxelize.run_all(store, meshes, volume)
+        _, count = store.counts()
+        rows = np.frombuffer(store.surfels.read(count * SURFEL_BYTES, offset=SURFELS_HEADER_BYTES), np.uint32)
+        return rows.reshape(count, -1)
+
+    runs: Counter[str] = Counter()
+    with watched(gpu, lambda run: runs.update([run.kernel.split()[0]])):
+        together = surfels(parts, parts)
+    assert runs["voxelize"] == 1
+    alone = [surfels([part], []) for part in parts] + [surfels([], [part]) for part in parts]
+    assert min(map(len, alone)) > 20
+    wanted = np.concatenate(alone)
+    assert np.array_equal(np.unique(together, axis=0), np.unique(wanted, axis=0))
+    assert len(together) == len(wanted)
+    release_all(store, volume, voxelize, mesh)
 
 
 def test_a_gpu_counts_without_being_waited_for(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) -> None:

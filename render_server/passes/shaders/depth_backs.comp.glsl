@@ -3,13 +3,14 @@
 #include "common/depth_views.glsl"
 
 layout(local_size_x = 64) in;
-uniform int triangle_count;
-layout(std430) writeonly buffer Chosen { uint chosen[]; };   // the triangle's number, or NOT_CHOSEN
+uniform float behind;         // m
+uniform int first_triangle, triangle_count, first_chosen;
+layout(std430) writeonly buffer Chosen { uint chosen[]; };   // the triangle's number, from the first one on, or NOT_CHOSEN
 
 void main() {
     uint triangle = gl_GlobalInvocationID.x;
     if (triangle >= uint(triangle_count)) return;
-    Piece back = triangle_at(triangle);
+    Piece back = triangle_at(uint(first_triangle) + triangle, behind);
     vec3 middle = (back.a.place + back.b.place + back.c.place) / 3.0;
-    chosen[triangle] = is_in_free_space(middle) ? NOT_CHOSEN : triangle;
+    chosen[uint(first_chosen) + triangle] = is_in_free_space(middle) ? NOT_CHOSEN : triangle;
 }

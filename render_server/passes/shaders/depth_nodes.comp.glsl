@@ -1,6 +1,6 @@
-// Nodes of the mesh of a depth image, one for each cell of stride x stride pixels, at its centre (scene/depth_mesh.py):
-// their vertices, inverse depth, the step to their neighbours that slopes explain, and with several cameras whether another
-// one shows the surface there larger.
+// Nodes of the meshes of a depth image, fine (z: 0) and coarse (1), one for each cell of stride x stride pixels, at its centre
+// (scene/depth_mesh.py): their vertices, inverse depth, the step to their neighbours that slopes explain, and with several
+// cameras whether another one shows the surface there larger.
 #define FITS_DEPTH
 #include "common/fitted_normal.glsl"
 #pragma switch GRAZING
@@ -8,15 +8,14 @@
 #ifdef SEVERAL_DEPTHS
 #include "common/depth_views.glsl"
 uniform int depth_view_number;   // of this camera
-uniform int coarseness;          // of this mesh: 0 fine, 1 coarse
 #endif
 
 #include "common/pixel_group.glsl"
+#include "common/node_grids.glsl"
 uniform sampler2D node_rays;       // (x/z, y/z) of the cells' centres
 uniform sampler2D grazing_depth;   // 1/m, of surfaces too oblique to measure; 0 elsewhere
-uniform int stride;                // pixels
+uniform ivec2 node_strides;        // pixels
 uniform mat4 world_from_camera;
-uniform int first_vertex;
 layout(rgba32f) writeonly uniform image2D nodes_out;   // 1/m, 0 for a hole; 1/m; 1 if another camera shows it larger
 layout(std430) writeonly buffer Vertices { float vertices[]; };   // VERTEX_FLOATS each (scene/triangle_mesh.py)
 
@@ -25,6 +24,7 @@ const uint VERTEX_FLOATS = 12u;
 const float MAX_CELL_DISTANCE = 2.8284271;   // cells between the pixels of two neighbouring nodes, at most
 const float MOST_SHIFT = 0.1;   // of w, from a pixel to the centre: outliers of the slope must not throw nodes off
 
+int stride;                // of this mesh
 uint keys[MOST_SAMPLES];   // of a cell's sampled pixels: bits of w, the lowest replaced by the sample's number
 
 float fitted_depth(ivec2 pixel) {
@@ -86,9 +86,12 @@ void store_vertex(uint node, vec3 place, vec3 normal, vec2 pixel) {
 }
 
 void main() {
-    ivec2 cell = ivec2(gl_GlobalInvocationID.xy), cells = textureSize(node_rays, 0), size = textureSize(inverse_depth, 0);
+    int coarseness = int(gl_WorkGroupID.z);
+    ivec2 cell = ivec2(gl_GlobalInvocationID.xy), cells = grid_size(coarseness), size = textureSize(inverse_depth, 0);
     if (any(greaterThanEqual(cell, cells))) return;
-    vec2 ray = texelFetch(node_rays, cell, 0).xy;
+    stride = node_strides[coarseness];
+    ivec2 texel = node_texel(coarseness, cell);
+    vec2 ray = texelFetch(node_rays, texel, 0).xy;
     ivec2 pixel = median_pixel(cell, false);
     float chosen = fitted_depth(pixel), w = 0.0, slack = 0.0;
     vec3 normal = vec3(0.0);
@@ -115,6 +118,6 @@ void main() {
 #ifdef SEVERAL_DEPTHS
     is_copy = w > 0.0 && is_shown_larger(depth_view_number, world, normal, coarseness);
 #endif
-    imageStore(nodes_out, cell, vec4(w, slack, float(is_copy), 0.0));
-    store_vertex(uint(first_vertex + cell.y * cells.x + cell.x), world, normal, 0.5 * vec2(first + last));
+    imageStore(nodes_out, texel, vec4(w, slack, float(is_copy), 0.0));
+    store_vertex(uint(first_vertices[coarseness] + cell.y * cells.x + cell.x), world, normal, 0.5 * vec2(first + last));
 }

@@ -5,7 +5,7 @@
 // VIRTUAL: L_rho = albedo / pi E_rho + emission.
 // E is direct + ambient light at first; FROM_MU: direct light + what the surfel's group gathered from mu; GATHERED: the direct
 // light of either run + what the group gathered, where REAL and VIRTUAL add the growth of L.
-// FINDS_GROUPS: each surfel's group gets a slot on the way (group_surfels).
+// FINDS_GROUPS: each surfel's group gets a slot on the way (group_surfels). MARKS: so does its voxel in a mipmap's occupancy.
 // REAL_MU and REAL_RHO sum all of L, each under the maps of its own solution: L_mu as REAL,
 // L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
 #define SURFELS_ACCESS readonly
@@ -81,6 +81,12 @@ int group_of(Surfel s, vec3 n) { return group_slot(group_entry(floatBitsToUint(s
 #include "common/find_group.glsl"
 #else
 void find_group(uint voxel, vec3 n) {}
+#endif
+
+#ifdef MARKS
+#include "common/mark_occupancy.glsl"
+#else
+void occupy(ivec3 voxel) {}
 #endif
 
 #ifdef GATHERED
@@ -258,6 +264,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 void light(Surfel s, uint own, vec3 n) {
     uint voxel = floatBitsToUint(s.uv_voxel.z);
     ivec3 v = enter_volume_of(voxel, volume_size);
+    occupy(v);
     find_group(voxel, n);
     vec3 radiance = outgoing(s, n, own);
 #if defined(REAL_DELTA) || defined(GATHERED)

@@ -11,8 +11,7 @@
 #endif
 #include "common/voxel_store.glsl"
 #include "common/resolved_voxels.glsl"
-#define OCCUPANCY_ACCESS
-#include "common/occupancy.glsl"
+#include "common/mark_occupancy.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image3D mipmap;
@@ -20,24 +19,6 @@ uniform bool marks;   // the occupancy; or that is done
 #ifdef RHO
 layout(std430) readonly buffer VirtualTouched { uint virtual_count; uint virtual_touched[]; };
 #endif
-
-void mark(int level, ivec3 corner, uint bits) {
-    int word = volume * mipmap_words(volume_size) + corner_word(volume_size, level, corner);
-    if ((occupied[word] & bits) != bits) atomicOr(occupied[word], bits);
-}
-
-void occupy(ivec3 cell, int level) {
-    int bit = cell.x & 31;
-    for (int j = 0; j < 4; ++j) {
-        ivec3 corner = cell + ivec3(0, j & 1, j >> 1);
-        mark(level, corner, bit < 31 ? 3u << bit : 1u << 31);
-        if (bit == 31) mark(level, corner + ivec3(1, 0, 0), 1u);
-    }
-}
-
-void occupy(ivec3 voxel) {
-    for (int level = 0; level < volume_levels; ++level) occupy(voxel >> level, level);
-}
 
 void main() {
     for (uint i = first_item(); i < slot_count; i += items_apart()) {

@@ -1,14 +1,13 @@
 // Lists the voxels that each piece of a triangle may meet: those of its box that its plane cuts. Clipping takes far longer, so
-// it gets a thread for each pair, however many voxels a triangle meets. Triangles longer than `longest_kept` are listed
-// first and cut then (LONG), some levels each, so that no thread has much more to do than others.
+// it gets a thread for each pair, however many voxels a triangle meets. Triangles longer than `longest_voxels` are listed
+// first and cut then (LONG), some levels each, so that no thread has much more to do than others. Fillings lie in y.
 #include "common/volume.glsl"
 #include "common/walk.glsl"
 #define PAIRS_ACCESS
 #include "common/voxel_pieces.glsl"
 
 layout(local_size_x = 64) in;
-uniform int filled_volume;
-uniform float longest_kept;   // m
+uniform float longest_voxels;   // longer edges are cut
 
 const float SLACK = 1e-3;     // relative, and in voxels: more than rounding
 const int LAST_LEVELS = 5;    // of cuts that the thread of a long piece makes
@@ -19,10 +18,10 @@ const int MOST_LEVELS = 30;   // bits of a path
 layout(std430) readonly buffer LongPieces { uvec2 long_pieces[]; };
 #else
 layout(std430) buffer LongPieces { uvec2 long_pieces[]; };
-layout(std430) readonly buffer Chosen { uint chosen[]; };
-uniform int triangle_count;
-uniform bool is_chosen;       // whether only those are voxelised whose numbers are given (or NOT_CHOSEN)
+layout(std430) readonly buffer Chosen { uint chosen[]; };   // numbers from a filling's first triangle on, or NOT_CHOSEN
 #endif
+
+float longest_kept() { return longest_voxels * voxel_edge; }
 
 bool reaches_volume(Piece p) {
     vec3 a = volume_coordinate(p.a.place), b = volume_coordinate(p.b.place), c = volume_coordinate(p.c.place);
@@ -72,7 +71,7 @@ void cut_piece(uint triangle, uint root, int levels) {
     bool is_done = false;
     while (!is_done) {
         Piece p = piece_of(triangle, path);
-        bool reaches = reaches_volume(p), is_long = longest_edge(p) > longest_kept;
+        bool reaches = reaches_volume(p), is_long = longest_edge(p) > longest_kept();
         if (reaches && is_long && findMSB(path) < levels) {
             path <<= 1;
             continue;
@@ -86,20 +85,24 @@ void cut_piece(uint triangle, uint root, int levels) {
 
 #ifdef LONG
 void main() {
-    work_in_volume(filled_volume);
     uint count = min(long_count, uint(long_pieces.length()));
-    for (uint i = first_item(); i < count; i += items_apart()) cut_piece(long_pieces[i].x, long_pieces[i].y, MOST_LEVELS);
+    for (uint i = first_item(); i < count; i += items_apart()) {
+        enter_filling_of(long_pieces[i].x);
+        cut_piece(long_pieces[i].x, long_pieces[i].y, MOST_LEVELS);
+    }
 }
 #else
 void main() {
-    uint i = gl_GlobalInvocationID.x;
-    if (i >= uint(triangle_count)) return;
-    work_in_volume(filled_volume);
-    uint triangle = is_chosen ? chosen[i] : i;
-    if (triangle == NOT_CHOSEN) return;
-    Piece p = triangle_at(triangle);
+    int i = int(gl_GlobalInvocationID.x), filling = int(gl_WorkGroupID.y);
+    ivec4 own = fillings[filling];
+    if (i >= own.y) return;
+    uint number = own.z < 0 ? uint(i) : chosen[own.z + i];
+    if (number == NOT_CHOSEN) return;
+    uint triangle = in_filling(filling, uint(own.x) + number);
+    enter_filling_of(triangle);
+    Piece p = piece_of(triangle, WHOLE);
     if (!reaches_volume(p)) return;
-    float length_ratio = longest_edge(p) / longest_kept;
+    float length_ratio = longest_edge(p) / longest_kept();
     // n cuts leave no edge longer than sqrt(3) 2^(-n/2) of the longest (Stynes 1980).
     int levels = int(ceil(2.0 * log2(max(length_ratio, 1.0)) + 1.585));
     cut_piece(triangle, WHOLE, clamp(levels - LAST_LEVELS, 0, MOST_LEVELS));

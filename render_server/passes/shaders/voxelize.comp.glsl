@@ -12,7 +12,6 @@
 
 layout(local_size_x = 64) in;
 layout(std430) readonly buffer Sides { float double_sided[]; };   // of each material
-uniform int filled_volume;
 
 // A half plane of the piece's plane, seen along the axis nearest to its normal: dot(xy, p) + z >= 0, xy of length 1.
 const int LINES = 9;                           // three edges, and six faces of the voxel
@@ -113,8 +112,9 @@ void emit(Piece t, int material, vec4 part, ivec3 voxel, vec3 a, vec3 b, vec3 c,
 }
 
 void clip_to_voxel(Pair pair) {
+    enter_filling_of(pair.triangle);
     Piece t = piece_of(pair.triangle, pair.path);
-    int material = material_of(pair.triangle);
+    int material = material_of(number_of(pair.triangle));
     ivec3 voxel = voxel_of_bits(pair.voxel);
     vec3 a = volume_coordinate(t.a.place), b = volume_coordinate(t.b.place), c = volume_coordinate(t.c.place);
     vec3 n = cross(b - a, c - a);
@@ -129,7 +129,6 @@ void clip_to_voxel(Pair pair) {
 }
 
 void main() {
-    work_in_volume(filled_volume);
     uint count = min(pair_count, uint(pairs.length()));
     for (uint i = first_item(); i < count; i += items_apart()) clip_to_voxel(pairs[i]);
 }

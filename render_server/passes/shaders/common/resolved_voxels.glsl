@@ -1,13 +1,15 @@
 // Premultiplied (c_k, a_k) texels of level 0 from fixed-point sums: of the real set, with RHO with the change of its light, and of
-// the virtual set. With SPENDS_DELTA, the sums of the change are left empty. Needs voxel_store.glsl, SUMS_ACCESS.
+// the virtual set. With SPENDS, the sums of the change are left empty, and the virtual ones if `spends_virtual`. Needs voxel_store.glsl, SUMS_ACCESS.
 #ifdef RHO
-#ifdef SPENDS_DELTA
+#ifdef SPENDS
+uniform bool spends_virtual;
 layout(std430) buffer DeltaSums { int delta_sums[]; };
+layout(std430) buffer VirtualSums { int virtual_sums[]; };
 #else
 layout(std430) readonly buffer DeltaSums { int delta_sums[]; };
+layout(std430) readonly buffer VirtualSums { int virtual_sums[]; };
 #endif
 layout(std430) readonly buffer VirtualGrid { uint virtual_grid[]; };
-layout(std430) readonly buffer VirtualSums { int virtual_sums[]; };
 #endif
 
 // A voxel face cannot be covered more than once: further layers occlude each other, radiance keeps its mean.
@@ -16,7 +18,7 @@ vec4 at_most_covered(vec4 c) { return c.a > 1.0 ? c / c.a : c; }
 #ifdef RHO
 ivec3 take_delta(int at) {
     ivec3 delta = ivec3(delta_sums[at], delta_sums[at + 1], delta_sums[at + 2]);
-#ifdef SPENDS_DELTA
+#ifdef SPENDS
     delta_sums[at] = delta_sums[at + 1] = delta_sums[at + 2] = 0;
 #endif
     return delta;
@@ -34,10 +36,12 @@ vec4 real_texel(int slot, int k) {
 
 #ifdef RHO
 vec4 virtual_texel(int slot, int k) {
-    int at = slot * SUMS_PER_SLOT;
-    vec3 c = vec3(virtual_sums[at + RADIANCE + k * 3], virtual_sums[at + RADIANCE + k * 3 + 1],
-        virtual_sums[at + RADIANCE + k * 3 + 2]);
-    return at_most_covered(vec4(c, float(virtual_sums[at + COVERAGE + k])) / FIXED_POINT);
+    int covered = slot * SUMS_PER_SLOT + COVERAGE + k, at = slot * SUMS_PER_SLOT + RADIANCE + k * 3;
+    vec4 sum = vec4(virtual_sums[at], virtual_sums[at + 1], virtual_sums[at + 2], virtual_sums[covered]);
+#ifdef SPENDS
+    if (spends_virtual) virtual_sums[at] = virtual_sums[at + 1] = virtual_sums[at + 2] = virtual_sums[covered] = 0;
+#endif
+    return at_most_covered(sum / FIXED_POINT);
 }
 #endif
 

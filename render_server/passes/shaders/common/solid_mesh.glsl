@@ -4,7 +4,6 @@ struct Piece { Corner a; Corner b; Corner c; };   // of a triangle, or all of it
 
 layout(std430) readonly buffer Vertices { float vertices[]; };   // VERTEX_FLOATS each (scene/triangle_mesh.py)
 layout(std430) readonly buffer Indices { uint indices[]; };      // three a triangle
-uniform float behind;   // m: not 0 for backs, which lie so far behind their triangles and face the other way
 
 const uint VERTEX_FLOATS = 12u;
 const uint NOT_CHOSEN = 0xffffffffu;   // in place of a triangle's number in a list of those that count
@@ -26,7 +25,7 @@ float length_of(vec3 v) {
     return sqrt(squares);
 }
 
-vec3 behind_of(vec3 a, vec3 b, vec3 c) {
+vec3 shift_of(vec3 a, vec3 b, vec3 c, float behind) {
     precise vec3 one = b - a, other = c - a;
     precise vec3 across = one.yzx * other.zxy - one.zxy * other.yzx;
     precise vec3 normal = across / max(length_of(across), 1.17549435e-38);
@@ -34,11 +33,12 @@ vec3 behind_of(vec3 a, vec3 b, vec3 c) {
     return shift;
 }
 
-Piece triangle_at(uint triangle) {
+// `behind`, m: not 0 for backs, which lie so far behind their triangles and face the other way.
+Piece triangle_at(uint triangle, float behind) {
     Corner a = corner_at(indices[3u * triangle]), b = corner_at(indices[3u * triangle + 1u]);
     Corner c = corner_at(indices[3u * triangle + 2u]);
     if (behind == 0.0) return Piece(a, b, c);
-    precise vec3 shift = behind_of(a.place, b.place, c.place);
+    precise vec3 shift = shift_of(a.place, b.place, c.place, behind);
     a.place -= shift;
     b.place -= shift;
     c.place -= shift;
