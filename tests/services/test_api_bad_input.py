@@ -156,7 +156,7 @@ def zip_bomb() -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.gltf", json.dumps({"asset": {"version": "2.0"}}))
-        archive.writestr("zeros.bin", bytes(64 << 20))
+        archive.writestr("zeros.bin", bytes(4 << 20))
     return buffer.getvalue()
 
 
