@@ -176,9 +176,14 @@ class TriangleMesh:
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
         """Returns the least and greatest coordinates of the vertices that triangles use."""
-        uses_all = len(self._used) == len(self.positions)
-        used = self.positions if uses_all else self.positions.take(self._used, axis=0)
-        return np.stack(short_axis.bounds(used))
+        return np.stack(self.bounds_at(self.positions))
+
+    def bounds_at(
+        self, positions: short_axis.Array[short_axis.Scalar]
+    ) -> tuple[short_axis.Array[short_axis.Scalar], short_axis.Array[short_axis.Scalar]]:
+        """Returns the least and the greatest of those vertices' coordinates if all were at other positions (n, 3)."""
+        uses_all = len(self._used) == len(positions)
+        return short_axis.bounds(positions if uses_all else positions.take(self._used, axis=0))
 
     @cached_property
     def _used(self) -> Int64[np.ndarray, " k"]:
