@@ -36,7 +36,7 @@ class TurnedMesh:
 
         To the bit: rounding keeps the order of positions, so the least is the rounded least.
         """
-        return (self._bounds + place).astype(np.float32)
+        return np.asarray(self._bounds + place, np.float32)
 
     @cached_property
     def _bounds(self) -> Float64[np.ndarray, "2 3"]:
