@@ -387,8 +387,8 @@ class Graph:
         Stages whose results no stage reads are left out: they serve estimates of light.
         """
         last_ms = {} if self.timers is None else self.timers.last_ms
-        kept = [stage.name for stage in self._sorted() if stage.is_read and stage.seen is not None]
-        return {name: last_ms[name] for name in kept if name in last_ms and name not in ran}
+        kept = [stage for stage in self._sorted() if stage.name not in ran and stage.name in last_ms]
+        return {stage.name: last_ms[stage.name] for stage in kept if stage.is_read and stage.seen is not None}
 
     def invalidate(self) -> None:
         """Makes every stage run again with the next run that needs it."""
