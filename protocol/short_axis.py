@@ -25,9 +25,7 @@ def bounds(points: Array[Scalar]) -> tuple[Array[Scalar], Array[Scalar]]:
 
 def boxes(corners: Array[Scalar]) -> tuple[Array[Scalar], Array[Scalar]]:
     """Returns the least and the greatest coordinates (m, k) of the corners of each polygon (m, c, k)."""
-    count, corner_count, axes = corners.shape
-    columns = np.ascontiguousarray(corners.reshape(count, corner_count * axes).T)
-    columns = columns.reshape(corner_count, axes, count)
+    columns = np.ascontiguousarray(np.moveaxis(corners, 0, -1))
     return columns.min(axis=0).T, columns.max(axis=0).T
 
 

@@ -40,6 +40,8 @@ class ObjectExtent:
     @classmethod
     def around(cls, parts: Sequence["ObjectExtent"]) -> "ObjectExtent":
         """Returns the extent of several objects."""
+        if len(parts) == 1:
+            return cls(parts[0].points, parts[0].upright, tuple(parts))
         points = np.concatenate([each.points for each in parts])
         upright = np.stack(short_axis.bounds(np.concatenate([each.upright for each in parts])))
         return cls(points, upright, tuple(parts))

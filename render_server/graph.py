@@ -31,6 +31,7 @@ from deltalight.render_server.stages import (
 __all__ = ["Graph", "GraphError", "Resource", "Stage"]
 
 T = TypeVar("T")
+UNTIMED = nullcontext()
 _Polled = tuple[Resource[Any], Callable[[], Any], Same]
 
 
@@ -316,9 +317,9 @@ class Graph:
             stage.lag is not None and stage.lag.holds(stage.inputs, stage.seen, versions)
         ):
             return
-        for item in stage.inputs:
-            if item.version == 0:
-                raise GraphError(f"Stage `{stage.name}` reads `{item.name}` before it is written.")
+        if 0 in versions:
+            name = stage.inputs[versions.index(0)].name
+            raise GraphError(f"Stage `{stage.name}` reads `{name}` before it is written.")
         for output, value in zip(stage.outputs, self._call(stage), strict=True):
             output.write(value, stage.same)
         stage.seen, stage.ran_in = versions, self._runs
@@ -328,22 +329,19 @@ class Graph:
         dispatches: list[Dispatch] = []
         try:
             with self._around(stage, dispatches):
-                found = stage.function(*[item.value for item in stage.inputs])
+                found = stage.call()
         except Exception as error:
             error.add_note(f"Stage `{stage.name}` raised it.")
             raise
-        results = found if len(stage.outputs) > 1 else (found,)
-        count = len(results) if isinstance(results, tuple | list) else 1
-        if count != len(stage.outputs):
-            names = ", ".join(f"`{item.name}`" for item in stage.outputs)
-            raise GraphError(f"Stage `{stage.name}` returned {count} values for {names}.")
-        self._require_declared(stage, results, dispatches)
+        results = (found,) if len(stage.outputs) == 1 else _several(stage, found)
+        if dispatches:
+            self._require_declared(stage, results, dispatches)
         return results
 
     def _around(self, stage: Stage, dispatches: list[Dispatch]) -> AbstractContextManager[object]:
         """Returns a context that times a stage, blames its plugin, and lists its `dispatches` if they are checked."""
         timers = None if stage.name in self._values else self.timers
-        timed = nullcontext() if timers is None else timers.measure(stage.name)
+        timed = UNTIMED if timers is None else timers.measure(stage.name)
         if stage.plugin is None and not self._checks:
             return timed
         around = ExitStack()
@@ -356,7 +354,7 @@ class Graph:
 
     def _require_declared(self, stage: Stage, results: Sequence[Any], dispatches: Sequence[Dispatch]) -> None:
         """Raises if a kernel wrote what another stage made, unless this stage returns it."""
-        own = {id(item) for value in results for item in gpu_objects(value)} if dispatches else set()
+        own = {id(item) for value in results for item in gpu_objects(value)}
         written = [
             (run.kernel, name, item)
             for run in dispatches
@@ -389,8 +387,8 @@ class Graph:
         Stages whose results no stage reads are left out: they serve estimates of light.
         """
         last_ms = {} if self.timers is None else self.timers.last_ms
-        kept = [stage.name for stage in self._sorted() if stage.is_read and stage.seen is not None]
-        return {name: last_ms[name] for name in kept if name in last_ms and name not in ran}
+        kept = [stage for stage in self._sorted() if stage.name not in ran and stage.name in last_ms]
+        return {stage.name: last_ms[stage.name] for stage in kept if stage.is_read and stage.seen is not None}
 
     def invalidate(self) -> None:
         """Makes every stage run again with the next run that needs it."""
@@ -443,6 +441,20 @@ class Graph:
         for item in reversed(self._owned):
             item.release()
         self._owned.clear()
+
+
+def _several(stage: Stage, found: Any) -> Sequence[Any]:  # noqa: ANN401 (as the stage's function returns)
+    """Returns the values of a stage's several outputs.
+
+    Raises:
+        GraphError: there are fewer or more.
+    """
+    count = len(found) if isinstance(found, tuple | list) else 1
+    if count != len(stage.outputs):
+        names = ", ".join(f"`{item.name}`" for item in stage.outputs)
+        raise GraphError(f"Stage `{stage.name}` returned {count} values for {names}.")
+    values: Sequence[Any] = found
+    return values
 
 
 def _of_view(name: str, view: int) -> str:

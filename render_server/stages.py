@@ -79,6 +79,10 @@ class Stage:
         """The clocks that make it run."""
         return self.outputs[0].clocks
 
+    def call(self) -> Any:  # noqa: ANN401 (as its function returns)
+        """Calls the function with the values of the inputs, which have all been written."""
+        return self.function(*[item._value for item in self.inputs])
+
 
 def in_order(stages: Iterable[Stage]) -> list[Stage]:
     """Returns stages in topological order; the given order breaks ties.

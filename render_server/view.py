@@ -1,5 +1,6 @@
 """The camera of one picture: matrices and lens, as the passes need them; frames at other sizes."""
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
@@ -7,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
+from deltalight.protocol import short_axis
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
@@ -267,7 +269,13 @@ def _rectangle(places: Float64[np.ndarray, "n 2"] | None, size: tuple[int, int])
     """Returns the rectangle around positions, with a margin; the whole picture if none is finite."""
     if places is None or not np.isfinite(places).all():
         return 0, 0, *size
-    low = np.clip(np.floor(places.min(axis=0)) - RECTANGLE_MARGIN_PX, 0, size)
-    high = np.clip(np.ceil(places.max(axis=0)) + RECTANGLE_MARGIN_PX, 0, size)
-    x, y, width, height = (int(v) for v in (*low, *(high - low)))
-    return x, y, width, height
+    lows, highs = (each.tolist() for each in short_axis.bounds(places))
+    x, y = (_within(math.floor(low) - RECTANGLE_MARGIN_PX, end) for low, end in zip(lows, size, strict=True))
+    right, bottom = (
+        _within(math.ceil(high) + RECTANGLE_MARGIN_PX, end) for high, end in zip(highs, size, strict=True)
+    )
+    return x, y, right - x, bottom - y
+
+
+def _within(place: int, end: int) -> int:
+    return min(max(place, 0), end)

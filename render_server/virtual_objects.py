@@ -89,11 +89,12 @@ def clip_of(item: SceneObject, asset: GltfAsset | None) -> Clip | None:
 
 @dataclass(frozen=True, eq=False)
 class _PlacedMeshes:
-    """An object's meshes in the world, and the same to be placed elsewhere (`turned`)."""
+    """An object's meshes in the world, and the same to be placed elsewhere (`turned`); `points` enclose it."""
 
     item: PlacedObject
     turned: Sequence[TurnedMesh]
     meshes: Sequence[TriangleMesh]
+    points: Float64[np.ndarray, "n 3"]
 
     @classmethod
     def of(cls, item: PlacedObject, before: "_PlacedMeshes | None") -> "_PlacedMeshes":
@@ -106,7 +107,9 @@ class _PlacedMeshes:
             return before
         else:
             parts = before.turned
-        return cls(item, parts, [part.at(matrix[:3, 3]) for part in parts])
+        place = matrix[:3, 3]
+        points = np.concatenate([_box_corners(part.bounds_at(place)) for part in parts])
+        return cls(item, parts, [part.at(place) for part in parts], points)
 
     def _is_turned_alike(self, item: PlacedObject) -> bool:
         """Whether an object differs by its place alone."""
@@ -207,9 +210,8 @@ class VirtualObjects:
         """Merges and uploads the triangles; returns None if all are degenerate."""
         objects = [self._described(item) for item in self._shown]
         each = [self._placed(item) for item in objects]
-        merged = self._merged([mesh for meshes in each for mesh in meshes])
-        points = [np.vstack([_box_corners(mesh.bounds()) for mesh in meshes]) for meshes in each]
-        swept = [self._swept(item, held) for item, held in zip(objects, points, strict=True)]
+        merged = self._merged([mesh for placed in each for mesh in placed.meshes])
+        swept = [self._swept(item, placed.points) for item, placed in zip(objects, each, strict=True)]
         if not np.ptp(np.vstack(swept), axis=0).any():
             return None
         self._buffers.write(merged)
@@ -217,7 +219,7 @@ class VirtualObjects:
         self._buffers.cutouts = materials.bindings
         return GeometryState(
             DrawnMesh(self._buffers, merged),
-            np.vstack(points),
+            np.concatenate([placed.points for placed in each]),
             materials,
             objects=tuple(objects),
             lamps=tuple(
@@ -275,11 +277,10 @@ class VirtualObjects:
             self._given[item.material] = given_material(item.material)
         return self._given[item.material]
 
-    def _placed(self, item: PlacedObject) -> Sequence[TriangleMesh]:
+    def _placed(self, item: PlacedObject) -> _PlacedMeshes:
         """Returns an object's meshes in the world: those of before unless it moved."""
-        before = self._standing.get(item.id)
-        self._standing[item.id] = placed = _PlacedMeshes.of(item, before)
-        return placed.meshes
+        self._standing[item.id] = placed = _PlacedMeshes.of(item, self._standing.get(item.id))
+        return placed
 
     def _merged(self, meshes: Sequence[TriangleMesh]) -> GpuMesh:
         """Merges the meshes of all objects."""

@@ -93,6 +93,7 @@ class Program:
         self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
         self.compute = cast("moderngl.ComputeShader", program)  # if it is one that is dispatched
         self.users: set[int] = set()  # ids of the kernels that have not been released
+        self.has_switches = bool(declared.switches)
         self._samplers: list[Slot] = []
         self._images: list[Slot] = []
         self._arrays: list[Slot] = []  # storage buffers that a shader takes as images
@@ -175,8 +176,6 @@ class Program:
         Raises:
             BindingError: one is missing.
         """
-        if not self._declared.switches:
-            return ()
         try:
             return tuple(compress(self._declared.switches, self._switch_values(known)))
         except KeyError:
@@ -346,6 +345,8 @@ class Shader(ABC):
         return program, known
 
     def _chosen(self, known: Bindings) -> Program:
+        if not self._plain.has_switches:
+            return self._plain
         on = self._plain.switched_on(known)
         if not on:
             return self._plain
@@ -470,8 +471,9 @@ def _attachments(target: moderngl.Framebuffer) -> dict[str, object]:
 def merged(own: Bindings, shared: Sequence[Bindings]) -> dict[str, Binding]:
     """Returns what each name is bound to: `own` takes precedence, then `shared` in order."""
     known: dict[str, Binding] = {}
-    for source in (*reversed(shared), own):
+    for source in reversed(shared):
         known.update(source)
+    known.update(own)
     return known
 
 

@@ -60,4 +60,7 @@ def values_of(names: Sequence[str]) -> Callable[[Mapping[str, Any]], tuple[Any, 
     """Returns what looks up the values of `names` (KeyError if one is missing)."""
     if len(names) > 1:
         return itemgetter(*names)
-    return lambda known: tuple([known[name] for name in names])
+    if names:
+        (only,) = names
+        return lambda known: (known[only],)
+    return lambda _: ()

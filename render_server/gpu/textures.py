@@ -179,16 +179,14 @@ class AsyncReadback:
         """Starts copying `texture` (level 0, as `dtype` elements)."""
         width, height = texture.size
         shape = (height, width, texture.components)
-        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-        buffer = self._take(size)
+        buffer = self._take(math.prod(shape) * np.dtype(dtype).itemsize)
         texture.read_into(buffer, alignment=1)
         self._waiting.append((buffer, shape, np.dtype(dtype)))
 
     def pop(self) -> np.ndarray[Any, Any]:
         """Returns the oldest pushed texture (h, w, components); waits only if the GPU has not finished it."""
         buffer, shape, dtype = self._waiting.popleft()
-        size = int(np.prod(shape)) * dtype.itemsize
-        array = np.frombuffer(buffer.read(size), dtype=dtype).reshape(shape)
+        array = np.frombuffer(buffer.read(math.prod(shape) * dtype.itemsize), dtype).reshape(shape)
         self._free.append(buffer)
         return array
 

@@ -83,16 +83,12 @@ class UniformBlock(Generic[Kind]):
         self.value = value
         self._data = value.packed()
         self._buffer = gpu.ctx.buffer(self._data, dynamic=True)
+        self.mglo: object = self._buffer.mglo  # what moderngl holds of the buffer
 
     @property
     def size(self) -> int:
         """Size in bytes."""
         return len(self._data)
-
-    @property
-    def mglo(self) -> object:
-        """What moderngl holds of the buffer."""
-        return self._buffer.mglo
 
     def fits(self, declared: int) -> bool:
         """Whether a program's block of that size in bytes, with or without its padding, is of these members."""
@@ -113,3 +109,4 @@ class UniformBlock(Generic[Kind]):
     def release(self) -> None:
         """Frees the buffer."""
         self._buffer.release()
+        self.mglo = self._buffer.mglo

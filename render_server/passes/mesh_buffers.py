@@ -277,7 +277,8 @@ class ObjectBvh:
             if before is not None:
                 before.result()
             bvh = self._renewed(shape.corners)
-            return bvh_rows(bvh.packed()), bvh_rows(bvh.packed_triangles(shape.corners, shape.triangles))
+            faces = bvh.packed_triangles(shape.vertices[:, :3], shape.triangles)
+            return bvh_rows(bvh.packed()), bvh_rows(faces)
 
         self._packed = submit(packed)
 

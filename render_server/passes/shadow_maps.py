@@ -358,8 +358,11 @@ def _perspective_view(
     half = float(_tangents(local).max()) * 1.01 + 1e-4
     if half > WIDEST_SINGLE_TANGENT:
         return None
-    depths = local[:, 2]  # all of them are inside
-    near, far = _range_around(depths, (occluders - position) @ rotation.T, half, float(depths.max()))
+    depths = local[
+        :, 2
+    ]  # all of them are inside, and need not be looked at again if they are the occluders, too
+    others = occluders[:0] if occluders is receivers else (occluders - position) @ rotation.T
+    near, far = _range_around(depths, others, half, float(depths.max()))
     return LightView(_matrix(rotation, position), half, near, far, False)
 
 

@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
 from deltalight.render_server.scene.triangle_mesh import (
@@ -29,6 +30,18 @@ class TurnedMesh:
     def at(self, place: Float64[np.ndarray, "3"]) -> TriangleMesh:
         """Returns the mesh at its place."""
         return self.mesh.changed(positions=(self.positions + place).astype(np.float32))
+
+    def bounds_at(self, place: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "2 3"]:
+        """Returns the bounds of the mesh at its place.
+
+        To the bit: rounding keeps the order of positions, so the least is the rounded least.
+        """
+        return np.asarray(self._bounds + place, np.float32)
+
+    @cached_property
+    def _bounds(self) -> Float64[np.ndarray, "2 3"]:
+        """The same relative to its place."""
+        return np.stack(self.mesh.bounds_at(self.positions))
 
 
 def turned(mesh: TriangleMesh, linear: Float64[np.ndarray, "3 3"]) -> TurnedMesh:

@@ -176,9 +176,14 @@ class TriangleMesh:
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
         """Returns the least and greatest coordinates of the vertices that triangles use."""
-        uses_all = len(self._used) == len(self.positions)
-        used = self.positions if uses_all else self.positions.take(self._used, axis=0)
-        return np.stack(short_axis.bounds(used))
+        return np.stack(self.bounds_at(self.positions))
+
+    def bounds_at(
+        self, positions: short_axis.Array[short_axis.Scalar]
+    ) -> tuple[short_axis.Array[short_axis.Scalar], short_axis.Array[short_axis.Scalar]]:
+        """Returns the least and the greatest of those vertices' coordinates if all were at other positions (n, 3)."""
+        uses_all = len(self._used) == len(positions)
+        return short_axis.bounds(positions if uses_all else positions.take(self._used, axis=0))
 
     @cached_property
     def _used(self) -> Int64[np.ndarray, " k"]:
@@ -370,7 +375,7 @@ class GpuMesh:
     @cached_property
     def corners(self) -> Float32[np.ndarray, "m 3 3"]:
         """Positions of each triangle's corners."""
-        return np.asarray(self.vertices[:, :3].take(self.triangles, axis=0))
+        return np.asarray(padded(self.vertices[:, :3]).take(self.triangles, axis=0)[..., :3])
 
     def repeats_per_m(self) -> Float32[np.ndarray, " k"]:
         """Returns how often the base colour's map repeats over a metre of each material's triangles, on average."""
@@ -451,6 +456,13 @@ def _interleaved(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 12"]:
         own[:, 11] = index
         if mesh.opacity is not None:
             own[:, 11] += CLEAR_FRACTION * (1 - np.clip(mesh.opacity[:, 0], 0, 1))
+    return rows
+
+
+def padded(positions: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
+    """Returns positions with a zero behind each: NumPy gathers rows of 16 bytes three times as fast as rows of 12."""
+    rows = np.zeros((len(positions), 4), np.float32)
+    rows[:, :3] = positions
     return rows
 
 

@@ -13,7 +13,7 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.lights.light_models import RectangleLight, SpotLight
 from deltalight.render_server.lights.lights import build_lights
-from deltalight.render_server.passes.shadow_maps import light_views
+from deltalight.render_server.passes.shadow_maps import light_views, pack_view
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
@@ -250,6 +250,15 @@ def test_a_large_real_triangle_in_a_narrow_cone_blocks(gpu: GpuContext, stage: S
     lit = np.linalg.norm(found.position[..., :2], axis=-1) < 0.1
     assert np.count_nonzero(on_floor & lit) > 300
     assert found.direct_mu[on_floor].max() == 0
+
+
+def test_receivers_that_are_the_occluders_count_once() -> None:
+    """They have the view that receivers have whose occluders are others at the same places."""
+    points = np.random.default_rng(1).uniform(-1, 1, (50, 3)) * 0.3 - (0, 0, 3)
+    zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
+    light = SpotLight(zero, np.array((0, 0, -1), np.float32), one, 0.0, np.radians(80), 0.2)
+    (view,), (other,) = light_views(light, points, points), light_views(light, points, points.copy())
+    assert pack_view(view, 0, 1, 64) == pack_view(other, 0, 1, 64)
 
 
 def test_views_fit_the_cone_and_the_rectangles_side() -> None:

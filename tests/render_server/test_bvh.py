@@ -89,7 +89,7 @@ def traced(
     bvh = bvh or build_bvh(corners)
     rows = np.zeros((len(origins), 2, 4), np.float32)
     rows[:, 0, :3], rows[:, 1, :3] = origins, directions
-    faces = bvh.packed_triangles(corners, vertices_of(corners))
+    faces = bvh.packed_triangles(corners.reshape(-1, 3), vertices_of(corners))
     rays, hits = (gpu.ctx.buffer(content) for content in (rows.tobytes(), bytes(16 * len(origins))))
     textures = [bvh_texture(gpu, bvh_rows(packed)) for packed in (bvh.packed(), faces)]
     hierarchy = {"bvh_nodes": textures[0], "bvh_faces": textures[1]}
@@ -125,7 +125,8 @@ def test_what_lies_before_the_first_triangle_is_none(gpu: GpuContext) -> None:
     """Inner nodes hold -1: three texels back from row 0 are those of other triangles, at the end of that row."""
     corners = soup(3000)
     bvh = build_bvh(corners)
-    packed = np.frombuffer(bvh.packed_triangles(corners, vertices_of(corners)), np.float32).reshape(-1, 4)
+    faces = bvh.packed_triangles(corners.reshape(-1, 3), vertices_of(corners))
+    packed = np.frombuffer(faces, np.float32).reshape(-1, 4)
     corner, first_edge, second_edge = packed[1021:1024, :3]
     origins, _ = random_rays()
     share = np.random.default_rng(2).dirichlet((1, 1, 1), RAYS)[:, 1:]
@@ -177,16 +178,20 @@ def test_every_triangle_is_in_one_leaf_and_boxes_enclose_what_is_below(corners: 
 def test_same_triangles_give_the_same_bvh() -> None:
     one, other = build_bvh(soup(2000)), build_bvh(soup(2000))
     assert one.packed() == other.packed()
-    packed = [bvh.packed_triangles(soup(2000), vertices_of(soup(2000))) for bvh in (one, other)]
+    positions, triangles = soup(2000).reshape(-1, 3), vertices_of(soup(2000))
+    packed = [bvh.packed_triangles(positions, triangles) for bvh in (one, other)]
     assert packed[0] == packed[1]
 
 
 def test_packed_triangles_name_their_vertices() -> None:
-    corners = soup(50)
-    bvh, vertices = build_bvh(corners), np.random.default_rng(5).integers(0, 99, (50, 3)).astype(np.int32)
-    rows = np.frombuffer(bvh.packed_triangles(corners, vertices), np.float32).reshape(50, 3, 4)
+    positions = soup(33).reshape(-1, 3)
+    vertices = np.random.default_rng(5).integers(0, 99, (50, 3)).astype(np.int32)
+    corners = positions[vertices]
+    bvh = build_bvh(corners)
+    rows = np.frombuffer(bvh.packed_triangles(positions, vertices), np.float32).reshape(50, 3, 4)
     np.testing.assert_array_equal(rows.view(np.int32)[:, :, 3], vertices[bvh.order])
     np.testing.assert_array_equal(rows[:, 0, :3], corners[bvh.order, 0])
+    np.testing.assert_array_equal(rows[:, 1:, :3], (corners[:, 1:] - corners[:, :1])[bvh.order])
 
 
 def test_rays_meet_few_boxes_of_a_large_mesh() -> None:

@@ -16,6 +16,9 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.gltf_meshes import load_gltf
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.moved_meshes import turned
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, unit_or
 from deltalight.render_server.virtual_objects import VirtualObjects
 from tests.render_server.gltf_samples import (
     IDENTITY,
@@ -156,6 +159,16 @@ def test_what_moved_or_changed_is_as_if_it_had_been_loaded_there(gpu: GpuContext
             np.testing.assert_array_equal(one, expected)
         fresh.release()
     objects.release()
+
+
+def test_bounds_of_a_displaced_mesh_are_those_of_its_positions() -> None:
+    random = np.random.default_rng(3)
+    positions = random.normal(size=(40, 3)).astype(np.float32)
+    triangles = random.integers(0, 30, (50, 3)).astype(np.int32)  # some vertices are in no triangle
+    mesh = TriangleMesh(positions, unit_or(positions, positions), triangles, None, Material())
+    part = turned(mesh, random.normal(size=(3, 3)))
+    for place in 10 * random.normal(size=(20, 3)):
+        np.testing.assert_array_equal(part.bounds_at(place), part.at(place).bounds())
 
 
 def test_while_it_plays_triangles_are_those_of_the_baked_pose(gpu: GpuContext, stage: Stage) -> None:
