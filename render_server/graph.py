@@ -264,7 +264,7 @@ class Graph:
         """Brings the `targets` (all resources if none is named) up to date; returns whether they are.
 
         No stage is begun after `until_s` (time.monotonic()): the next run goes on from there. What a stage raises is
-        raised here; the stage and those that read it run again the next time.
+        raised here; the stage, all that lead to it and those that read them run again the next time.
 
         Raises:
             GraphError: stages read each other in a circle, read what nobody writes, or write what they did not
@@ -319,7 +319,12 @@ class Graph:
         for item in stage.inputs:
             if item.version == 0:
                 raise GraphError(f"Stage `{stage.name}` reads `{item.name}` before it is written.")
-        for output, value in zip(stage.outputs, self._call(stage), strict=True):
+        try:
+            values = self._call(stage)
+        except Exception:
+            _forget(stage)
+            raise
+        for output, value in zip(stage.outputs, values, strict=True):
             output.write(value, stage.same)
         stage.seen, stage.ran_in = versions, self._runs
 
@@ -443,6 +448,13 @@ class Graph:
         for item in reversed(self._owned):
             item.release()
         self._owned.clear()
+
+
+def _forget(stage: Stage) -> None:
+    """Makes a stage that failed run again, and all that lead to it: it may have changed a part of what they made."""
+    for item in needed_for(stage.outputs):
+        if item.stage is not None:
+            item.stage.seen = None
 
 
 def _of_view(name: str, view: int) -> str:

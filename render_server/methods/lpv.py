@@ -151,7 +151,8 @@ class DifferenceVolumes:
         """Propagates V_rho on, with the light that surfaces reflect of it.
 
         Returns it and the sums of what they reflect; None if there is no bounce. It adds to V_rho, so `propagate_rho`
-        runs before each run: whatever changes an input of this stage changes one of that stage, too.
+        runs before each run: whatever changes an input of this stage changes one of that stage, too, and where this
+        one fails, the graph runs both again.
         """
         own = {**scene, **query_bindings(self._settings)}
         last = self._settings.resolved_bounces
