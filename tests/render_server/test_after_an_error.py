@@ -17,7 +17,7 @@ from tests.render_server.scenes import Stage, checkered, frame, look_at
 pytestmark = [pytest.mark.slow(seconds=20), pytest.mark.usefixtures("clean_gl")]
 
 INTERRUPTED = [  # a method, and the run of a kernel after which it fails: within a stage that changes its input
-    ("dlpv", "lpv_bounce_tail", 1),  # after the first of two bounces
+    ("dlpv", "lpv_bounce_share", 1),  # after the first of two bounces
     ("exact", "light_voxels REAL GATHERED", 1),
     ("exact", "resolve_voxels RHO", 1),  # on a GPU it uses up what it reads
     ("exact", "light_voxels VIRTUAL GATHERED", 1),
