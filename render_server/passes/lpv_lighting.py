@@ -95,12 +95,15 @@ class LpvInjectSurfaces:
 
 
 class LpvBounce:
-    """Adds the surfaces' reflection of propagated light to fixed-point sums."""
+    """Adds the surfaces' reflection of propagated light to fixed-point sums.
+
+    On a GPU in one dispatch; software would run the code for both sets for each surfel.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._threads = list_threads(gpu)
-        self._real = Kernel(gpu, "lpv_bounce", REAL=1)
-        self._virtual = Kernel(gpu, "lpv_bounce")
+        self._both = None if gpu.is_software else Kernel(gpu, "lpv_bounce", REAL=1, BOTH=1)
+        self._each = (Kernel(gpu, "lpv_bounce", REAL=1), Kernel(gpu, "lpv_bounce")) if gpu.is_software else ()
 
     def run(
         self,
@@ -110,14 +113,16 @@ class LpvBounce:
         scene: Bindings,
     ) -> None:
         """Adds real and virtual surfels under the light without and with objects."""
-        volumes = light_volume_bindings(*light)
-        for kernel, store in zip((self._real, self._virtual), stores, strict=True):
-            kernel.run((self._threads,), store.bindings, volumes, scene, Injected=sums)
+        threads, shared = (self._threads,), {**light_volume_bindings(*light), **scene, "Injected": sums}
+        if self._both is not None:
+            real, virtual = stores
+            self._both.run(threads, real.bindings, shared, VirtualSurfels=virtual.surfels)
+        for kernel, store in zip(self._each, stores, strict=False):
+            kernel.run(threads, store.bindings, shared)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self._real.release()
-        self._virtual.release()
+        release_all(self._both, *self._each)
 
 
 class LpvAddBounce:

@@ -275,7 +275,7 @@ MOST_ASKED = {  # dispatches and uploads in a frame on a GPU, while the camera m
     "exact:quality=live,volume_size=32": ((31, 37), (3, 6)),
     "exact:volume_size=32": ((70, 66), (8, 10)),
     "paper:volume_size=32": ((36, 35), (4, 7)),
-    "dlpv:volume_size=16": ((72, 64), (4, 8)),
+    "dlpv:volume_size=16": ((65, 59), (4, 8)),
 }
 
 

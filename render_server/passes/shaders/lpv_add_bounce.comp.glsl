@@ -13,8 +13,10 @@ layout(std430) readonly buffer Injected { int injected[]; };
 #endif
 #ifdef CLEARS
 layout(std430) buffer Before { int before[]; };
-#elif !defined(FIRST)
+#else
+#ifndef FIRST
 layout(std430) readonly buffer Before { int before[]; };
+#endif
 #endif
 layout(rgba32f) uniform image3D state;
 layout(rgba32f) uniform image3D total;
