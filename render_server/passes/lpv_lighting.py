@@ -113,7 +113,7 @@ class LpvBounce:
         scene: Bindings,
     ) -> None:
         """Adds real and virtual surfels under the light without and with objects."""
-        threads, shared = (self._threads,), {**light_volume_bindings(*light), **scene, "Injected": sums}
+        threads, shared = (self._threads,), {**scene, **light_volume_bindings(*light), "Injected": sums}
         if self._both is not None:
             real, virtual = stores
             self._both.run(threads, real.bindings, shared, VirtualSurfels=virtual.surfels)
