@@ -265,7 +265,7 @@ class Graph:
         """Brings the `targets` (all resources if none is named) up to date; returns whether they are.
 
         No stage is begun after `until_s` (time.monotonic()): the next run goes on from there. What a stage raises is
-        raised here; the stage and those that read it run again the next time.
+        raised here; the stage, all that lead to it and those that read them run again the next time.
 
         Raises:
             GraphError: stages read each other in a circle, read what nobody writes, or write what they did not
@@ -320,7 +320,12 @@ class Graph:
         if 0 in versions:
             name = stage.inputs[versions.index(0)].name
             raise GraphError(f"Stage `{stage.name}` reads `{name}` before it is written.")
-        for output, value in zip(stage.outputs, self._call(stage), strict=True):
+        try:
+            values = self._call(stage)
+        except Exception:
+            _forget(stage)
+            raise
+        for output, value in zip(stage.outputs, values, strict=True):
             output.write(value, stage.same)
         stage.seen, stage.ran_in = versions, self._runs
 
@@ -455,6 +460,13 @@ def _several(stage: Stage, found: Any) -> Sequence[Any]:  # noqa: ANN401 (as the
         raise GraphError(f"Stage `{stage.name}` returned {count} values for {names}.")
     values: Sequence[Any] = found
     return values
+
+
+def _forget(stage: Stage) -> None:
+    """Makes a stage that failed run again, and all that lead to it: it may have changed a part of what they made."""
+    for item in needed_for(stage.outputs):
+        if item.stage is not None:
+            item.stage.seen = None
 
 
 def _of_view(name: str, view: int) -> str:

@@ -44,6 +44,16 @@ def clear_buffers(gpu: GpuContext, *starts: Start) -> None:
         _clear(gpu, dirty)
 
 
+def clear_for_later(gpu: GpuContext, *starts: Start) -> None:
+    """Clears, in one dispatch on a GPU, what other stages of the frame fill: their own `clear_buffers` then need not.
+
+    Nothing in software, where they clear as fast by themselves.
+    """
+    if not gpu.is_software:
+        clear_buffers(gpu, *starts)
+        note_cleared(gpu, *starts)
+
+
 def clear_ahead(gpu: GpuContext, *starts: Start) -> None:
     """Lets buffers whose contents have been used up be cleared when the next frame begins, all in one dispatch.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources
-from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffer
+from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu_scene import ObjectExtent
@@ -47,8 +47,8 @@ from deltalight.render_server.passes.lpv import (
     moment_weights,
 )
 from deltalight.render_server.passes.lpv_lighting import (
+    LpvAddBounce,
     LpvBounce,
-    LpvBounceTail,
     LpvFields,
     LpvInjectMaps,
     LpvSources,
@@ -73,10 +73,11 @@ class Propagated:
         self._start_change = LpvStartChange(gpu)
         self._propagate = LpvPropagate(gpu)
         self._in_place = self._propagate.is_in_place(cells, steps)
+        self._half_step = self._in_place and self._propagate.starts_with_half_step
 
     def run(self, through: moderngl.Texture3D | None, *injected: moderngl.Buffer) -> LightVolume:
         """Propagates the light of one or two injected sums, added up; without `through` nothing blocks it."""
-        self._start.run(self.light, *injected)
+        self._start.run(self.light, self._medium(through), *injected, half_step=self._half_step)
         return self._go(self._steps, through)
 
     def run_change(
@@ -87,24 +88,27 @@ class Propagated:
         through: moderngl.Texture3D | None,
     ) -> LightVolume:
         """Propagates what objects change of the light `before`."""
-        medium = medium_bindings(self.light.cells, self._weights, through)
-        self._start_change.run(self.light, before, change, medium, through_real, in_place=self._in_place)
+        self._start_change.run(
+            self.light,
+            before,
+            change,
+            self._medium(through),
+            through_real,
+            in_place=self._in_place,
+            half_step=self._half_step,
+        )
         return self._go(self._steps, through)
 
-    def go_on(
-        self,
-        through: moderngl.Texture3D | None,
-        injected: moderngl.Buffer,
-        known: moderngl.Buffer | None,
-    ) -> LightVolume:
-        """Adds what the sums `injected` have more than those `known`, and propagates on by STEPS_OF_A_BOUNCE."""
-        self._start.add(self.light, injected, known)
+    def go_on(self, through: moderngl.Texture3D | None) -> LightVolume:
+        """Propagates on by STEPS_OF_A_BOUNCE."""
         return self._go(math.ceil(STEPS_OF_A_BOUNCE * self._steps), through)
 
     def _go(self, steps: int, through: moderngl.Texture3D | None) -> LightVolume:
-        medium = medium_bindings(self.light.cells, self._weights, through)
-        self._propagate.run(self.light, medium, steps, in_place=self._in_place)
+        self._propagate.run(self.light, self._medium(through), steps, in_place=self._in_place)
         return self.light
+
+    def _medium(self, through: moderngl.Texture3D | None) -> Bindings:
+        return medium_bindings(self.light.cells, self._weights, through)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -124,7 +128,7 @@ class DifferenceVolumes:
         self._mu, self._rho = (Propagated(gpu, settings, size, steps) for _ in range(2))
         self._bounced, self._before = (injected_sums(gpu, size) for _ in range(2))
         self._bounce = LpvBounce(gpu)
-        self._tail = LpvBounceTail(gpu)
+        self._add = LpvAddBounce(gpu)
 
     def propagate_mu(self, injected: moderngl.Buffer, through: moderngl.Texture3D | None) -> LightVolume:
         """Propagates V_mu."""
@@ -151,7 +155,8 @@ class DifferenceVolumes:
         """Propagates V_rho on, with the light that surfaces reflect of it.
 
         Returns it and the sums of what they reflect; None if there is no bounce. It adds to V_rho, so `propagate_rho`
-        runs before each run: whatever changes an input of this stage changes one of that stage, too.
+        runs before each run: whatever changes an input of this stage changes one of that stage, too, and where this
+        one fails, the graph runs both again.
         """
         own = {**scene, **query_bindings(self._settings)}
         last = self._settings.resolved_bounces
@@ -159,13 +164,18 @@ class DifferenceVolumes:
             self._bounced, self._before = self._before, self._bounced
             clear_buffer(self._gpu, self._bounced)
             self._bounce.run(self._bounced, surfels, (mu, rho), own)
-            if number == 2:
-                self._tail.measure(self._before, self._bounced)
-            if number == last > 1:
-                self._tail.extend(self._before, self._bounced)
-            self._rho.go_on(through, self._bounced, self._before if number > 1 else None)
-        clear_ahead(self._gpu, (self._before, self._before.size))
+            self._add_to(rho, number, is_last=number == last)
+            self._rho.go_on(through)
         return rho, self._bounced if last > 0 else None
+
+    def _add_to(self, rho: LightVolume, number: int, *, is_last: bool) -> None:
+        """Adds the sums of that bounce, counted from 1."""
+        if number == 1:
+            self._add.run_first(rho, self._bounced, self._before)
+            return
+        if number == 2:
+            self._add.measure(self._before, self._bounced)
+        self._add.run(rho, self._bounced, self._before, is_last=is_last)
 
     def release(self) -> None:
         """Frees the GL objects."""

@@ -7,7 +7,7 @@ import moderngl
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources, Observation
-from deltalight.render_server.gpu.clearing import clear_ahead, clear_buffer
+from deltalight.render_server.gpu.clearing import Start, clear_buffer, clear_for_later
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
@@ -71,21 +71,27 @@ class LpvCells:
         return self.volume
 
     def voxelize_real(self, real: GeometryState, volume: PlacedVolume) -> VoxelStore:
-        """Voxelises the real scene into surfels, if anything reads them."""
+        """Voxelises the real scene into surfels, if anything reads them; all sums of these cells follow it."""
+        own = _whole(self.real.grid, self._real_light, self._real_covered)
+        clear_for_later(self._gpu, *own, *self._filled_by_objects)
         if self._has_geometry or self._blocks_environment or self._settings.resolved_bounces > 0:
             self._surfels(self.real, real.solid_parts(volume.placement.voxel_edge))
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, _volume: PlacedVolume) -> VoxelStore:
-        """Voxelises the objects into surfels."""
+        """Voxelises the objects into surfels, which the sums of their change follow."""
+        clear_for_later(self._gpu, *self._filled_by_objects)
         self._surfels(self.objects, objects.parts)
         return self.objects
+
+    @property
+    def _filled_by_objects(self) -> list[Start]:
+        return _whole(self.objects.grid, self._change_light, self._virtual_covered)
 
     def _surfels(self, store: VoxelStore, meshes: Meshes) -> None:
         """Voxelises at half a cell; only the store's surfels are used."""
         clear_buffer(self._gpu, store.grid)
         self._voxelize.run(store, meshes, self._half_cells)
-        clear_ahead(self._gpu, (store.grid, store.grid.size))
 
     def real_scene(
         self,
@@ -159,6 +165,10 @@ class LpvCells:
     def release(self) -> None:
         """Frees the GL objects."""
         release_held(self)
+
+
+def _whole(*buffers: moderngl.Buffer) -> list[Start]:
+    return [(buffer, buffer.size) for buffer in buffers]
 
 
 def release_held(owner: object) -> None:

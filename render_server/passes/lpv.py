@@ -4,8 +4,9 @@ See docs/method.md 5; shaders/common/light_cells.glsl has the cells' layout.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import moderngl
@@ -91,21 +92,25 @@ def moment_weights(cells: int) -> StepWeights:
 
 
 class LightVolume:
-    """The state between steps (two textures that swap) and the total; (3 channels x) cells x 4 coefficients each."""
+    """The state between steps, and the total: (3 channels x) cells x 4 coefficients each. Steps write to `spare`."""
 
     def __init__(self, gpu: GpuContext, cells: int) -> None:
         self.cells = cells
         size = (cells, cells, 3 * cells)
-        self.state, self.next_state, self.total = (texture_3d(gpu, size, 4, "f4") for _ in range(3))
+        self.state, self.spare, self.total = (texture_3d(gpu, size, 4, "f4") for _ in range(3))
         self.colour = 0  # of the cells that the next half step changes
 
-    def swap(self) -> None:
-        """Makes the last output the current state."""
-        self.state, self.next_state = self.next_state, self.state
+    def swap_state(self) -> None:
+        """Makes what was written to `spare` the current state."""
+        self.state, self.spare = self.spare, self.state
+
+    def swap_total(self) -> None:
+        """Makes what was written to `spare` the total."""
+        self.total, self.spare = self.spare, self.total
 
     def release(self) -> None:
         """Frees the textures."""
-        release_all(self.state, self.next_state, self.total)
+        release_all(self.state, self.spare, self.total)
 
 
 class PropagatedLight(Protocol):
@@ -183,45 +188,40 @@ def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
 
 
 class LpvStart:
-    """Converts fixed-point sums of injected light into the state before the first step, or adds them to it later."""
+    """Converts fixed-point sums of injected light into the state before the first step."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._start, self._add = Kernel(gpu, "lpv_start"), Kernel(gpu, "lpv_start", ADD=1)
+        self._kernel = Kernel(gpu, "lpv_start")
 
     def run(
-        self, volume: LightVolume, injected: moderngl.Buffer, more: moderngl.Buffer | None = None
-    ) -> None:
-        """Initialises state and total of `volume` with the sums `injected` and `more`, added up."""
-        self._run(self._start, volume, injected, more, 1)
-        volume.colour = 0
-
-    def add(
-        self, volume: LightVolume, injected: moderngl.Buffer, before: moderngl.Buffer | None = None
-    ) -> None:
-        """Adds to light under way what the sums `injected` have more than those of `before`."""
-        self._run(self._add, volume, injected, before, -1)
-
-    def _run(
         self,
-        kernel: Kernel,
         volume: LightVolume,
-        first: moderngl.Buffer,
-        second: moderngl.Buffer | None,
-        sign: int,
+        medium: Bindings,
+        injected: moderngl.Buffer,
+        more: moderngl.Buffer | None = None,
+        *,
+        half_step: bool = False,
     ) -> None:
-        kernel.run(
+        """Initialises state and total of `volume` with the sums `injected` and `more`, added up.
+
+        `medium` is that of `volume` (`medium_bindings`); `half_step`: also makes the first half step, which takes a
+        GPU no dispatch of its own then (`LpvPropagate.starts_with_half_step`).
+        """
+        self._kernel.run(
             (volume.cells**3,),
-            First=first,
-            Second=second,
-            second_sign=0 if second is None else sign,
+            medium,
+            First=injected,
+            Second=more,
+            has_second=more is not None,
             state=volume.state,
             total=volume.total,
-            cells=volume.cells,
+            HALF_STEP=half_step,
         )
+        volume.colour = int(half_step)
 
     def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(self._start, self._add)
+        """Frees the GL object."""
+        self._kernel.release()
 
 
 class LpvStartChange:
@@ -239,11 +239,12 @@ class LpvStartChange:
         through_real: moderngl.Texture3D | None,
         *,
         in_place: bool,
+        half_step: bool = False,
     ) -> None:
         """Initialises state and total of `volume` from those `before` and the injected `change`.
 
         `medium` is that of `volume` (`medium_bindings`); `through_real` lets the light `before` pass; `in_place`: for
-        half steps (`LpvPropagate.is_in_place`).
+        half steps (`LpvPropagate.is_in_place`), of which it makes the first, too, with `half_step`.
         """
         self._kernel.run(
             (volume.cells,) * 3,
@@ -251,13 +252,14 @@ class LpvStartChange:
             light_mu=before.total,
             First=change,
             Second=None,
-            second_sign=0,
+            has_second=False,
             transmitted_real=through_real,
             state=volume.state,
             total=volume.total,
             in_place=in_place,
+            HALF_STEP=half_step,
         )
-        volume.colour = 0
+        volume.colour = int(half_step)
 
     def release(self) -> None:
         """Frees the GL object."""
@@ -271,7 +273,7 @@ class LpvBoxFilter:
         self._kernel = Kernel(gpu, "lpv_box_filter")
 
     def run(self, volume: LightVolume, radius: int) -> None:
-        """Replaces the total by its mean over cubes of 2 `radius` + 1 cells an edge; overwrites the next state.
+        """Replaces the total by its mean over cubes of 2 `radius` + 1 cells an edge.
 
         Beyond the border there is no light.
         """
@@ -279,9 +281,9 @@ class LpvBoxFilter:
             return
         threads = (volume.cells, volume.cells, 3 * volume.cells)
         self._kernel.run(
-            threads, total=volume.total, filtered=volume.next_state, cells=volume.cells, radius=radius
+            threads, total=volume.total, filtered=volume.spare, cells=volume.cells, radius=radius
         )
-        volume.total, volume.next_state = volume.next_state, volume.total
+        volume.swap_total()
 
     def release(self) -> None:
         """Frees the GL object."""
@@ -405,22 +407,38 @@ def medium_bindings(
 class LpvPropagate:
     """Propagates light from cell to cell (docs/method.md 5).
 
-    `tiled` runs several steps per dispatch in shared memory (default on a GPU); otherwise each is a dispatch, or half
-    of one is, `in_place`.
+    `tiled` runs several steps, or half steps, per dispatch in shared memory (default on a GPU); otherwise each is a
+    dispatch.
     """
 
     def __init__(self, gpu: GpuContext, *, tiled: bool | None = None) -> None:
+        self._gpu = gpu
         self._tiled = not gpu.is_software if tiled is None else tiled
-        self._kernels = (
-            {count: Kernel(gpu, "lpv_propagate", FUSED=count) for count in (1, FUSED_STEPS)}
-            if self._tiled
-            else {1: Kernel(gpu, "lpv_propagate_plain")}
-        )
-        self._half_step = None if self._tiled else Kernel(gpu, "lpv_half_step")
 
-    def is_in_place(self, cells: int, steps: int) -> bool:
-        """Whether so many steps in all are best run `in_place`: light crosses the volume, and is not tiled."""
-        return self._half_step is not None and steps >= cells
+    @cached_property
+    def _steps(self) -> dict[int, Kernel]:
+        """Kernels by how many steps each runs."""
+        if not self._tiled:
+            return {1: Kernel(self._gpu, "lpv_propagate_plain")}
+        return {count: Kernel(self._gpu, "lpv_propagate", FUSED=count) for count in (1, FUSED_STEPS)}
+
+    @cached_property
+    def _halves(self) -> dict[int, Kernel]:
+        """Kernels by how many half steps each runs."""
+        if not self._tiled:
+            return {1: Kernel(self._gpu, "lpv_half_step")}
+        counts = 1, FUSED_STEPS
+        return {count: Kernel(self._gpu, "lpv_propagate", FUSED=count, HALVES=1) for count in counts}
+
+    @staticmethod
+    def is_in_place(cells: int, steps: int) -> bool:
+        """Whether so many steps in all are best run `in_place`, for half of the work: light crosses the volume."""
+        return steps >= cells
+
+    @property
+    def starts_with_half_step(self) -> bool:
+        """Whether the first half step is best made with what starts the volume: on a GPU, alone it is a dispatch."""
+        return self._tiled
 
     def run(self, volume: LightVolume, medium: Bindings, steps: int, *, in_place: bool = False) -> None:
         """Runs `steps` steps through a medium (`medium_bindings`).
@@ -428,30 +446,42 @@ class LpvPropagate:
         `in_place`, half steps of alternating colours change the total alone, and the state is what is injected into
         the volume: cells of one colour have a step more. Otherwise the state is the light of the last step.
         """
-        if in_place and self._half_step is not None:
-            _run_halves(self._half_step, volume, steps, medium)
+        if in_place:
+            self._run_halves(volume, steps, medium)
         else:
             self._run_whole(volume, steps, medium)
 
     def _run_whole(self, volume: LightVolume, steps: int, medium: Bindings) -> None:
         channels = 3 if self._tiled else 1  # the plain kernel loops over them
         threads = (volume.cells, volume.cells, channels * volume.cells)
-        while steps > 0:
-            count = max(count for count in self._kernels if count <= steps)
-            self._kernels[count].run(
-                threads, medium, state=volume.state, next_state=volume.next_state, total=volume.total
-            )
-            volume.swap()
-            steps -= count
+        for kernel, _ in _in_dispatches(self._steps, steps):
+            kernel.run(threads, medium, state=volume.state, next_state=volume.spare, total=volume.total)
+            volume.swap_state()
+
+    def _run_halves(self, volume: LightVolume, steps: int, medium: Bindings) -> None:
+        """Runs half steps, from the colour after the last one; cells of both colours have at least `steps`."""
+        cells = volume.cells
+        threads = (cells, cells, 3 * cells) if self._tiled else (-(-cells // 2), cells, cells)
+        for kernel, count in _in_dispatches(self._halves, steps + (volume.colour == 0)):
+            bound: dict[str, Binding] = {
+                "state": volume.state,
+                "total": volume.total,
+                "colour": volume.colour,
+            }
+            kernel.run(threads, medium, bound, {"next_total": volume.spare})
+            if self._tiled:
+                volume.swap_total()
+            volume.colour = (volume.colour + count) % 2
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(*self._kernels.values(), self._half_step)
+        for name in ("_steps", "_halves"):
+            release_all(*vars(self).get(name, {}).values())
 
 
-def _run_halves(half_step: Kernel, volume: LightVolume, steps: int, medium: Bindings) -> None:
-    """Runs half steps, from the colour after the last one; cells of both colours have at least `steps`."""
-    threads = (-(-volume.cells // 2), volume.cells, volume.cells)
-    for _ in range(steps + (volume.colour == 0)):
-        half_step.run(threads, medium, state=volume.state, total=volume.total, colour=volume.colour)
-        volume.colour = 1 - volume.colour
+def _in_dispatches(kernels: Mapping[int, Kernel], steps: int) -> Iterator[tuple[Kernel, int]]:
+    """Yields the kernels to run, each with how many steps it runs."""
+    while steps > 0:
+        count = max(count for count in kernels if count <= steps)
+        yield kernels[count], count
+        steps -= count

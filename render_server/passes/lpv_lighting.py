@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 import moderngl
 
 from deltalight.protocol.scene_method import DlpvMethod
+from deltalight.render_server.gpu.clearing import note_cleared
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import list_threads, map_threads
@@ -94,12 +95,15 @@ class LpvInjectSurfaces:
 
 
 class LpvBounce:
-    """Adds the surfaces' reflection of propagated light to fixed-point sums."""
+    """Adds the surfaces' reflection of propagated light to fixed-point sums.
+
+    On a GPU in one dispatch; software would run the code for both sets for each surfel.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._threads = list_threads(gpu)
-        self._real = Kernel(gpu, "lpv_bounce", REAL=1)
-        self._virtual = Kernel(gpu, "lpv_bounce")
+        self._both = None if gpu.is_software else Kernel(gpu, "lpv_bounce", REAL=1, BOTH=1)
+        self._each = (Kernel(gpu, "lpv_bounce", REAL=1), Kernel(gpu, "lpv_bounce")) if gpu.is_software else ()
 
     def run(
         self,
@@ -109,40 +113,61 @@ class LpvBounce:
         scene: Bindings,
     ) -> None:
         """Adds real and virtual surfels under the light without and with objects."""
-        volumes = light_volume_bindings(*light)
-        for kernel, store in zip((self._real, self._virtual), stores, strict=True):
-            kernel.run((self._threads,), store.bindings, volumes, scene, Injected=sums)
+        threads, shared = (self._threads,), {**scene, **light_volume_bindings(*light), "Injected": sums}
+        if self._both is not None:
+            real, virtual = stores
+            self._both.run(threads, real.bindings, shared, VirtualSurfels=virtual.surfels)
+        for kernel, store in zip(self._each, stores, strict=False):
+            kernel.run(threads, store.bindings, shared)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self._real.release()
-        self._virtual.release()
+        release_all(self._both, *self._each)
 
 
-class LpvBounceTail:
-    """Extends the sums of reflected light by the bounces that are not propagated (docs/method.md 5.6)."""
+class LpvAddBounce:
+    """Adds bounces to light that is under way, and those beyond the last one (docs/method.md 5.6)."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._measure = Kernel(gpu, "lpv_bounce_tail", MEASURE=1)
-        self._extend = Kernel(gpu, "lpv_bounce_tail")
-        self._threads = self._measure.local_size[0] ** 2  # as many workgroups as one of `_extend` has threads
-        self._parts = gpu.ctx.buffer(reserve=8 * self._measure.local_size[0])
+        self._gpu = gpu
+        clears = {} if gpu.is_software else {"CLEARS": 1}
+        self._first = Kernel(gpu, "lpv_add_bounce", FIRST=1, **clears)
+        self._next = Kernel(gpu, "lpv_add_bounce", **clears)
+        self._last = Kernel(gpu, "lpv_add_bounce", TAIL=1, **clears)
+        self._measure = Kernel(gpu, "lpv_bounce_share")
+        width = self._measure.local_size[0]
+        self._threads = width**2  # as many workgroups as one of `_last` has threads
+        self.parts = gpu.ctx.buffer(reserve=8 * width)
 
     def measure(self, first: moderngl.Buffer, both: moderngl.Buffer) -> None:
-        """Finds the share from the sums of the `first` bounce and those of `both` first bounces."""
-        self._run(self._measure, self._threads, first, both)
+        """Finds which share of a bounce returns, from the sums of the `first` one and those of `both` first ones."""
+        threads, cells = (self._threads,), cells_of(both)
+        self._measure.run(threads, Before=first, Injected=both, Parts=self.parts, cells=cells)
 
-    def extend(self, before: moderngl.Buffer, bounced: moderngl.Buffer) -> None:
-        """Adds the bounces after the last to `bounced`, the sums of all; `before` lacks the last one."""
-        self._run(self._extend, cells_of(bounced) ** 3, before, bounced)
+    def run_first(self, volume: LightVolume, bounced: moderngl.Buffer, spare: moderngl.Buffer) -> None:
+        """Adds the first bounce to `volume`; on a GPU also clears the `spare` sums, which the next one fills."""
+        cleared: Bindings = {} if self._gpu.is_software else {"Before": spare}
+        self._run(self._first, volume, bounced, cleared)
+        note_cleared(self._gpu, (spare, spare.size))
 
-    def _run(self, kernel: Kernel, threads: int, before: moderngl.Buffer, bounced: moderngl.Buffer) -> None:
-        cells = cells_of(bounced)
-        kernel.run((threads,), Before=before, Injected=bounced, Parts=self._parts, cells=cells)
+    def run(
+        self, volume: LightVolume, bounced: moderngl.Buffer, before: moderngl.Buffer, *, is_last: bool
+    ) -> None:
+        """Adds what the sums `bounced` have more than those `before`, which it clears on a GPU.
+
+        The last bounce brings all that are not propagated, to the sums `bounced` too.
+        """
+        own: Bindings = {"Before": before, **({"Parts": self.parts} if is_last else {})}
+        self._run(self._last if is_last else self._next, volume, bounced, own)
+        note_cleared(self._gpu, (before, before.size))
+
+    def _run(self, kernel: Kernel, volume: LightVolume, bounced: moderngl.Buffer, own: Bindings) -> None:
+        cells = volume.cells
+        kernel.run((cells**3,), own, Injected=bounced, state=volume.state, total=volume.total, cells=cells)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._measure, self._extend, self._parts)
+        release_all(self._first, self._next, self._last, self._measure, self.parts)
 
 
 SOURCE_TEXELS = 9  # of a volume: those of two sources, and which fractions arrive where (light_sources.glsl)

@@ -3,6 +3,7 @@
 A context's `compile_watchers` are told of each, with its defines.
 """
 
+import itertools
 from collections.abc import Callable
 from functools import partial
 from itertools import combinations
@@ -22,7 +23,7 @@ from deltalight.render_server.passes.cones import reuse_define
 from deltalight.render_server.passes.depth_fit import DepthFit
 from deltalight.render_server.passes.depth_mesh import DepthMesher
 from deltalight.render_server.passes.depth_views import DepthViewLayers
-from deltalight.render_server.passes.lpv import LpvPropagate
+from deltalight.render_server.passes.lpv import LightVolume, LpvPropagate, lobe_weights, medium_bindings
 from deltalight.render_server.passes.matting import Matting
 from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.renderer import SceneRenderer
@@ -213,8 +214,14 @@ def changed(scene: SceneDocument, part: str, changes: dict[str, Any]) -> SceneDo
 
 def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     """Compiles what software and GPUs do differently, both ways wherever this runs, and what a budget brings."""
-    for tiled in (False, True):
-        LpvPropagate(gpu, tiled=tiled).release()
+    light, medium = LightVolume(gpu, 8), medium_bindings(8, lobe_weights(), None)
+    for tiled, in_place in itertools.product((False, True), repeat=2):
+        propagate = LpvPropagate(gpu, tiled=tiled)
+        propagate.run(light, medium, 5, in_place=in_place)  # four in a dispatch, and one
+        propagate.release()
+    light.release()
+    for kind in ({"FIRST": 1}, {}, {"TAIL": 1}):
+        Kernel(gpu, "lpv_add_bounce", CLEARS=1, **kind).release()
     Kernel(gpu, "clear_buffer").release()
     for kind in ({}, {"FUSED": 1}, {"LISTED": 1}):
         Kernel(gpu, "filter_voxels", **kind).release()

@@ -12,6 +12,7 @@ from deltalight.render_server.gpu.clearing import (
     clear_ahead,
     clear_buffer,
     clear_buffers,
+    clear_for_later,
     clear_used_up,
 )
 from deltalight.render_server.gpu.context import GpuContext
@@ -107,6 +108,25 @@ def test_what_was_used_up_is_cleared_once_when_the_next_frame_begins(gpu: GpuCon
         assert len(seen) == 4
     assert not words(short).any()
     assert not words(buffers[3]).any()
+    for each in buffers:
+        each.release()
+
+
+def test_what_was_cleared_for_later_is_not_cleared_again_until_it_is_filled(gpu: GpuContext) -> None:
+    hardware = replace(gpu, is_software=False)
+    one, other = buffers = [gpu.ctx.buffer(np.full(8, FULL, np.uint32).tobytes()) for _ in range(2)]
+    seen: list[Dispatch] = []
+    with watched(hardware, seen.append):
+        clear_for_later(hardware, (one, 32), (other, 32))
+        clear_for_later(hardware, (other, 32))
+        clear_buffer(hardware, one)
+        clear_buffer(hardware, other)
+        assert len(seen) == 1
+        assert not any(words(each).any() for each in buffers)
+        other.write(b"\xff" * 32)  # by whoever had it cleared
+        clear_buffer(hardware, other)
+        assert len(seen) == 2
+    assert not words(other).any()
     for each in buffers:
         each.release()
 

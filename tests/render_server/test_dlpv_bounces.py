@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import moderngl
 import numpy as np
 import pytest
 import trimesh
@@ -13,7 +14,7 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.lpv import CONSTANT, LOBE, LightVolume, injected_sums
-from deltalight.render_server.passes.lpv_lighting import LpvBounce, LpvBounceTail
+from deltalight.render_server.passes.lpv_lighting import LpvAddBounce, LpvBounce
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import GREY, Stage, ambient, cube, floor, frame, shifted, solve, sphere_light
 
@@ -86,15 +87,20 @@ def test_a_floor_reflects_its_albedo_of_what_the_objects_changed(gpu: GpuContext
 def extended(
     gpu: GpuContext, first: Int32[np.ndarray, "z y x 3 4"], second: Int32[np.ndarray, "z y x 3 4"]
 ) -> Int32[np.ndarray, "z y x 3 4"]:
-    """The sums of both bounces and the estimate of all others."""
+    """The sums of both bounces and the estimate of all others; a volume gets all of them but the first."""
     before, bounced = injected_sums(gpu, CELLS), injected_sums(gpu, CELLS)
     before.write(first.tobytes())
     bounced.write((first + second).tobytes())
-    tail = LpvBounceTail(gpu)
+    tail, volume = LpvAddBounce(gpu), LightVolume(gpu, CELLS)
+    volume.state.write(bytes(16 * 3 * CELLS**3))
+    volume.total.write(np.full((3, CELLS**3, 4), 0.5, np.float32).tobytes())
     tail.measure(before, bounced)
-    tail.extend(before, bounced)
+    tail.run(volume, bounced, before, is_last=True)
     found = np.frombuffer(bounced.read(), np.int32).reshape(first.shape)
-    for item in (tail, before, bounced):
+    added = (np.moveaxis(found - first, 3, 0) / FIXED).astype(np.float32).ravel()
+    assert np.frombuffer(volume.state.read(), np.float32) == pytest.approx(added, abs=1e-6)
+    assert np.frombuffer(volume.total.read(), np.float32) == pytest.approx(0.5 + added, abs=1e-6)
+    for item in (tail, volume, before, bounced):
         item.release()
     return found
 
@@ -122,6 +128,11 @@ def test_without_light_there_is_no_tail(gpu: GpuContext) -> None:
     assert (extended(gpu, nothing, nothing) == 0).all()
 
 
+def measure_nothing(add: LpvAddBounce, *_sums: moderngl.Buffer) -> None:
+    """Nothing returns, so there are those bounces alone that are propagated."""
+    add.parts.write(bytes(add.parts.size))
+
+
 ALL_STEPS = 128
 """Further ones bring no light, so bounces differ by what is reflected alone."""
 
@@ -138,7 +149,7 @@ def niche(stage: Stage) -> SceneDocument:
 def test_each_bounce_changes_less_than_the_one_before(
     gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(LpvBounceTail, "extend", lambda *_: None)  # those that are propagated alone
+    monkeypatch.setattr(LpvAddBounce, "measure", measure_nothing)
     document = niche(stage)
     solutions = [solve(gpu, dlpv(document, bounces=count, steps=ALL_STEPS)) for count in (0, 1, 2, 3)]
     assert all(np.array_equal(solutions[0].cones_mu, one.cones_mu) for one in solutions[1:])
@@ -161,7 +172,7 @@ def test_two_bounces_come_to_what_more_of_them_do(
         return float((solution.cones_rho - solution.cones_mu)[seen].mean())
 
     with_tail, many = change(2), change(4)
-    monkeypatch.setattr(LpvBounceTail, "extend", lambda *_: None)
+    monkeypatch.setattr(LpvAddBounce, "measure", measure_nothing)
     without, four = change(2), change(4)
     print(
         f"2 bounces {without:.5f}, with the tail {with_tail:.5f}; 4 bounces {four:.5f}, with the tail {many:.5f}"

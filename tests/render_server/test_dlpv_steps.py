@@ -21,6 +21,7 @@ from deltalight.render_server.passes.lpv import (
     moment_weights,
     transmitted_fractions,
 )
+from deltalight.render_server.passes.lpv_lighting import LpvAddBounce
 from tests.render_server.lpv_scenes import INJECTED_STEPS
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -93,15 +94,16 @@ def test_tiles_in_shared_memory_make_the_same_steps(gpu: GpuContext, weights: St
         assert one == pytest.approx(other, abs=1e-5)
 
 
+@pytest.mark.parametrize("tiled", [False, True], ids=["plain", "tiled"])
 @pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS)
-def test_half_steps_come_to_whole_steps(gpu: GpuContext, weights: StepWeights) -> None:
+def test_half_steps_come_to_whole_steps(gpu: GpuContext, weights: StepWeights, tiled: bool) -> None:
     """Cells of one colour hold the totals of CELLS whole steps, those of the other have one step more."""
     through = np.random.default_rng(1).uniform(0.8, 1, (CELLS, CELLS, CELLS, 8)).astype(np.float32)
     light = np.random.default_rng(2).uniform(-1, 2, (3, CELLS, CELLS, CELLS, 4)).astype(np.float32)
     whole, more = (
         propagated(gpu, light, weights, steps, tiled=True, through=through)[1] for steps in (CELLS, CELLS + 1)
     )
-    _, halves = propagated(gpu, light, weights, CELLS, tiled=False, in_place=True, through=through)
+    _, halves = propagated(gpu, light, weights, CELLS, tiled=tiled, in_place=True, through=through)
     is_odd = np.indices((CELLS, CELLS, CELLS)).sum(axis=0) % 2 == 1
     assert halves[:, is_odd] == pytest.approx(whole[:, is_odd], abs=1e-5)
     assert halves[:, ~is_odd] == pytest.approx(more[:, ~is_odd], abs=1e-5)
@@ -118,13 +120,14 @@ def sums_of(gpu: GpuContext, light: Float32[np.ndarray, "3 n n n 4"]) -> moderng
 class ChangedLight:
     """V_mu after some steps, and V_rho that starts with it and with what objects send and block."""
 
-    def __init__(self, gpu: GpuContext, *, in_place: bool) -> None:
-        self._gpu, self._in_place = gpu, in_place
+    def __init__(self, gpu: GpuContext, *, in_place: bool, tiled: bool = False) -> None:
+        self._gpu, self._in_place, self._half_step = gpu, in_place, in_place and tiled
         self.mu, self.rho = LightVolume(gpu, CELLS), LightVolume(gpu, CELLS)
-        self._start, self._start_change, self._steps = (
+        self._start, self._start_change, self._add, self._steps = (
             LpvStart(gpu),
             LpvStartChange(gpu),
-            LpvPropagate(gpu, tiled=False),
+            LpvAddBounce(gpu),
+            LpvPropagate(gpu, tiled=tiled),
         )
         self._held: list[moderngl.Buffer | moderngl.Texture3D] = []
 
@@ -145,21 +148,21 @@ class ChangedLight:
         past_real, self._past_all = (
             medium_bindings(CELLS, WEIGHTS["moments"], each) for each in (real, joint)
         )
-        self._start.run(self.mu, self._sums(light))
+        self._start.run(self.mu, past_real, self._sums(light), half_step=self._half_step)
         self._steps.run(self.mu, past_real, steps[0], in_place=self._in_place)
-        self._start_change.run(
-            self.rho, self.mu, self._sums(change), self._past_all, real, in_place=self._in_place
-        )
+        own = {"in_place": self._in_place, "half_step": self._half_step}
+        self._start_change.run(self.rho, self.mu, self._sums(change), self._past_all, real, **own)
         self._steps.run(self.rho, self._past_all, steps[1], in_place=self._in_place)
 
     def add(
         self, more: Float32[np.ndarray, "3 n n n 4"], known: Float32[np.ndarray, "3 n n n 4"], steps: int
     ) -> None:
-        self._start.add(self.rho, self._sums(more), self._sums(known))
+        self._add.run(self.rho, self._sums(more), self._sums(known), is_last=False)
         self._steps.run(self.rho, self._past_all, steps, in_place=self._in_place)
 
     def release(self) -> None:
-        for item in (self.mu, self.rho, self._start, self._start_change, self._steps, *self._held):
+        passes = self._start, self._start_change, self._add, self._steps
+        for item in (self.mu, self.rho, *passes, *self._held):
             item.release()
 
 
@@ -173,14 +176,18 @@ def surroundings() -> tuple[Float32[np.ndarray, "3 n n n 4"], Float32[np.ndarray
     return light, rng.uniform(0.8, 1, (CELLS, CELLS, CELLS, 8)).astype(np.float32)
 
 
-IN_PLACE = pytest.mark.parametrize("in_place", [False, True], ids=["whole", "in place"])
+STEPS = pytest.mark.parametrize(
+    "how",
+    [{"in_place": False}, {"in_place": True}, {"in_place": True, "tiled": True}],
+    ids=["whole", "in place", "tiled in place"],
+)
 
 
-@IN_PLACE
-def test_objects_that_change_nothing_leave_the_light_as_it_was(gpu: GpuContext, in_place: bool) -> None:
+@STEPS
+def test_objects_that_change_nothing_leave_the_light_as_it_was(gpu: GpuContext, how: dict[str, bool]) -> None:
     """Although V_mu has had few steps and V_rho has further ones."""
     light, through = surroundings()
-    changed = ChangedLight(gpu, in_place=in_place)
+    changed = ChangedLight(gpu, **how)
     changed.propagate(light, np.zeros_like(light), (through, through), (3, 9))
     mu, rho = cells_of(changed.mu, "total").copy(), cells_of(changed.rho, "total").copy()
     changed.release()
@@ -188,13 +195,15 @@ def test_objects_that_change_nothing_leave_the_light_as_it_was(gpu: GpuContext, 
     assert rho == pytest.approx(mu, abs=2e-5)
 
 
-@IN_PLACE
-def test_what_objects_send_and_block_comes_to_the_light_with_them(gpu: GpuContext, in_place: bool) -> None:
+@STEPS
+def test_what_objects_send_and_block_comes_to_the_light_with_them(
+    gpu: GpuContext, how: dict[str, bool]
+) -> None:
     """V_rho that starts with V_mu, and is given more on the way, against all of it propagated at once."""
     light, through = surroundings()
     change, more, known = spot(seed=6), spot(seed=7), spot(seed=8)
     joint = through * np.random.default_rng(9).uniform(0.5, 1, through.shape).astype(np.float32)
-    changed = ChangedLight(gpu, in_place=in_place)
+    changed = ChangedLight(gpu, **how)
     changed.propagate(light, change, (through, joint), (MANY_STEPS, 5))
     changed.add(more, known, MANY_STEPS)
     rho = cells_of(changed.rho, "total").copy()
@@ -203,6 +212,21 @@ def test_what_objects_send_and_block_comes_to_the_light_with_them(gpu: GpuContex
         gpu, light + change + more - known, WEIGHTS["moments"], MANY_STEPS, tiled=False, through=joint
     )
     assert rho == pytest.approx(expected, abs=5e-4)
+
+
+def test_tiles_in_shared_memory_make_the_same_half_steps(gpu: GpuContext) -> None:
+    """Although they begin where the volume is started, and each dispatch makes several."""
+    light, through = surroundings()
+    joint = through * np.random.default_rng(9).uniform(0.5, 1, through.shape).astype(np.float32)
+    found = []
+    for tiled in (False, True):
+        changed = ChangedLight(gpu, in_place=True, tiled=tiled)
+        changed.propagate(light, spot(seed=6), (through, joint), (CELLS, 5))
+        changed.add(spot(seed=7), spot(seed=8), 3)
+        found.append([cells_of(each, "total").copy() for each in (changed.mu, changed.rho)])
+        changed.release()
+    for one, other in zip(*found, strict=True):
+        assert one == pytest.approx(other, abs=1e-5, rel=1e-5)
 
 
 @pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS)

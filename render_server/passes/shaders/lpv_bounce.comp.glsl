@@ -19,6 +19,9 @@ vec3 sent_out(Surfel s, vec3 n) {
     vec3 e_mu = max(natural + e.mu, vec3(0.0)), e_rho = max(natural + e.rho, vec3(0.0));
     return albedo_at(s, n, e_mu) * (e_rho - e_mu);
 }
+#ifdef BOTH
+vec3 sent_out_by_object(Surfel s, vec3 n) { return virtual_albedo(s) * brought_to(s, n).rho; }
+#endif
 #else
 vec3 sent_out(Surfel s, vec3 n) { return virtual_albedo(s) * brought_to(s, n).rho; }
 #endif

@@ -4,13 +4,24 @@
 //
 // A step takes light from even cells (by the sum of their coordinates) to odd ones and from odd ones to even: two systems that never
 // meet. So a workgroup steps one after the other, and holds half of the cells at a time: borders of four fit 32 KB.
+//
+// HALVES: as many half steps, as in lpv_half_step.comp.glsl, from one total to the next: of one system alone, the cells that change and
+// their neighbours in turn.
 #include "common/light_cells.glsl"
 #include "common/light_step.glsl"
 
 layout(local_size_x = 8, local_size_y = 8, local_size_z = 8) in;
 layout(rgba32f) readonly uniform image3D state;
+#ifdef HALVES
+layout(rgba32f) readonly uniform image3D total;
+layout(rgba32f) writeonly uniform image3D next_total;
+uniform int colour;   // of the cells that the first half step changes
+#define TAKEN total
+#else
 layout(rgba32f) writeonly uniform image3D next_state;
 layout(rgba32f) uniform image3D total;
+#define TAKEN state
+#endif
 uniform usampler3D transmitted;
 #pragma texels rg32ui transmitted
 uniform int cells;
@@ -54,13 +65,22 @@ void share() {
 void load(ivec3 low, int channel, int wanted) {
     for (int i = int(gl_LocalInvocationIndex); i < WIDE * WIDE * WIDE / 2; i += THREADS) {
         ivec3 c = in_cube(i, WIDE, 0, wanted), cell = low + c - FUSED;
-        held[held_index(c)] = in_grid(cell, cells) ? imageLoad(state, in_channel(cell, channel, cells)) : vec4(0.0);
+        held[held_index(c)] = in_grid(cell, cells) ? imageLoad(TAKEN, in_channel(cell, channel, cells)) : vec4(0.0);
     }
     share();
 }
 
+// Light that a cell has by itself.
+vec4 own_light(ivec3 cell, int channel) {
+#ifdef HALVES
+    return imageLoad(state, in_channel(cell, channel, cells));
+#else
+    return vec4(0.0);
+#endif
+}
+
 // From cells of one parity to those of the other, `wanted`, in the part of the border that is valid after so many steps.
-void step_to(ivec3 low, int done, int wanted) {
+void step_to(ivec3 low, int channel, int done, int wanted) {
     int edge = WIDE - 2 * done, count = edge * edge * edge / 2;
     vec4 results[ROUNDS];
     for (int j = 0; j < ROUNDS; ++j) {
@@ -69,7 +89,7 @@ void step_to(ivec3 low, int done, int wanted) {
         ivec3 c = in_cube(i, edge, done, wanted), cell = low + c - FUSED;
         bool inside = in_grid(cell, cells);
         uvec2 open = has_geometry && inside ? texelFetch(transmitted, cell, 0).xy : uvec2(0xffffffffu);
-        results[j] = inside ? gathered(c, open) : vec4(0.0);
+        results[j] = inside ? own_light(cell, channel) + gathered(c, open) : vec4(0.0);
     }
     share();
     for (int j = 0; j < ROUNDS; ++j) {
@@ -79,16 +99,27 @@ void step_to(ivec3 low, int done, int wanted) {
     share();
 }
 
-void main() {
-    int tiles = cells / TILE, channel = int(gl_WorkGroupID.z) / tiles;
-    ivec3 low = ivec3(gl_WorkGroupID.xy, int(gl_WorkGroupID.z) % tiles) * TILE;
-    ivec3 own = ivec3(gl_LocalInvocationID) + FUSED;
+#ifdef HALVES
+void run_steps(ivec3 low, int channel, ivec3 own) {
+    ivec3 texel = in_channel(low + own - FUSED, channel, cells);
+    int first = (colour + FUSED) & 1;   // parity in the tile, whose border shifts it
+    vec4 after = imageLoad(total, texel);
+    load(low, channel, 1 - first);
+    for (int done = 1; done <= FUSED; ++done) {
+        int reached = (first + done - 1) & 1;
+        step_to(low, channel, done, reached);
+        if (parity(own) == reached) after = held[held_index(own)];
+    }
+    imageStore(next_total, texel, after);
+}
+#else
+void run_steps(ivec3 low, int channel, ivec3 own) {
     vec4 after[FUSED];   // each step
     for (int first = 0; first < 2; ++first) {
         load(low, channel, first);
         for (int done = 1; done <= FUSED; ++done) {
             int reached = (first + done) & 1;
-            step_to(low, done, reached);
+            step_to(low, channel, done, reached);
             if (parity(own) == reached) after[done - 1] = held[held_index(own)];
         }
         share();   // before the next system takes its place
@@ -98,4 +129,11 @@ void main() {
     for (int i = 0; i < FUSED; ++i) sum += after[i];
     imageStore(total, texel, sum);
     imageStore(next_state, texel, after[FUSED - 1]);
+}
+#endif
+
+void main() {
+    int tiles = cells / TILE, channel = int(gl_WorkGroupID.z) / tiles;
+    ivec3 low = ivec3(gl_WorkGroupID.xy, int(gl_WorkGroupID.z) % tiles) * TILE;
+    run_steps(low, channel, ivec3(gl_LocalInvocationID) + FUSED);
 }

@@ -5,6 +5,8 @@
 #include "common/light_step.glsl"
 #include "common/injected_light.glsl"
 
+#pragma switch HALF_STEP
+
 layout(local_size_x = 16) in;
 layout(rgba32f) readonly uniform image3D light_mu;
 layout(rgba32f) writeonly uniform image3D state;
@@ -16,6 +18,14 @@ uniform bool in_place;   // as lpv_half_step.comp.glsl has its state: what the t
 vec4 light_of(ivec3 texel) { return imageLoad(light_mu, texel); }
 #include "common/light_neighbours.glsl"
 
+// Before any half step; HALF_STEP: after the first one, of the cells of colour 0.
+vec4 total_in_place(ivec3 cell, Neighbours all, int channel, vec4 before, vec4 change) {
+#ifdef HALF_STEP
+    if (((cell.x + cell.y + cell.z) & 1) == 0) return before + change + entering(cell, all, channel);
+#endif
+    return before;
+}
+
 void main() {
     ivec3 cell = ivec3(gl_GlobalInvocationID);
     if (!in_grid(cell, cells)) return;
@@ -26,6 +36,6 @@ void main() {
         ivec3 texel = in_channel(cell, channel, cells);
         vec4 before = light_of(texel), change = injected_light(int(cell_index(cell, cells)), channel) + entering(cell, gained, channel);
         imageStore(state, texel, in_place ? before + change : change);
-        imageStore(total, texel, in_place ? before : before + change);
+        imageStore(total, texel, in_place ? total_in_place(cell, all, channel, before, change) : before + change);
     }
 }

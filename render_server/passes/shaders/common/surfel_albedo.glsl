@@ -1,4 +1,4 @@
-// Albedo of surfels. Needs voxel_store.glsl, environment.glsl.
+// Albedo of surfels: of real ones (REAL), of the objects', or of BOTH. Needs voxel_store.glsl, environment.glsl.
 #include "common/brdf.glsl"
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
@@ -21,7 +21,14 @@ vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
     }
     return clamp(PI * measured_radiance(p) / max(e, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
 }
+#ifdef BOTH
+#define OF_OBJECTS
+#endif
 #else
+#define OF_OBJECTS
+#endif
+
+#ifdef OF_OBJECTS
 #include "common/materials.glsl"
 #ifdef EXTENDED
 #include "common/coating.glsl"
