@@ -5,6 +5,7 @@ A context's `compile_watchers` are told of each, with its defines.
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -92,6 +93,11 @@ SURFACES = [  # what materials are shaded by maps of light
     for count in range(4)
     for switches in combinations(("EXTENDED", "MATERIAL_MAPS", "MEASURED"), count)
 ]
+ON_GPUS = [  # with what the others lack: edges that are unmixed, objects that change the light of both sets
+    Case("exact", "depth", "antialiased"),
+    Case("paper", "depth", "mirror"),
+    Case("dlpv", "model", "mirror"),
+]
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume", "error"),
@@ -108,6 +114,11 @@ def render(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -
             renderer.render(frames_of(case)[0])
     finally:
         renderer.release()
+
+
+def render_on_gpu(case: Case, gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame by a GPU's paths, wherever this runs."""
+    render(case, {}, replace(gpu, is_software=False), folder)
 
 
 def render_textured(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
@@ -274,6 +285,7 @@ PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{f"{case}, two cameras": partial(render_several, case) for case in SEVERAL},
     **{f"{case}, objects far apart": partial(render_apart, case) for case in APART},
     **{f"{case}, objects far apart, live": partial(render_apart, case, quality="live") for case in APART[:2]},
+    **{f"{case}, on a GPU": partial(render_on_gpu, case) for case in ON_GPUS},
     "by device": by_device,
     "image-based shading": image_based,
     "precomputed transfer": precomputed_transfer,
