@@ -108,3 +108,24 @@ def test_commands_keep_what_handles_such_a_signal(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
     assert run(["--version"]) == 0
     assert sys.excepthook is sys.__excepthook__
+
+
+IMPORTING = """
+import os, runpy, signal, sys, time
+
+class Interrupts:
+    def find_spec(self, name, *_):
+        if name == "deltalight.services.commands.render":
+            os.kill(os.getpid(), signal.{name})
+            time.sleep(60)
+
+sys.meta_path.insert(0, Interrupts())
+runpy.run_module("deltalight.services", run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_signal_during_the_imports_ends_the_command_without_a_traceback(name: str, code: int) -> None:
+    program = [sys.executable, "-c", IMPORTING.format(name=name)]
+    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert (ended.stdout, ended.stderr, ended.returncode) == ("", "", code)
