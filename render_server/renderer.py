@@ -266,9 +266,9 @@ class SceneRenderer:
         return [main, *(readback.start_other(source, view, output, self._live) for view in others)]
 
     def _end_frame(self, sources: Sequence[FrameSource]) -> PassTimes:
+        ran = dict(self._live.timers.end_frame())  # what shows no surface was uploaded all the same
         if self.graph is None or all(source.relit is None for source in sources):
             return PassTimes({}, {})
-        ran = dict(self._live.timers.end_frame())
         return PassTimes(ran, self.graph.reused_times_ms(ran))
 
     def _check_device(self) -> None:

@@ -2,13 +2,24 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deltalight.render_server.gpu import timers as timers_module
 from deltalight.render_server.gpu.context import GpuContext, count_gl_objects
 from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.scenes import Stage, cube, directional, floor, frame, pass_times_ms
+from tests.render_server.scenes import (
+    HEIGHT,
+    WIDTH,
+    Stage,
+    cube,
+    depth_image,
+    directional,
+    floor,
+    frame,
+    pass_times_ms,
+)
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
@@ -79,6 +90,21 @@ def test_a_renderer_leaves_no_queries(gpu: GpuContext, tmp_path: Path) -> None:
         renderer.release()
         counts.append(count_gl_objects()["Query"])
     assert counts[0] == counts[1]
+
+
+@pytest.mark.usefixtures("queried")
+def test_frames_without_a_surface_use_queries_again(gpu: GpuContext, tmp_path: Path) -> None:
+    stage, counts = Stage(tmp_path), []
+    document = stage.document([stage.virtual(cube())], [directional()])
+    blind = frame(depth=depth_image(np.zeros((HEIGHT, WIDTH), np.float32)))
+    for frames in (4, 8):
+        gpu.spare_queries.clear()
+        renderer = SceneRenderer(gpu, document)
+        for _ in range(frames):
+            renderer.render(blind)
+        renderer.release()
+        counts.append(len(gpu.spare_queries))
+    assert counts[0] == counts[1] > 0
 
 
 def test_what_the_cpu_takes_for_a_pass_is_told_apart_from_what_the_gpu_takes(gpu: GpuContext) -> None:
