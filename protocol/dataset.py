@@ -285,7 +285,7 @@ def _instead_of_list(folder: Path) -> str:
     """Return a sentence about a folder without rgb.txt, by what else it holds."""
     if (folder / BAG_METADATA).is_file():
         return f"{folder} is a ROS 2 bag; make a recording of it with `deltalight recordings import`."
-    bags = sorted(path.name for path in folder.glob("*") if path.suffix == BAG_DATABASE)
+    bags = sorted(path.name for path in folder.glob(f"*{BAG_DATABASE}"))
     if bags:
         return (
             f"{folder} is a ROS 2 bag ({bags[0]}) without its {BAG_METADATA}; let `ros2 bag reindex` write that file,"
