@@ -1,14 +1,45 @@
 """Checks of the frames and scenes that a program passes to a renderer: what it made itself may be anything."""
 
 import math
+import operator
+from typing import SupportsIndex
 
 import numpy as np
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
+from deltalight.protocol.method_names import require_method
 from deltalight.protocol.poses import require_rigid
 from deltalight.protocol.scene import SceneDocument
 from deltalight.scene import Scene
+
+
+def require_method_name(method: object) -> str:
+    """Returns the name of a method.
+
+    Raises:
+        DeltalightError: it is no name, or there is no such method.
+    """
+    if not isinstance(method, str):
+        raise DeltalightError(
+            f'The name of a method is needed and {_kind(method)} was given; write `method="exact"`, for example.'
+        )
+    return require_method(method)
+
+
+def require_device(device: object) -> int:
+    """Returns the number of an EGL device, which may be one of numpy's.
+
+    Raises:
+        DeltalightError: it is no number from 0 on.
+    """
+    number = operator.index(device) if isinstance(device, SupportsIndex) else -1
+    if number < 0 or isinstance(device, bool):
+        raise DeltalightError(
+            f"The device {device!r} is not possible; give a number from 0 on, as `deltalight doctor` lists them, or"
+            " None for the driver's first."
+        )
+    return number
 
 
 def require_document(scene: object) -> SceneDocument:

@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from deltalight.checked_input import require_document, require_frames
+from deltalight.checked_input import require_device, require_document, require_frames, require_method_name
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame, linear_color
-from deltalight.protocol.method_names import require_method, with_method
+from deltalight.protocol.method_names import with_method
 from deltalight.protocol.quality import Quality, require_quality
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import create_context
@@ -93,10 +93,10 @@ class Renderer:
         *,
         device: int | None = None,
     ) -> None:
-        self._method = None if method is None else require_method(method)
+        self._method = None if method is None else require_method_name(method)
         self._quality = None if quality is None else require_quality(quality)
         self._is_closed = False
-        self._gpu = create_context(device)
+        self._gpu = create_context(None if device is None else require_device(device))
         self._renderer: SceneRenderer | None = None
 
     @property

@@ -5,6 +5,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self, SupportsIndex, overload
 
+from deltalight.protocol.counts import counted
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
@@ -71,11 +72,11 @@ class Take(Sequence[ViewFrame]):
             return self._frames[index]
         except IndexError:
             raise IndexError(
-                f"The take has {len(self)} frames, counted from 0, and none at {index}."
+                f"The take has {counted(len(self), 'frame')}, counted from 0, and none at {index}."
             ) from None
 
     def __repr__(self) -> str:
-        return f"<Take of {len(self)} frames>"
+        return f"<Take of {counted(len(self), 'frame')}>"
 
 
 class LiveTake:

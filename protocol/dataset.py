@@ -37,6 +37,8 @@ from deltalight.protocol.pictures import (
 from deltalight.protocol.response_table import load_response_table
 from deltalight.protocol.scene import SceneDocument
 
+BAG_METADATA, BAG_DATABASE = "metadata.yaml", ".db3"  # of a ROS 2 bag
+
 
 @dataclass(frozen=True)
 class DepthCalibration:
@@ -155,9 +157,7 @@ class DatasetReader:
     def _read_colors(self) -> list[ListEntry]:
         path = self.path / "rgb.txt"
         if not path.is_file():
-            raise DeltalightError(
-                f"{self.path} has no rgb.txt; write it, with a line `timestamp filename` for every picture."
-            )
+            raise DeltalightError(_instead_of_list(self.path))
         entries = read_list(path)
         require_increasing(entries, path)
         return entries
@@ -279,3 +279,23 @@ def _require_size(picture: np.ndarray, camera: CameraModel, path: Path, calibrat
             f"{path} has {width}x{height} pixels but {calibration} says {camera.width}x{camera.height}; "
             "correct the calibration or the picture."
         )
+
+
+def _instead_of_list(folder: Path) -> str:
+    """Return a sentence about a folder without rgb.txt, by what else it holds."""
+    if (folder / BAG_METADATA).is_file():
+        return f"{folder} is a ROS 2 bag; make a recording of it with `deltalight recordings import`."
+    bags = sorted(path.name for path in folder.glob(f"*{BAG_DATABASE}"))
+    if bags:
+        return (
+            f"{folder} is a ROS 2 bag ({bags[0]}) without its {BAG_METADATA}; let `ros2 bag reindex` write that file,"
+            " then make a recording of the bag with `deltalight recordings import`."
+        )
+    recordings = sorted(path.name for path in folder.glob("*.mcap"))
+    if recordings:
+        return (
+            f"{folder} has no rgb.txt, but {recordings[0]}; name that recording, or, if the folder is a ROS 2 bag,"
+            f" let `ros2 bag reindex` write its {BAG_METADATA} and make a recording of it with"
+            " `deltalight recordings import`."
+        )
+    return f"{folder} has no rgb.txt; write it, with a line `timestamp filename` for every picture."

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import FileIO
 from pathlib import Path
 
 import cv2
@@ -37,12 +38,34 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     except OSError as fault:
-        raise DeltalightError(
-            f"'{path}' cannot be written ({fault.strerror}); free some space or choose another folder."
-        ) from fault
+        raise unwritable(path, fault.strerror) from fault
     finally:
         with suppress(OSError):  # the error above says what is wrong
             temporary.unlink()
+
+
+def unwritable(path: Path, reason: str | None) -> DeltalightError:
+    """Return the fault that a file cannot be written, to be raised."""
+    return DeltalightError(
+        f"'{path}' cannot be written ({reason}); free some space or choose another folder."
+    )
+
+
+def append_whole(file: FileIO, content: bytes) -> None:
+    """Append `content` to an unbuffered file; all of it, or nothing where the disk refuses.
+
+    Raises:
+        DeltalightError: the disk refuses.
+    """
+    end, left = file.tell(), memoryview(content)
+    try:
+        while left:
+            left = left[file.write(left) :]
+    except OSError as fault:
+        with suppress(OSError):
+            file.seek(end)
+            file.truncate()
+        raise unwritable(Path(str(file.name)), fault.strerror) from fault
 
 
 def write_bytes(path: Path, content: bytes) -> None:

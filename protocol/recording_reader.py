@@ -25,6 +25,7 @@ from zstandard import ZstdError
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.counts import counted
 from deltalight.protocol.documents import parse_mapping
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage, SensorFrame
@@ -197,7 +198,7 @@ class RecordingReader:
                 damaged += 1
         frames = {time for time, found in topics.items() if {FRAME_TOPIC, COLOR_TOPIC} <= found}
         fisheyes = {time for time, found in topics.items() if FISHEYE_RECORD_TOPIC in found}
-        lost = f" and {damaged} damaged parts were left out" if damaged else ""
+        lost = f", without {counted(damaged, 'damaged part')}" if damaged else ""
         self.notes.append(
             f"{self.path} was not finished; {len(frames)} frames were recovered by reading it through{lost}."
         )

@@ -5,19 +5,23 @@ import math
 import statistics
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import FileIO
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from struct import unpack
+from typing import Any
 
 import cv2
 import numpy as np
+from cv2.utils import logging as logs
 from jaxtyping import UInt8
 
 from deltalight.protocol.codecs import decode_color
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.files import replacing, write_bytes, write_png
+from deltalight.protocol.files import append_whole, replacing, unwritable, write_bytes, write_png
 from deltalight.protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
@@ -44,9 +48,7 @@ class CompositeCollector:
         self._began_s = time.monotonic()
         self._receiver = Receiver([composite_endpoint], ["composite", "stats"])
         self._client = RequestClient(control_endpoint)
-        self._index: IO[str] | None = (
-            None if out is None else (out / "frames.jsonl").open("w", encoding="utf-8")
-        )
+        self._index: FileIO | None = None if out is None else (out / "frames.jsonl").open("wb", buffering=0)
 
     @property
     def count(self) -> int:
@@ -117,8 +119,7 @@ class CompositeCollector:
         self.arrivals_s.append(time.monotonic())
         if self._out is not None and self._index is not None:
             write_bytes(self._out / f"{number:06d}.jpg", bytes(parts[0]))
-            self._index.write(json.dumps(self._record(number)) + "\n")
-            self._index.flush()
+            append_whole(self._index, f"{json.dumps(self._record(number))}\n".encode())
 
     def _record(self, number: int) -> dict[str, Any]:
         message = self.messages[number]
@@ -143,7 +144,7 @@ class CompositeCollector:
         height, width = self.messages[0].shape[:2]
         codec = cv2.VideoWriter.fourcc(*VIDEO_CODEC)
         rate = round(float(np.clip(self.frames_per_s() or FALLBACK_RATE, *VIDEO_RATES)), 2)
-        with replacing(self._out / "demo.mp4") as path:
+        with replacing(self._out / "demo.mp4") as path, _no_warnings():
             video = cv2.VideoWriter(str(path), codec, rate, (width, height))
             if not video.isOpened():
                 raise DeltalightError(
@@ -153,6 +154,37 @@ class CompositeCollector:
                 frame = cv2.resize(self._picture(number), (width, height))
                 video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
             video.release()
+            if not _is_whole(path):
+                raise unwritable(self._out / "demo.mp4", "it is not whole")
+
+
+@contextmanager
+def _no_warnings() -> Iterator[None]:
+    """Keep OpenCV from warning of each picture that the disk refuses."""
+    before = logs.setLogLevel(logs.LOG_LEVEL_ERROR)
+    try:
+        yield
+    finally:
+        logs.setLogLevel(before)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether an MP4 file has all its boxes (ISO/IEC 14496-12, 4.2).
+
+    OpenCV does not tell that the disk refused one.
+    """
+    size, place, kinds = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while place < size:
+            file.seek(place)
+            length, kind = unpack(">I4s", file.read(8).ljust(8, b"\0"))
+            if length == 1:  # it follows, because the box is larger than 4 GB
+                (length,) = unpack(">Q", file.read(8).ljust(8, b"\0"))
+            if length < 8:  # not known yet
+                return False
+            place += length
+            kinds.add(kind)
+    return place == size and b"moov" in kinds
 
 
 def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h w 3"]:

@@ -184,6 +184,12 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         "does not exist; correct the path": lambda: scene.add(tmp_path / "cup.glb"),
         "has an object `knot` already": lambda: scene.add(cube, name="knot"),
         "is not a method; the nearest is dlpv": lambda: dl.Renderer("dlvp"),
+        "name of a method is needed and `int` was given": lambda: dl.Renderer(5),  # type: ignore[arg-type]
+        "device -1 is not possible; give a number from 0 on, as `deltalight doctor`": lambda: dl.Renderer(
+            device=-1
+        ),
+        "device '0' is not possible": lambda: dl.Renderer(device="0"),  # type: ignore[arg-type]
+        "device True is not possible": lambda: dl.Renderer(device=True),
         "'fast' is not a quality; use one of live, balanced, best": lambda: dl.Renderer(quality="fast"),  # type: ignore[arg-type]
         r"the object `cube`: the key `pose.translation_m\[2\]` is missing": lambda: scene.add(
             cube, at=(1, 2)

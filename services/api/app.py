@@ -16,6 +16,7 @@ from deltalight.protocol.keys import Keys
 from deltalight.services.api.auth import AuthMiddleware, AuthRules
 from deltalight.services.api.context import Context
 from deltalight.services.api.credentials import SecretToken
+from deltalight.services.api.head_requests import HeadRequests
 from deltalight.services.api.host_names import HostNames
 from deltalight.services.api.metrics import MetricsMiddleware
 from deltalight.services.api.problems import describe_problems, responses
@@ -167,7 +168,8 @@ def _middleware(settings: ApiSettings, store: Store, context: Context) -> list[M
         streams=context.streams,
         secrets=_secret_tokens(settings),
     )
-    return [Middleware(RoomPaths), Middleware(MetricsMiddleware, metrics=context.metrics), auth]
+    measuring = Middleware(MetricsMiddleware, metrics=context.metrics)
+    return [Middleware(RoomPaths), Middleware(HeadRequests), measuring, auth]
 
 
 def _secret_tokens(settings: ApiSettings) -> list[SecretToken]:

@@ -5,6 +5,7 @@ import logging
 import socket
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import structlog
@@ -22,12 +23,18 @@ from deltalight.services.api.app import create_app
 from deltalight.services.api.connections import HEAD_TIMEOUT_S, LimitedProtocol, RateLimitedLog
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host_store import FIRST_SCENE, activate_first, import_scene
+from deltalight.services.storage.data_folder import doing_jobs
 from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultError
 from deltalight.services.storage.store import Store, default_folder
 
 FIRST_TOKEN, FIRST_TOKEN_FILE = "first", "first_token"
 MAX_CONNECTIONS = 256
 ANSWER_TIMEOUT_S = 1.0
+OTHER_JOBS = (
+    "another web process with this data folder records and replays, too: both have the same active scene, and each"
+    " page lists the recordings and the replay of both, but ends only its own; name another folder with --data, or"
+    " set `jobs = false` in [api] of one of them"
+)
 DATABASE_PATIENCE_S, DATABASE_INTERVAL_S = 60.0, 2.0
 LARGEST_SOCKET_MESSAGE = 1024  # bytes: clients send acknowledgements only
 
@@ -46,7 +53,10 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
     with (
         listening(settings.host, settings.port) as listener,
         open_patiently(settings) as store,
+        ExitStack() as held,
     ):
+        if settings.jobs and held.enter_context(doing_jobs(store.folder)):
+            log.warning(OTHER_JOBS, data=str(store.folder))
         if scene is not None:
             store.scenes.activate(import_scene(store, scene))
         if settings.rooms is None:

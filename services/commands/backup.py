@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deltalight.protocol.counts import counted
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.commands.options import ConfigFile, Data, data_folder
 
@@ -76,7 +77,8 @@ def _print(contents: "Contents", place: str, *, as_json: bool) -> None:
         return
     size = f"{contents.size_bytes / 1e6:.2f} MB"
     typer.echo(
-        f"{contents.scenes} scenes with {contents.revisions} revisions and {contents.assets} assets ({size}) {place}"
+        f"{counted(contents.scenes, 'scene')} with {counted(contents.revisions, 'revision')} and"
+        f" {counted(contents.assets, 'asset')} ({size}) {place}"
     )
     if aside is not None:
         typer.echo(f"The previous data is in {aside}; delete it when you no longer need it.")

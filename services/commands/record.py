@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deltalight.protocol.counts import counted
 from deltalight.services.commands.options import ConfigFile, NodeName, NodeStreams, node_endpoints
 from deltalight.services.commands.room_options import Room, Rooms, following_room
 
@@ -146,8 +147,9 @@ def _line(status: "RecordStatus") -> "Text":
     from rich.text import Text
 
     words = (
-        f"{status.out.name}: {status.frames} frames, {status.seconds:.0f} s, {status.size_bytes / 1e6:.1f} MB,"
-        f" {status.bytes_per_s / 1e6:.1f} MB/s, lost {_losses(status)}, {status.free_bytes / 1e9:.1f} GB free"
+        f"{status.out.name}: {counted(status.frames, 'frame')}, {status.seconds:.0f} s,"
+        f" {status.size_bytes / 1e6:.1f} MB, {status.bytes_per_s / 1e6:.1f} MB/s,"
+        f" lost {_losses(status)}, {status.free_bytes / 1e9:.1f} GB free"
     )
     return Text(words if status.frames else "waiting for the first frame", no_wrap=True, overflow="ellipsis")
 
@@ -158,7 +160,7 @@ def _losses(status: "RecordStatus") -> str:
         parts.append(f"{status.node_drops} dropped by the node itself")
     parts += [f"{count} {cause} dropped here" for cause, count in status.dropped.items() if count]
     if status.unkept:
-        parts.append(f"{status.unkept} frames that the disk refused")
+        parts.append(f"{counted(status.unkept, 'frame')} that the disk refused")
     return ", ".join(parts) or "nothing"
 
 
@@ -169,9 +171,9 @@ def _print_summary(status: "RecordStatus", *, as_json: bool) -> None:
     elif not status.frames:
         typer.echo("Nothing was recorded and no file was written.", err=True)
     else:
-        relit = f", {status.composites} relit pictures" if status.composites else ""
+        relit = f", {counted(status.composites, 'relit picture')}" if status.composites else ""
         typer.echo(
-            f"{status.frames} frames{relit} in {status.seconds:.1f} s ({figures['frames_per_s']:.1f} a second),"
-            f" {status.size_bytes / 1e6:.1f} MB ({figures['mb_per_s']:.1f} MB/s), lost {_losses(status)},"
+            f"{counted(status.frames, 'frame')}{relit} in {status.seconds:.1f} s ({figures['frames_per_s']:.1f} a"
+            f" second), {status.size_bytes / 1e6:.1f} MB ({figures['mb_per_s']:.1f} MB/s), lost {_losses(status)},"
             f" {100 * figures['cpu_share']:.0f} % of a core, written to {status.out}"
         )

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from deltalight.protocol.counts import counted
+from deltalight.protocol.errors import DeltalightError
 from deltalight.services.exports import ExportFormat
 
 if TYPE_CHECKING:
@@ -85,7 +87,9 @@ def import_(
     from deltalight.services.exports.ros_bags import import_bag, is_bag
     from deltalight.services.recording_copies import import_folder
 
-    if is_bag(folder) and scene is None:
+    if is_bag(folder):
+        if scene is not None:
+            raise DeltalightError("--scene is attached to dataset folders; leave it out for a ROS bag.")
         _print_copied(import_bag(folder, out, _track("importing")), as_json=as_json)
         return
     _print_copied(import_folder(folder, out, scene, _track("importing")), as_json=as_json)
@@ -140,7 +144,7 @@ def _print_copied(copied: "Copied", *, as_json: bool) -> None:
         return
     for note in copied.notes:
         typer.echo(note, err=True)
-    typer.echo(f"{copied.frames} frames, {copied.lost} lost, written to {copied.out}")
+    typer.echo(f"{counted(copied.frames, 'frame')}, {copied.lost} lost, written to {copied.out}")
 
 
 def _summary_table(found: dict[str, Any]) -> "Table":
@@ -172,7 +176,7 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _finished(found: dict[str, Any]) -> str:
-    damage = f", {found['damaged_parts']} damaged parts" if found["damaged_parts"] else ""
+    damage = f", {counted(found['damaged_parts'], 'damaged part')}" if found["damaged_parts"] else ""
     return ("yes" if found["is_finished"] else "no, `recordings recover` finishes it") + damage
 
 
@@ -181,8 +185,9 @@ def _per_second(rate: float | None, unit: str) -> str:
 
 
 def _lost(found: dict[str, Any]) -> str:
-    gaps = f", {found['gaps']} gaps, the longest {found['longest_gap_s']:.3f} s" if found["gaps"] else ""
-    return f"{found['frames_skipped']} frame numbers skipped{gaps}"
+    gaps, longest_s = found["gaps"], found["longest_gap_s"]
+    told = f", {counted(gaps, 'gap')}, the longest {longest_s:.3f} s" if gaps else ""
+    return f"{counted(found['frames_skipped'], 'frame number')} skipped{told}"
 
 
 def _color(color: dict[str, Any]) -> str:
@@ -207,7 +212,7 @@ def _depth(depth: dict[str, Any] | None) -> str:
     if depth is None:
         return "none"
     scale = "32-bit floats" if depth["scale_m"] is None else f"{1000 * depth['scale_m']:g} mm a step"
-    return f"{_camera(depth['camera'])}, {scale}, in {depth['frames']} frames"
+    return f"{_camera(depth['camera'])}, {scale}, in {counted(depth['frames'], 'frame')}"
 
 
 def _fisheye(fisheye: dict[str, Any] | None) -> str:
@@ -216,7 +221,7 @@ def _fisheye(fisheye: dict[str, Any] | None) -> str:
     lens, exposures = fisheye["lens"], len(fisheye["exposures_s"])
     size = f"{lens['width']}x{lens['height']}" if "width" in lens else "size not told"
     bracket = f"{exposures} exposures" if exposures > 1 else "one exposure"
-    return f"{size}, {lens.get('distortion_model')}, {fisheye['pictures']} moments of {bracket}"
+    return f"{size}, {lens.get('distortion_model')}, {counted(fisheye['pictures'], 'moment')} of {bracket}"
 
 
 def _board(board: dict[str, Any] | None) -> str:

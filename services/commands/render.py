@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deltalight.protocol.counts import counted
 from deltalight.services.commands.options import Device, Quality, View
 
 if TYPE_CHECKING:
@@ -121,6 +122,6 @@ def _print_summary(summary: "RenderSummary", *, as_json: bool) -> None:
         typer.echo(json.dumps(figures))
         return
     typer.echo(
-        f"{figures['frames']} frames, {figures['no_pose']} without a pose, {figures['mean_ms']:.1f} ms per"
-        f" frame, {figures['renderer']}, written to {figures['out']}"
+        f"{counted(figures['frames'], 'frame')}, {figures['no_pose']} without a pose, {figures['mean_ms']:.1f} ms"
+        f" per frame, {figures['renderer']}, written to {figures['out']}"
     )

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deltalight.protocol.counts import counted
 from deltalight.services.commands.options import ConfigFile, OneCamera
 from deltalight.services.commands.room_options import Composites, Room, Rooms, relit_pictures
 
@@ -83,4 +84,4 @@ def _send_all(source: "PictureSource", out: "StreamOut", show: "Callable[[Stream
 
 def _line(status: "StreamStatus") -> str:
     state = "connected" if status.is_connected else "not connected"
-    return f"{state}: {status.pictures} pictures, {status.bytes / 1e6:.1f} MB sent"
+    return f"{state}: {counted(status.pictures, 'picture')}, {status.bytes / 1e6:.1f} MB sent"

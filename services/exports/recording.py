@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from deltalight.protocol.counts import counted
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.protocol.source import Source, open_source
@@ -67,5 +68,5 @@ def _export_glb(source: Source, out: Path, scene: Path | None, track: Track) -> 
 def _with_poses(copied: Copied, source: Source) -> Copied:
     """Say how many frames have no pose."""
     missing = len(source) - copied.frames
-    note = [f"{missing} frames without a pose were left out."] if missing else []
+    note = [f"Left out: {counted(missing, 'frame')} without a pose."] if missing else []
     return replace(copied, notes=[*copied.notes, *note])

@@ -21,6 +21,7 @@ from pydantic import Field
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset import BAG_METADATA
 from deltalight.protocol.documents import StrictModel, validate
 from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.protocol.frames import DepthImage, SensorFrame
@@ -225,7 +226,7 @@ def _transform(bag: _Bag, time_ns: int, parent: str, child: str, matrix: Float64
 
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a ROS bag and not like a dataset folder."""
-    return path.suffix == ".bag" or (path / "metadata.yaml").is_file()
+    return path.suffix == ".bag" or (path / BAG_METADATA).is_file()
 
 
 def import_bag(path: Path, out: Path, track: Track) -> Copied:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from deltalight.protocol.counts import counted
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.pictures import decode_rgb
 from deltalight.protocol.source import Source
@@ -30,5 +31,5 @@ def export_video(source: Source, out: Path, track: Track) -> Copied:
             raise DeltalightError(
                 "No relit picture was recorded; record with --composites, or render the recording to NAME.mp4."
             )
-    note = [f"{without} frames without a relit picture were left out."] if without else []
+    note = [f"Left out: {counted(without, 'frame')} without a relit picture."] if without else []
     return Copied(out, video.frames, notes=[*source.notes, *note])

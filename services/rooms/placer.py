@@ -140,7 +140,8 @@ def _why_none(order: RoomOrder, fitting: Sequence[Slot], usable: Sequence[Slot])
         return f"no host{where} offers a slot; start one."
     if not usable:
         return f"the hosts{where} are drained; end that for one of them, or add slots."
-    return f"all {len(usable)} slots{where} are in use; free one or add slots."
+    in_use = f"all {len(usable)} slots{where} are" if len(usable) > 1 else f"the only usable slot{where} is"
+    return f"{in_use} in use; free one or add slots."
 
 
 def _written(labels: Mapping[str, str]) -> str:

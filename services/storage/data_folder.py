@@ -6,7 +6,8 @@ process is free).
 
 import fcntl
 import os
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -41,6 +42,22 @@ def use_folder_alone(folder: Path) -> ExitStack:
         fcntl.LOCK_EX,
         "is in use; stop the service (and `deltalight backup`) that uses it, then try again.",
     )
+
+
+@contextmanager
+def doing_jobs(folder: Path) -> Iterator[bool]:
+    """Announce during the block that this process records and replays; yield whether another one does so, too.
+
+    It does so by a lock of this process alone (lockf(3)): what it forks does not keep it.
+    """
+    with (folder / ".jobs").open("a+") as mark:
+        try:
+            fcntl.lockf(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            is_shared = False
+        except (BlockingIOError, PermissionError):
+            is_shared = True
+        fcntl.lockf(mark, fcntl.LOCK_SH)
+        yield is_shared
 
 
 def staging_folder(folder: Path) -> Path:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
+from deltalight.protocol.counts import counted
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
@@ -175,7 +176,7 @@ def light_at(lights: Sequence[Item], index: int) -> Item:
     """
     if not 0 <= index < len(lights):
         raise NotFoundError(
-            f"the scene has {len(lights)} manual lights, counted from 0, and none at {index}."
+            f"the scene has {counted(len(lights), 'manual light')}, counted from 0, and none at {index}."
         )
     return lights[index]
 

@@ -181,10 +181,33 @@ def picture(name: str, values: np.ndarray) -> Callable[[Path], None]:
     return apply
 
 
+def instead(*names: str) -> Callable[[Path], None]:
+    """Other files in place of rgb.txt."""
+
+    def apply(folder: Path) -> None:
+        (folder / "rgb.txt").unlink()
+        for name in names:
+            (folder / name).touch()
+
+    return apply
+
+
 MIRROR = "depth_from_rgb: [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
 SKEWED = "depth_from_rgb: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
 BAD_FOLDERS: list[tuple[Callable[[Path], None], str]] = [
-    (remove("rgb.txt"), r"has no rgb\.txt"),
+    (remove("rgb.txt"), r"has no rgb\.txt; write it"),
+    (
+        instead("metadata.yaml", "a.db3"),
+        "is a ROS 2 bag; make a recording of it with `deltalight recordings import`",
+    ),
+    (
+        instead("b.db3", "a.db3"),
+        r"is a ROS 2 bag \(a\.db3\) without its metadata\.yaml; let `ros2 bag reindex`",
+    ),
+    (
+        instead("a.mcap"),
+        r"has no rgb\.txt, but a\.mcap; name that recording, or, if the folder is a ROS 2 bag, let",
+    ),
     (remove("calibration/rgb.yaml"), r"has no calibration/rgb\.yaml"),
     (remove("rgb/1.png"), r"rgb\.txt names 1 missing files, first .*1\.png"),
     (remove("depth/3.png"), r"depth\.txt names 1 missing files"),

@@ -176,7 +176,7 @@ def test_manual_lights_one_by_one(client: httpx.Client) -> None:
     assert [light["type"] for light in client.get(address).json()] == ["directional"]
     for method in ("GET", "DELETE", "PUT", "PATCH"):
         answer = client.request(method, f"{address}/1", json=None if method == "GET" else lamp)
-        assert "has 1 manual lights" in sentence(answer, 404)
+        assert "has 1 manual light," in sentence(answer, 404)
 
 
 def test_changes_of_a_gesture_are_undone_together(client: httpx.Client) -> None:

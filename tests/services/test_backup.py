@@ -81,7 +81,7 @@ def test_restore_moves_aside_what_was_there_and_says_so(cli: RunCli, tmp_path: P
     (data / "recordings").mkdir()
     done = cli("backup", kept, "--data", data)
     assert done.returncode == 0, done.stderr
-    assert "1 scenes with 1 revisions and 1 assets" in done.stdout
+    assert "1 scene with 1 revision and 1 asset (" in done.stdout
     shutil.rmtree(data / "assets")
     (data / "store.sqlite3").unlink()
     filled(data, "second")

@@ -1,6 +1,8 @@
 """What a viewer writes of the composites that it receives."""
 
+import resource
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -9,6 +11,8 @@ import pytest
 
 from deltalight.protocol.codecs import encode_color
 from deltalight.protocol.envelope import encode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import append_whole
 from deltalight.protocol.publisher import Publisher
 from deltalight.services import collector as collector_module
 from deltalight.services import ports
@@ -34,6 +38,56 @@ def test_a_video_is_written_however_fast_or_slow_pictures_came(tmp_path: Path, a
     video = cv2.VideoCapture(str(tmp_path / "demo.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 2
     video.release()
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """The system refuses to let files grow further, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_line_that_the_disk_refuses_is_not_half_written(tmp_path: Path) -> None:
+    path = tmp_path / "lines"
+    with path.open("wb", buffering=0) as file:
+        append_whole(file, b"first\n")
+        with (
+            files_of_at_most(10),
+            pytest.raises(DeltalightError, match=r"lines' cannot be written \(File too large\); free"),
+        ):
+            append_whole(file, b"second\n")
+        assert path.read_bytes() == b"first\n"
+        append_whole(file, b"third\n")
+    assert path.read_bytes() == b"first\nthird\n"
+
+
+def test_a_video_that_the_disk_refuses_is_not_half_written(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rig = Rig(tmp_path)
+    try:
+        rig.send_composites(2)
+        rig.collector.write_overview()
+        video = tmp_path / "demo.mp4"
+        size = video.stat().st_size
+        video.unlink()
+        names = {path.name for path in tmp_path.iterdir()}
+        for limit in (size - 1, size // 2):
+            with (
+                files_of_at_most(limit),
+                pytest.raises(
+                    DeltalightError, match=r"demo\.mp4' cannot be written \(it is not whole\); free"
+                ),
+            ):
+                rig.collector._write_video()
+            assert {path.name for path in tmp_path.iterdir()} == names
+    finally:
+        rig.close()
+    assert capfd.readouterr().err == ""
 
 
 class Rig:

@@ -17,6 +17,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
+import cv2
 import httpx
 import psutil
 import pytest
@@ -32,7 +33,7 @@ from tests.services.test_api_process import wait_for
 
 OWN_MOUNTS = ("unshare", "--user", "--map-root-user", "--mount")
 MOUNT = 'mount -t tmpfs -o "size=$0" tmpfs "$1"'
-PATIENCE_S = 60
+PATIENCE_S, DEMO_PATIENCE_S = 60, 240
 OF_DISK = re.compile(
     "cannot grow|takes data again|recording ended"
 )  # a busy machine tells of other things, too
@@ -140,8 +141,24 @@ def test_files_beyond_what_the_user_may_write_are_refused_and_it_goes_on_once_th
         assert len(client.get("/scenes").raise_for_status().json()) == before + 1 > stored > 0
 
 
-def run_to_its_end(command: list[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+def run_to_its_end(command: list[str], timeout_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+@pytest.mark.slow(seconds=20)
+def test_a_headless_demo_on_a_full_disk_ends_and_leaves_whole_files(disk: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    keep = f'"$@"; code=$?; cp -r {quote(str(disk))} {quote(str(kept))}; exit $code'
+    options = ("--headless", "--frames", 30, "--method", "paper", "--out", disk)
+    done = run_to_its_end(on_small_disk("200k", disk, keep, "demo", *options), DEMO_PATIENCE_S)
+    assert done.returncode == 2, done.stderr
+    (told,) = (line for line in done.stderr.splitlines() if line.startswith("deltalight: "))
+    assert "cannot be written (No space left on device); free some space" in told
+    lines = [json.loads(line) for line in (kept / "frames.jsonl").read_text().splitlines()]
+    pictures = sorted(kept.glob("*.jpg"))
+    assert len(pictures) >= len(lines) > 0
+    assert all(cv2.imread(str(path)) is not None for path in pictures)
+    assert {path.name for path in kept.iterdir()} == {"frames.jsonl", *(path.name for path in pictures)}
 
 
 class Take:

@@ -62,7 +62,7 @@ def on_wall(points: np.ndarray) -> None:
 
 def test_colmap_projects_a_point_onto_our_pixel(recording: Path, tmp_path: Path) -> None:
     copied = export_as(ExportFormat.COLMAP, recording, tmp_path / "out", None, quietly)
-    assert (copied.frames, copied.notes[-1]) == (1, "1 frames without a pose were left out.")
+    assert (copied.frames, copied.notes[-1]) == (1, "Left out: 1 frame without a pose.")
     model = tmp_path / "out" / "sparse" / "0"
     _, name, width, height, *numbers = rows(model / "cameras.txt")[0]
     assert (name, width, height) == ("OPENCV", str(WIDTH), str(HEIGHT))

@@ -267,7 +267,7 @@ def test_a_room_takes_a_host_with_its_labels_that_is_not_drained() -> None:
     assert choose_slot(slots, wants({})).name == "c/1"  # the emptier host
     assert choose_slot(slots, wants({}, "c")).name == "b/1"
     for order, slot, sentence in (
-        (wants(east), None, "all 1 slots with network=east are in use"),
+        (wants(east), None, "the only usable slot with network=east is in use"),
         (wants(east, "a"), None, "the hosts with network=east are drained"),
         (wants({"network": "west"}), None, "no host with network=west offers a slot"),
         (wants({}), "a/1", "a/1 is in use by hall"),

@@ -297,6 +297,10 @@ def test_every_foxglove_topic_of_a_mended_recording_decodes(tmp_path: Path) -> N
         (["import", "{folder}/none", "--out", "{folder}/b.mcap"], "is not a folder"),
         (["import", "{folder}", "--out", "{folder}/b.mcap"], "has no rgb.txt"),
         (["import", "{folder}", "--out", "{folder}/a.mcap"], "already exists"),
+        (
+            ["import", "{folder}/a.bag", "--scene", "{folder}/s.json", "--out", "{folder}/b.mcap"],
+            "leave it out",
+        ),
         (["export", "{folder}/a.mcap", "--out", "{folder}"], "already exists"),
         (["export", "{folder}/none.mcap", "--out", "{folder}/b"], "none.mcap"),
         (["export", "{folder}/a.mcap", "--out", "{folder}/a.mcap/b"], "is a file"),

@@ -348,7 +348,7 @@ def test_a_drained_host_is_emptied_one_room_at_a_time_and_what_has_no_slot_waits
     keeper.poll()
     hall, door = rooms(keeper)["hall"], rooms(keeper)["door"]
     assert (hall.slot, hall.restarts, door.state) == ("west/1", 0, "waiting")
-    assert "all 1 slots are in use" in door.why
+    assert "the only usable slot is in use" in door.why
     assert [slot.drained for slot in keeper.status().slots] == [True, True, False]
     keeper.undrain_host("east")
     keeper.poll()

@@ -80,7 +80,7 @@ def test_relit_pictures_of_a_recording_are_exported(tmp_path: Path, cli: RunCli)
             writer.add(frame)
     done = cli("recordings", "export", tmp_path / "take.mcap", "--format", "mp4", "-o", tmp_path / "take.mp4")
     assert (done.returncode, done.stdout.split()[:2]) == (0, ["2", "frames,"]), done.stderr
-    assert "2 frames without a relit picture were left out." in done.stderr
+    assert "Left out: 2 frames without a relit picture." in done.stderr
     with RecordingWriter(tmp_path / "bare.mcap") as writer:
         writer.add(replace(frames(1)[0], composite=None))
     with pytest.raises(DeltalightError, match="record with --composites"):

@@ -7,13 +7,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pytest
+from structlog.testing import capture_logs
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
@@ -23,6 +25,7 @@ from deltalight.services.api.heard_jobs import LIFE_S as HEARD_S
 from deltalight.services.api.heard_jobs import HeardJobs
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host_store import activate_first
+from deltalight.services.storage.data_folder import doing_jobs
 from deltalight.services.storage.faults import DatabaseGoneError, StorageFaultError
 from deltalight.services.storage.feed import LONGEST_BYTES
 from deltalight.services.storage.last_known import LIFE_S, MOST_ANSWERS, LastKnown
@@ -103,6 +106,53 @@ def test_each_of_many_changes_to_one_revision_wins_once(pair: Pair) -> None:
     with ThreadPoolExecutor(8) as pool:
         assert Counter(pool.map(attempt, range(16))) == {200: 1, 409: 15}
     assert pair.second.client.get(f"/scenes/{scene_id}").json()["revision"] == 2
+
+
+OTHER_WITH_JOBS = """
+import os, pathlib, sys
+from deltalight.services.storage.data_folder import doing_jobs
+with doing_jobs(pathlib.Path(sys.argv[1])) as is_shared:
+    if os.fork():  # the child keeps what it inherited until the pipe ends
+        print(is_shared, flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def other_with_jobs(folder: Path) -> Iterator["subprocess.Popen[str]"]:
+    """Another process that records and replays, and one that it forked."""
+    command, pipe = [sys.executable, "-c", OTHER_WITH_JOBS, str(folder)], subprocess.PIPE
+    with subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline() == "False\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_second_process_with_jobs_hears_of_the_first(tmp_path: Path) -> None:
+    with other_with_jobs(tmp_path) as other:
+        for _ in range(2):  # having heard of it changes nothing
+            with doing_jobs(tmp_path) as is_shared:
+                assert is_shared
+        other.kill()
+        other.wait(60)
+        with doing_jobs(tmp_path) as is_shared:
+            assert not is_shared
+
+
+@pytest.mark.parametrize("jobs", [True, False])
+def test_a_web_process_tells_of_another_one_with_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, jobs: bool
+) -> None:
+    monkeypatch.setattr(serve, "http_server", lambda _app: SimpleNamespace(run=lambda **_: None))
+    monkeypatch.setattr(serve.gc, "freeze", lambda: None)
+    page, control = ports.private_ports(2)
+    settings = ApiSettings(data=tmp_path, port=page, control=ports.endpoint(control), subscribe=(), jobs=jobs)
+    with other_with_jobs(tmp_path), capture_logs() as told:
+        serve.run_api(settings)
+    assert [line["event"] for line in told].count(serve.OTHER_JOBS) == jobs
 
 
 def test_tokens_and_tickets_are_those_of_all(tmp_path: Path, database: str | None) -> None:

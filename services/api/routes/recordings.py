@@ -8,6 +8,7 @@ from fastapi import APIRouter, Body, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field, StrictBool, ValidationError
 
+from deltalight.protocol.counts import counted
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import Name
@@ -94,7 +95,7 @@ def _checklist(facts: Facts) -> list[Check]:
             is_there=depth is not None,
             text="No depth: give the scene a model of the room."
             if depth is None
-            else f"Depth in {depth['frames']} of {facts['frames']} frames.",
+            else f"Depth in {depth['frames']} of {counted(facts['frames'], 'frame')}.",
         ),
         Check(
             what="pose",
