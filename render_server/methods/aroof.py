@@ -3,6 +3,7 @@ docs/method.md 6).
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from operator import eq
 
 import moderngl
@@ -39,7 +40,7 @@ from deltalight.render_server.passes.occlusion_fields import (
 )
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement, place_volume
-from deltalight.render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand
 from deltalight.render_server.precomputation.occlusion_fields import (
     OcclusionFields,
     field_settings,
@@ -152,11 +153,13 @@ class FieldShading:
         edge = float(np.max(high - low)) + 2 * self._settings.reach * max(reach)
         return self._volume.place(place_volume(low, high, self._cells, edge))
 
-    def show(self, items: list[FieldObject], volume: PlacedVolume) -> VoxelMipmap:
-        """Draws what the fields occlude into cells, for debug view `volume`."""
+    def show(self, items: list[FieldObject], volume: PlacedVolume) -> VoxelsOnDemand:
+        """Shows what the fields occlude in cells, once somebody looks at debug view `volume`."""
+        return VoxelsOnDemand(self._shown, partial(self._draw, items, volume))
+
+    def _draw(self, items: list[FieldObject], volume: PlacedVolume) -> None:
         for number, item in enumerate(items):
             self._show.run(self._shown, item.textures, volume.bindings, item.place, first=number == 0)
-        return self._shown
 
     def find_light(
         self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, seen: Observation
@@ -273,7 +276,7 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
     found = g.polled("found fields", "objects", lambda: objects.find(s.objects.value), eq)
     items = g.stage("occlusion fields", objects.place, s.objects, found)
     volume = g.value("volume", own.place, items, s.objects)
-    shown = g.stage("shown cells", own.show, items, volume)
+    shown = g.value("shown cells", own.show, items, volume)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         around = g.stage("light around objects", own.find_light, items, scene, grid, s.observation)

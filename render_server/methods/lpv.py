@@ -56,7 +56,7 @@ from deltalight.render_server.passes.lpv_lighting import (
 )
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import MOST_VOLUMES, PlacedVolume, VolumePlacement
-from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand, VoxelStore
 
 STEPS_OF_A_BOUNCE = 1 / 4
 """Fraction of the steps: V_rho starts with the light of V_mu, and each bounce goes on where the one before ended."""
@@ -243,14 +243,16 @@ class ShownCells:
 
     def show(
         self, change: PerVolume[moderngl.Buffer], direct: PerVolume[moderngl.Buffer] | None = None
-    ) -> VoxelMipmap:
-        """Draws the injected change into the cells of all volumes."""
+    ) -> VoxelsOnDemand:
+        """Shows the injected change in the cells of all volumes, once somebody looks at them."""
+        return VoxelsOnDemand(self._cells, partial(self._draw, change, direct))
+
+    def _draw(self, change: PerVolume[moderngl.Buffer], direct: PerVolume[moderngl.Buffer] | None) -> None:
         if len(change) != self._count:
+            self._cells.resize(self._size, len(change))
             self._count = len(change)
-            self._cells.resize(self._size, self._count)
         for volume, own in enumerate(change):
             self._show.run(self._cells, own, None if direct is None else direct[volume], volume=volume)
-        return self._cells
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -321,7 +323,7 @@ class LitCells:
     rho: Resource[PropagatedLight]
     rho_volume: Resource[PlacedVolume]
     volume: Resource[PlacedVolume]
-    shown: Resource[VoxelMipmap]
+    shown: Resource[VoxelsOnDemand]
 
 
 def joined(g: Graph, name: str, light: Resource[PerVolume[LightVolume]]) -> Resource[PropagatedLight]:
@@ -366,7 +368,7 @@ def difference_stages(
     rho, reflected = g.stages("bounces", bounce, *bounced, outputs=names)
     sources = exchanged(g, s, cubes, c.change, c.covered, reflected)
     all_mu, all_rho = joined(g, "light mu", mu), joined(g, "light rho", rho)
-    shown = g.stage("shown cells", g.shared("shown cells", partial(ShownCells, g.gpu, size)).show, c.change)
+    shown = g.value("shown cells", g.shared("shown cells", partial(ShownCells, g.gpu, size)).show, c.change)
     volume = placed_cells(g, "volume", size, cubes)
 
     def read(
@@ -419,7 +421,7 @@ def printed_stages(
     all_rho, all_delta = joined(g, "light rho", rho), joined(g, "light delta", delta)
     change: tuple[Resource[Any], ...] = (all_delta, joined(g, "light direct", after))
     show = g.shared("shown cells", partial(ShownCells, g.gpu, sizes.indirect)).show
-    shown = g.stage("shown cells", show, indirect.change, injected)
+    shown = g.value("shown cells", show, indirect.change, injected)
     volume = placed_cells(g, "volume", sizes.indirect, cubes)
     rho_volume = placed_cells(g, "volume of rho", sizes.objects, cubes)
 

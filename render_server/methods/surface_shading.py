@@ -34,7 +34,7 @@ from deltalight.render_server.passes.reflections import (
 from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
 from deltalight.render_server.passes.volumes import PlacedVolume
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand
 from deltalight.render_server.view import CameraView, Rectangle
 
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
@@ -42,7 +42,7 @@ DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees 
 
 
 def no_voxels(_: object) -> None:
-    """Returns None, for methods whose volume holds no voxels."""
+    """Returns None: the volume holds no voxels, or no shadow cones march through them."""
 
 
 def no_bindings(_: object) -> dict[str, Binding]:
@@ -124,7 +124,7 @@ class Layers:
     change: Resource[ChangeRatio]
     radiance: Resource[moderngl.Texture]
     reflection: Resource[moderngl.Texture | None]
-    voxels: Resource[VoxelMipmap | None]
+    voxels: Resource[VoxelMipmap | VoxelsOnDemand | None]
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
     error: Resource[Callable[[], moderngl.Texture]] | None = None
@@ -165,7 +165,7 @@ class SurfaceShading:
         self._caustics: Caustics | None = None
         if options.caustics:
             self._caustics = Caustics(gpu, self.grid, reuses=self.reuses_light)
-        self.has_caustics = options.caustics
+        self.has_caustics, self.has_shadow_cones = options.caustics, direct.has_shadow_cones
         self._screen: ScreenCones | None = None
         if options.screen_space:
             self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
@@ -393,7 +393,7 @@ class MethodStages:
     Attributes:
         volume: where its light is stored.
         trace: declares the stages that fill the cones, given the shading scene and the grid.
-        voxels: those of the `volume`; None if it has none.
+        voxels: those of the `volume`, for its debug view and for shadow cones; None if it has none.
         marching: bindings of what rays march through; None if they march through nothing.
         light_directly: computes the direct light; None: `SurfaceShading` does.
         find_distant: finds the change of light beyond the volume.
@@ -402,7 +402,7 @@ class MethodStages:
 
     volume: Resource[PlacedVolume]
     trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]]
-    voxels: Resource[VoxelMipmap] | None = None
+    voxels: Resource[VoxelMipmap] | Resource[VoxelsOnDemand] | None = None
     marching: Resource[dict[str, Binding]] | None = None
     light_directly: Callable[..., DirectLight] | None = None
     find_distant: Callable[..., Bindings] | None = None
@@ -437,7 +437,9 @@ def shading_stages(
     cones = own.trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     light = own.light_directly or shading.light_directly
-    direct = g.stage("direct light", light, scene, grid, caustics, voxels, bvh, *kept)
+    marches = own.light_directly is not None or shading.has_shadow_cones
+    joint = voxels if marches else g.value("shadow voxels", no_voxels, volume)
+    direct = g.stage("direct light", light, scene, grid, caustics, joint, bvh, *kept)
     if own.refract is not None:
         traced = s.objects, scene, grid, direct, bvh, s.observation, marching
         cones = g.stage("refracted cones", own.refract, cones, *traced)

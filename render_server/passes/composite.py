@@ -19,7 +19,7 @@ from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import PlacedVolume
-from deltalight.render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand
 
 FILL_RADIUS = 3  # texels of the reduced grid by which the change extends into a hole
 
@@ -89,7 +89,7 @@ class RelitLayers:
     cones: ConeFields
     grid: LowResGrid
     change: ChangeRatio
-    voxels: VoxelMipmap | None
+    voxels: VoxelMipmap | VoxelsOnDemand | None
     volume: PlacedVolume
     lights: LightBuffers
     reflection: moderngl.Texture | None = None
@@ -267,7 +267,7 @@ class DebugViews:
         self,
         code: moderngl.Texture,
         image: CameraImage,
-        voxels: VoxelMipmap,
+        voxels: VoxelMipmap | VoxelsOnDemand,
         volume: PlacedVolume,
         scene: Bindings,
     ) -> None:

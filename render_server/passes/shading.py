@@ -73,6 +73,11 @@ class DirectLight:
         self.spared = gpu.ctx.buffer(reserve=4) if self._spared is not None else None
 
     @property
+    def has_shadow_cones(self) -> bool:
+        """Whether cones through voxels give the objects' shadows."""
+        return "SHADOW_CONES" in self.defines
+
+    @property
     def bindings(self) -> dict[str, Binding]:
         """Its textures by GLSL name."""
         return {

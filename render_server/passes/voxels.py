@@ -1,7 +1,7 @@
 """Mipmaps of voxel volumes; sparse voxel sets, from surfels to filtered texels."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import moderngl
 import numpy as np
@@ -129,6 +129,27 @@ class VoxelMipmap:
     def release(self) -> None:
         """Frees the texture and the buffer."""
         release_all(self.texture, self.occupied)
+
+
+class VoxelsOnDemand:
+    """Level 0 of a mipmap for debug view `volume`: `draw` fills it when the view is looked at, and only once."""
+
+    def __init__(self, mipmap: VoxelMipmap, draw: Callable[[], None]) -> None:
+        self._mipmap = mipmap
+        self._draw: Callable[[], None] | None = draw
+
+    @property
+    def directions(self) -> int:
+        """Number of slabs."""
+        return self._mipmap.directions
+
+    @property
+    def texture(self) -> moderngl.Texture3D:
+        """The mipmap's texture, drawn."""
+        if self._draw is not None:
+            self._draw()
+            self._draw = None
+        return self._mipmap.texture
 
 
 class VoxelStore:

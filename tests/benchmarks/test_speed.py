@@ -279,7 +279,7 @@ MOST_ASKED = {  # dispatches and uploads in a frame on a GPU, while the camera m
     "exact:quality=live,volume_size=32": ((28, 34), (3, 6)),
     "exact:volume_size=32": ((58, 57), (8, 10)),
     "paper:volume_size=32": ((31, 31), (4, 7)),
-    "dlpv:volume_size=16": ((57, 55), (4, 8)),
+    "dlpv:volume_size=16": ((56, 54), (4, 8)),
 }
 
 

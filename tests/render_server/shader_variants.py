@@ -101,6 +101,8 @@ ON_GPUS = [  # with what the others lack: edges that are unmixed, objects that c
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume", "error"),
+    Case("dlpv", "model", "mirror"): ("volume",),
+    Case("aroof", "depth", "mirror"): ("volume",),
 }
 
 

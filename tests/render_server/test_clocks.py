@@ -30,7 +30,7 @@ STANDING = {
     "differential": LIGHT | VOXELS | {"shadow maps mu", "shadow maps rho", "voxelize far", "group surfels"},
     "dlpv": LIGHT | MAPS | VOXELS | CELLS,
     "dlpv-paper": LIGHT | MAPS | VOXELS | CELLS,
-    "aroof": LIGHT | MAPS | {"occlusion fields", "shown cells"},
+    "aroof": LIGHT | MAPS | {"occlusion fields"},
 }
 """Stages that a camera which moves through a given model leaves alone: all others but values follow `view`."""
 

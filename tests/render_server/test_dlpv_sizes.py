@@ -176,7 +176,7 @@ def readers(gpu: GpuContext, method: DlpvMethod, count: int) -> list[Any]:
     sizes = PrintedSizes.of(method)
     shown = ShownCells(gpu, sizes.indirect)
     injected = injected_sums(gpu, sizes.indirect)
-    shown.show(PerVolume([injected] * count))
+    assert shown.show(PerVolume([injected] * count)).texture.width == count * sizes.indirect
     read = [sizes.objects, sizes.indirect] + ([sizes.direct] if method.resolved_shadow == "lobe" else [])
     joins = [LpvJoin(gpu) for _ in read]
     for join, cells in zip(joins, read, strict=True):
