@@ -494,5 +494,5 @@ def test_run_takes_a_python_that_has_the_packages(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    assert said("gpu-check", "--out", "x") == f"{tmp_path}: -m deltalight.services.cli gpu-check --out x\n"
-    assert said("doctor", DELTALIGHT_PYTHON=str(python)) == f"{tmp_path}: -m deltalight.services.cli doctor\n"
+    assert said("gpu-check", "--out", "x") == f"{tmp_path}: -m deltalight.services gpu-check --out x\n"
+    assert said("doctor", DELTALIGHT_PYTHON=str(python)) == f"{tmp_path}: -m deltalight.services doctor\n"
