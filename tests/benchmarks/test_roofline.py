@@ -107,7 +107,10 @@ def test_a_frame_that_counts_is_the_same_and_grows_with_its_pixels(gpu: GpuConte
     assert (picture == plain).all()
     assert stages["upload"] == stages["readback"] == NOTHING
     assert min(stages[name].flops for name in ("cones", "direct light", "relit picture")) > 0
-    for name, error in {"real surface": 0.001, "change of light": 0.01}.items():  # each pixel, whatever it shows
+    for name, error in {
+        "real surface": 0.001,
+        "change of light": 0.01,
+    }.items():  # each pixel, whatever it shows
         assert larger[name].flops == pytest.approx(4 * stages[name].flops, rel=error), name
     assert larger["filter"].flops == pytest.approx(
         stages["filter"].flops, rel=0.01
