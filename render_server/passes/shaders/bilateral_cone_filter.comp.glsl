@@ -115,6 +115,6 @@ void main() {
     imageStore(irradiance_rho, texel, rho);
 #ifdef REAL
     imageStore(irradiance_mu, texel, mu);
-    if (is_mean && s.roughness < 0.0) store_specular(texel, vec4(0.0, 0.0, 0.0, 1.0));
+    if (is_mean) store_specular(texel, vec4(0.0, 0.0, 0.0, 1.0));   // nothing is kept where surfaces are smooth
 #endif
 }

@@ -63,11 +63,10 @@ void main() {
     ivec4 pixels = texelFetch(sample_pixels, texel, 0);
     if (pixels.x < -1) pixels.xy = -2 - pixels.xy;
     vec4 real = vec4(0.0), object = vec4(0.0);
-    vec4 real_normal = vec4(0.0);
-    vec3 object_normal = vec3(0.0);
+    vec3 real_normal = vec3(0.0), object_normal = vec3(0.0);
     if (pixels.x >= 0) {
         real = texelFetch(real_surface_position, pixels.xy, 0);
-        real_normal = texelFetch(real_surface_normal, pixels.xy, 0);
+        real_normal = texelFetch(real_surface_normal, pixels.xy, 0).xyz;
     }
     if (pixels.z >= 0) {
         ivec2 raster = raster_texel(pixels.zw);
@@ -75,14 +74,12 @@ void main() {
         object_normal = texelFetch(virtual_raster_normal, raster, 0).xyz;
     }
     bool due = is_due(texel);
-    LastTexels last = seen_last(object, object_normal, true), last_real = seen_last(real, real_normal.xyz, false);
+    LastTexels last = seen_last(object, object_normal, true), last_real = seen_last(real, real_normal, false);
     uint stale = due || is_unknown(real, last_real) ? STALE_REAL : 0u;
     if (object.w > 0.0 && (due || objects_moved || is_unknown(object, last))) stale |= STALE_OBJECT;
 #ifdef REUSES_IRRADIANCE
     keep_irradiance(texel, object.w > 0.0 && (stale & STALE_OBJECT) == 0u, last);
-    bool is_diffuse = real_normal.w < 0.0;
-    if (texelFetch(cone_reach, texel, 0).r != 0u)
-        keep_or_list_cones(texel, is_diffuse && (stale & STALE_REAL) == 0u, last_real);
+    if (texelFetch(cone_reach, texel, 0).r != 0u) keep_or_list_cones(texel, (stale & STALE_REAL) == 0u, last_real);
 #endif
     imageStore(stale_out, texel, uvec4(stale));
     imageStore(real_texels_out, texel, real);
