@@ -290,6 +290,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
         screen_space=settings.screen_space,
         mirror_gather="gather" if settings.reflections == "rays" else None,
         march=march_defines(settings),
+        lists_cones=True,
         is_everywhere=True,
         texel_m=lights.rho.real_texel_m,
     )

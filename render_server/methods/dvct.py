@@ -56,7 +56,7 @@ class ExactCones:
         self._real = TraceRealCones(gpu, size, defines, reuses=reuses)
         self._virtual = TraceVirtualCones(gpu, size, defines, reuses=reuses)
         if reuses:
-            fields.keep_virtual(gpu)
+            fields.keep_irradiance(gpu)
 
     def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
         """Returns the bindings that cones march with."""
@@ -146,6 +146,7 @@ def _shading(gpu: GpuContext, setup: Setup[DvctMethod], lights: LightBuffers) ->
         screen_space=settings.screen_space,
         mirror_gather="gather" if settings.reflections == "rays" else None,
         march=march_defines(settings),
+        lists_cones=True,
     )
     return SurfaceShading(gpu, size, setup.resolved, lights, direct, options)
 

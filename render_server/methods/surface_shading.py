@@ -89,6 +89,7 @@ class ShadingOptions:
             surfaces.
         march: defines of march.glsl, with which smooth objects look up in voxels what the picture does not show;
             None: they do not.
+        lists_cones: the reduced grid lists where cones are to be traced at real surfaces.
         is_everywhere: shades all pixels, whether or not objects seem to reach them.
         texel_m: size of a shadow map's texel at a point (m), by which objects are lifted against self-shadowing;
             None: that of the objects' maps.
@@ -99,6 +100,7 @@ class ShadingOptions:
     screen_space: bool = False
     mirror_gather: str | None = None
     march: Mapping[str, int] | None = None
+    lists_cones: bool = False
     is_everywhere: bool = False
     texel_m: Callable[[Points], float] | None = None
 
@@ -154,7 +156,12 @@ class SurfaceShading:
         self.reuses_light = options.tier.refresh_tiles > 0
         lists_quads = options.screen_space and options.tier.reflection_step > 1
         self.grid = LowResGrid(
-            gpu, size, resolved.cone_scale, shadow_defines=direct.defines, lists_quads=lists_quads
+            gpu,
+            size,
+            resolved.cone_scale,
+            shadow_defines=direct.defines,
+            lists_quads=lists_quads,
+            lists_cones=options.lists_cones,
         )
         self.cones = ConeFields(gpu, self.grid.size, remembers=self.reuses_light)
         self._history: LightHistory | None = None

@@ -20,7 +20,9 @@ class LowResGrid:
     -1 marks a block that shows none; -2 - pixel represents real surfaces that objects hide. `virtual_texels` lists
     the texels that show an object (count, then indices), `shown_pixels` the picture's pixels that do; `quads`, if
     `lists_quads`, one pixel that does of each 2 x 2. `reached_texels` lists those in which objects may change the
-    direct light of a pixel: `shadow_defines` say how they cast shadows (`DirectLight.defines`).
+    direct light of a pixel: `shadow_defines` say how they cast shadows (`DirectLight.defines`). With `lists_cones`,
+    `cone_texels` lists those in which they may change what cones gather at the real surface, and `cone_reach` is 1
+    there.
     """
 
     def __init__(
@@ -31,6 +33,7 @@ class LowResGrid:
         *,
         shadow_defines: Mapping[str, float | str],
         lists_quads: bool = False,
+        lists_cones: bool = False,
     ) -> None:
         self._gpu = gpu
         self.picture_size, self.scale = picture_size, scale
@@ -41,7 +44,13 @@ class LowResGrid:
         )
         self.shown_pixels = gpu.ctx.buffer(bytes(4 * (1 + math.prod(picture_size))))
         self.quads = gpu.ctx.buffer(bytes(self.shown_pixels.size)) if lists_quads else None
-        self._kernel = Kernel(gpu, "low_res_grid", **({"QUADS": 1} if lists_quads else {}), **shadow_defines)
+        self.cone_reach, self.cone_texels = None, None
+        if lists_cones:
+            self.cone_reach = texture_2d(gpu, self.size, 1, "u1")
+            self.cone_texels = gpu.ctx.buffer(bytes(4 * (1 + self.texel_count)))
+        defines = {"QUADS": lists_quads, "CONES": lists_cones}
+        wanted = {name: 1 for name, is_wanted in defines.items() if is_wanted}
+        self._kernel = Kernel(gpu, "low_res_grid", **wanted, **shadow_defines)
 
     @property
     def texel_count(self) -> int:
@@ -51,7 +60,12 @@ class LowResGrid:
     @property
     def bindings(self) -> dict[str, Binding]:
         """The bindings of low_res_grid.glsl and upsample.glsl."""
-        return {"sample_pixels": self.pixels, "low_resolution_size": self.size, "scale": self.scale}
+        return {
+            "sample_pixels": self.pixels,
+            "cone_reach": self.cone_reach,
+            "low_resolution_size": self.size,
+            "scale": self.scale,
+        }
 
     def empty_list(self, texels: moderngl.Buffer) -> None:
         """Clears a list of texels (count, then indices), and makes room for all of the grid."""
@@ -65,14 +79,17 @@ class LowResGrid:
         self.empty_list(self.virtual_texels)
         self.empty_list(self.reached_texels)
         self._gpu.clear_start(self.shown_pixels, LIST_HEADER_BYTES)
-        quads: dict[str, Binding] = {}
+        lists: dict[str, Binding] = {}
         if self.quads is not None:
             self._gpu.clear_start(self.quads, LIST_HEADER_BYTES)
-            quads["Quads"] = self.quads
+            lists["Quads"] = self.quads
+        if self.cone_texels is not None:
+            self.empty_list(self.cone_texels)
+            lists |= {"ConeTexels": self.cone_texels, "cone_reach_out": self.cone_reach}
         self._kernel.run(
             self.size,
             scene,
-            quads,
+            lists,
             sample_pixels_out=self.pixels,
             Texels=self.virtual_texels,
             ShownPixels=self.shown_pixels,
@@ -83,15 +100,41 @@ class LowResGrid:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        lists = self.virtual_texels, self.reached_texels, self.shown_pixels, self.quads
-        release_all(self.pixels, *lists, self._kernel)
+        lists = self.virtual_texels, self.reached_texels, self.shown_pixels, self.quads, self.cone_texels
+        release_all(self.pixels, self.cone_reach, *lists, self._kernel)
+
+
+class KeptIrradiance:
+    """Irradiance of cones as far as the last frame knows it: without (mu) and with the objects, and at objects.
+
+    That at objects is 0 where it is not known (a: 1 where it is). `stale_texels` lists the texels at whose real
+    surface it is not known.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.mu, self.rho, self.virtual = (texture_2d(gpu, size, 4, "f2") for _ in range(3))
+        self.stale_texels = gpu.ctx.buffer(reserve=4)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """What stale_texels.comp.glsl fills in."""
+        return {
+            "kept_mu": self.mu,
+            "kept_rho": self.rho,
+            "kept_irradiance": self.virtual,
+            "StaleCones": self.stale_texels,
+        }
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.mu, self.rho, self.virtual, self.stale_texels)
 
 
 class ConeFields:
     """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone).
 
-    With `remembers`, the irradiance of the last frame too. `kept_virtual` is that at objects as far as the last frame
-    knows it (a: 1), and 0 elsewhere; None: nothing is kept there.
+    With `remembers`, the irradiance of the last frame too. `kept` is what of it serves for this one; None: nothing is
+    kept.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], *, remembers: bool = False) -> None:
@@ -101,14 +144,14 @@ class ConeFields:
         self.specular_rho = texture_2d(gpu, size, 4, "f2")
         self.virtual = texture_2d(gpu, size, 4, "f2")
         self.virtual_specular = texture_2d(gpu, size, 4, "f2")
-        self.kept_virtual: moderngl.Texture | None = None
+        self.kept: KeptIrradiance | None = None
         self.last: tuple[moderngl.Texture, ...] = ()
         if remembers:
             self.last = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(3))
 
-    def keep_virtual(self, gpu: GpuContext) -> None:
-        """Lets the irradiance at objects that the last frame knows be kept."""
-        self.kept_virtual = texture_2d(gpu, self.virtual.size, 4, "f2")
+    def keep_irradiance(self, gpu: GpuContext) -> None:
+        """Lets the irradiance that the last frame knows be kept."""
+        self.kept = KeptIrradiance(gpu, self.mu.size)
 
     def remember(self) -> dict[str, Binding]:
         """Makes the irradiance the last frame's, and returns its bindings."""
@@ -118,8 +161,8 @@ class ConeFields:
             "last_cone_mu": now[0],
             "last_cone_rho": now[1],
             "last_irradiance": now[2],
-            "kept_irradiance": self.kept_virtual,
-            "REUSES_IRRADIANCE": self.kept_virtual is not None,
+            "REUSES_IRRADIANCE": self.kept is not None,
+            **({} if self.kept is None else self.kept.bindings),
         }
 
     def release(self) -> None:
@@ -132,7 +175,7 @@ class ConeFields:
             self.virtual,
             self.virtual_specular,
         )
-        release_all(*of_frame, *self.last, self.kept_virtual)
+        release_all(*of_frame, *self.last, self.kept)
 
 
 def reuse_define(reuses: bool) -> dict[str, int]:
@@ -143,52 +186,56 @@ def reuse_define(reuses: bool) -> dict[str, int]:
 class TraceRealCones:
     """Traces the cones of the exact operator at real surfaces, through mu and rho (docs/method.md 3 and 4.5).
 
-    `size` is that of the reduced grid, `defines` are those of march.glsl. With `reuses`, only where the scene's
-    `stale_texels` say so. `refract` bends those that meet transparent objects.
+    `size` is that of the reduced grid, which lists cones; `defines` are those of march.glsl. With `reuses`, only
+    where the light that `fields` keep of the last frame does not serve. `refract` bends those that meet transparent
+    objects.
     """
 
     def __init__(
         self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
     ) -> None:
         self._gpu, self._defines = gpu, defines
-        self._mu, self._rho = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
-        self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
+        self._own = None if reuses else tuple(texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._trace = Kernel(gpu, "trace_cones", REAL=1, **defines)
         self._filter = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
         self._refract: RefractCones | None = None  # made when objects are transparent
-        self._texels = gpu.ctx.buffer(reserve=4)
 
     def run(
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
         """Traces E_mu, E_rho and the specular cones; filters E so that where both are equal they stay equal."""
-        grid.empty_list(self._texels)
-        traced: Bindings = {
-            "irradiance_mu": self._mu,
-            "irradiance_rho": self._rho,
-            "specular_mu": fields.specular_mu,
-            "specular_rho": fields.specular_rho,
-            "Texels": self._texels,
-            **grid.bindings,
-        }
-        self._select.run(grid.size, traced, scene)
+        traced = self._traced(fields, grid)
+        specular: Bindings = {"specular_mu": fields.specular_mu, "specular_rho": fields.specular_rho}
         self._trace.run(
             (list_threads(self._gpu, grid.texel_count),),
-            traced,
+            specular,
+            grid.bindings,
             scene,
+            irradiance_mu=traced["traced_mu"],
+            irradiance_rho=traced["traced_rho"],
+            Texels=traced["Texels"],
             mipmap_mu=mu.texture,
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
         self._filter.run(
             grid.size,
+            traced,
+            specular,
             grid.bindings,
             scene,
-            traced_mu=self._mu,
-            traced_rho=self._rho,
             irradiance_mu=fields.mu,
             irradiance_rho=fields.rho,
         )
+
+    def _traced(self, fields: ConeFields, grid: LowResGrid) -> dict[str, Binding]:
+        """Returns what cones are traced into, and the list of texels from which."""
+        if self._own is not None:
+            mu, rho = self._own
+            return {"traced_mu": mu, "traced_rho": rho, "Texels": grid.cone_texels}
+        kept = fields.kept
+        assert kept is not None
+        return {"traced_mu": kept.mu, "traced_rho": kept.rho, "Texels": kept.stale_texels}
 
     def refract(
         self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, objects: ObjectBvh, scene: Bindings
@@ -199,12 +246,12 @@ class TraceRealCones:
         """
         if self._refract is None:
             self._refract = RefractCones(self._gpu, grid.size, self._defines)
-        lit = {**scene, "Texels": self._texels, "traced_mu": self._mu, "traced_rho": self._rho}
+        lit = {**scene, **self._traced(fields, grid)}
         return self._refract.run(fields, grid, rho, objects, lit)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._mu, self._rho, self._select, self._trace, self._filter, self._refract, self._texels)
+        release_all(*(self._own or ()), self._trace, self._filter, self._refract)
 
 
 class RefractCones:
@@ -282,8 +329,8 @@ class TraceVirtualCones:
     def _begin(self, fields: ConeFields) -> moderngl.Texture:
         """Returns the texture to trace into, which holds what is kept of the last frame and 0 elsewhere."""
         if self._irradiance is None or self._target is None:
-            assert fields.kept_virtual is not None
-            return fields.kept_virtual
+            assert fields.kept is not None
+            return fields.kept.virtual
         self._target.use()
         self._target.clear()
         return self._irradiance

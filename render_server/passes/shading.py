@@ -210,6 +210,8 @@ class LightHistory:
         if direct.spared is not None:
             grid.empty_list(direct.spared)
             apart["Spared"] = direct.spared
+        if self._cones.kept is not None:
+            grid.empty_list(self._cones.kept.stale_texels)
         self._reproject.run(
             (list_threads(self._gpu, grid.texel_count),),
             shared,

@@ -1,6 +1,8 @@
 // Four neighbouring texels each trace a quarter of the cones (trace_cones); their mean covers all of them. A tent
 // over 3 x 3 texels weights the four quarters equally; texels whose surface does not continue this one's are left
-// out.
+// out. REAL: where nothing is traced, objects have no influence, and light is the environment's.
+#include "common/environment.glsl"
+#include "common/brdf.glsl"
 #include "common/low_res_grid.glsl"
 #include "common/continuation.glsl"
 
@@ -13,9 +15,14 @@ uniform sampler2D traced_change;   // of what was traced, by transparent objects
 #endif
 layout(rgba16f) writeonly uniform image2D irradiance_rho;
 #ifdef REAL
-uniform sampler2D traced_mu;                        // a: 1 where traced
+uniform usampler2D cone_reach;   // 1 where cones are traced, or the last frame's light is kept
+uniform sampler2D traced_mu;
 #pragma texels rgba16f traced_mu
 layout(rgba16f) writeonly uniform image2D irradiance_mu;
+#ifndef BENT
+layout(rgba16f) writeonly uniform image2D specular_mu;
+layout(rgba16f) writeonly uniform image2D specular_rho;
+#endif
 #endif
 #ifdef REUSES
 uniform usampler2D stale_texels;   // the others hold means already
@@ -35,7 +42,7 @@ vec4 rho_of(ivec2 texel) {
 bool traced(ivec2 texel) {
     if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, low_resolution_size))) return false;
 #ifdef REAL
-    return texelFetch(traced_mu, texel, 0).a > 0.0;
+    return texelFetch(cone_reach, texel, 0).r != 0u;
 #else
     return texelFetch(traced_rho, texel, 0).a > 0.0;
 #endif
@@ -60,9 +67,36 @@ void average(ivec2 texel, inout vec3 mu, inout vec3 rho) {
     rho /= total;
 }
 
+#ifdef REAL
+// Specular cones where none was traced.
+void store_specular(ivec2 texel, vec4 c) {
+#ifndef BENT
+    imageStore(specular_mu, texel, c);
+    imageStore(specular_rho, texel, c);
+#endif
+}
+
+void store_environment(ivec2 texel, SurfacePoint s) {
+    vec3 e = s.present ? environment_irradiance(s.normal) : vec3(0.0);
+    vec3 c = vec3(0.0);
+    if (s.present && s.roughness >= 0.0)
+        c = environment(reflect(normalize(s.position - camera_position), s.normal), specular_half_angle(s.roughness));
+    imageStore(irradiance_mu, texel, vec4(e, 0.0));
+    imageStore(irradiance_rho, texel, vec4(e, 0.0));
+    store_specular(texel, vec4(c, 0.0));
+}
+#endif
+
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
+#ifdef REAL
+    SurfacePoint s = surface_point(texel);
+    if (!traced(texel)) {
+        store_environment(texel, s);
+        return;
+    }
+#endif
     vec4 rho = rho_of(texel), mu = vec4(0.0);
 #ifdef REAL
     mu = texelFetch(traced_mu, texel, 0);
@@ -81,5 +115,6 @@ void main() {
     imageStore(irradiance_rho, texel, rho);
 #ifdef REAL
     imageStore(irradiance_mu, texel, mu);
+    if (is_mean) store_specular(texel, vec4(0.0, 0.0, 0.0, 1.0));   // nothing is kept where surfaces are smooth
 #endif
 }

@@ -1,6 +1,7 @@
 // For each texel of the reduced grid, the picture pixel nearest to its centre that shows a real surface with depth,
 // and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel. Lists the texels that show
-// an object, and those in which objects may change the direct light of a pixel.
+// an object, and those in which objects may change the direct light of a pixel. CONES: also those from whose real surface cones are
+// to be traced; from the others, objects change nothing.
 #include "common/light_reach.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
@@ -74,6 +75,25 @@ void append_shown(ivec2 texel, uint count) {
     }
 }
 
+#ifdef CONES
+layout(r8ui) writeonly uniform uimage2D cone_reach_out;   // 1 in the texels listed
+layout(std430) buffer ConeTexels { uint traced_count; uint traced_texels[]; };   // as Texels
+uniform bool hidden_too;   // as in low_res_grid.glsl
+
+bool cones_reach(ivec2 pixel) {
+    vec3 position = texelFetch(real_surface_position, pixel, 0).xyz;
+    enter_volume(position);
+    return is_in_lit_area(pixel) || volume_fade(volume_coordinate(position)) > 0.0 || object_may_shadow(position, 0.0, true);
+}
+
+void append_traced(ivec2 texel, ivec2 real, int width) {
+    if (hidden_too && real.x < -1) real = -2 - real;
+    bool reached = real.x >= 0 && cones_reach(real);
+    imageStore(cone_reach_out, texel, uvec4(reached));
+    if (reached) traced_texels[atomicAdd(traced_count, 1u)] = uint(texel.y * width + texel.x);
+}
+#endif
+
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     ivec2 low = (picture_pixels + scale - 1) / scale;
@@ -103,4 +123,7 @@ void main() {
 #endif
     append_shown(texel, shown_here);
     append_reached(texel, low.x);
+#ifdef CONES
+    append_traced(texel, best.xy, low.x);
+#endif
 }

@@ -108,7 +108,7 @@ void refract_cones(ivec2 texel) {
     imageStore(cone_change, texel, vec4(change_of_cones(s, cones_of(texel)), 0.0));
 }
 
-// The texels that select_cone_texels listed.
+// The texels that low_res_grid listed.
 void main() {
     uint i = first_item();
     if (i < listed_count()) do refract_cones(texel_of_index(texels[i], low_resolution_size.x));

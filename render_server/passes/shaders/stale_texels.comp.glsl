@@ -1,7 +1,7 @@
 // Where cones and caustics must be computed at each texel of the reduced grid: where the last frame did not see the
 // texel's surface, on objects that moved; and in turn, one tile in `turns`, so that errors of resampling do not add up. Keeps the points that
-// the next frame looks up. With REUSES_IRRADIANCE, fills in the irradiance of cones at objects (a: 1 where it is known) where it
-// need not be computed.
+// the next frame looks up. With REUSES_IRRADIANCE, fills in the irradiance of cones where it need not be computed (at objects, a: 1
+// where it is known), and lists the texels from whose real surface they are to be traced.
 #include "common/geometry.glsl"
 #include "common/reprojection.glsl"
 #include "common/last_texels.glsl"
@@ -15,8 +15,32 @@ layout(rgba32f) writeonly uniform image2D object_texels_out;
 uniform bool objects_moved;
 #pragma switch REUSES_IRRADIANCE
 #ifdef REUSES_IRRADIANCE
+uniform usampler2D cone_reach;   // 1 where cones are to gather light at real surfaces
+uniform sampler2D last_cone_mu;  // a: 1 where they did
+uniform sampler2D last_cone_rho;
 uniform sampler2D last_irradiance;
+layout(rgba16f) writeonly uniform image2D kept_mu;
+layout(rgba16f) writeonly uniform image2D kept_rho;
 layout(rgba16f) writeonly uniform image2D kept_irradiance;
+layout(std430) buffer StaleCones { uint traced_count; uint traced_texels[]; };   // as Texels
+
+// Of a real surface that cones are to reach; `known`: if the last frame's texels have all of its light.
+void keep_or_list_cones(ivec2 texel, bool known, LastTexels last) {
+    vec4 mu = vec4(0.0), rho = vec4(0.0);
+    for (int j = 0; j < (known ? 4 : 0); ++j) {
+        if (last.weights[j] == 0.0) continue;
+        ivec2 from = last.base + ivec2(j & 1, j >> 1);
+        vec4 light = texelFetch(last_cone_mu, from, 0);
+        known = light.a >= 0.5;
+        mu += last.weights[j] * light;
+        rho += last.weights[j] * texelFetch(last_cone_rho, from, 0);
+    }
+    if (known) {
+        imageStore(kept_mu, texel, vec4(mu.rgb, 1.0));
+        imageStore(kept_rho, texel, rho);
+    } else
+        traced_texels[atomicAdd(traced_count, 1u)] = uint(texel.y * textureSize(sample_pixels, 0).x + texel.x);
+}
 
 void keep_irradiance(ivec2 texel, bool known, LastTexels last) {
     vec3 sum = vec3(0.0);
@@ -50,11 +74,12 @@ void main() {
         object_normal = texelFetch(virtual_raster_normal, raster, 0).xyz;
     }
     bool due = is_due(texel);
-    LastTexels last = seen_last(object, object_normal, true);
-    uint stale = due || is_unknown(real, seen_last(real, real_normal, false)) ? STALE_REAL : 0u;
+    LastTexels last = seen_last(object, object_normal, true), last_real = seen_last(real, real_normal, false);
+    uint stale = due || is_unknown(real, last_real) ? STALE_REAL : 0u;
     if (object.w > 0.0 && (due || objects_moved || is_unknown(object, last))) stale |= STALE_OBJECT;
 #ifdef REUSES_IRRADIANCE
     keep_irradiance(texel, object.w > 0.0 && (stale & STALE_OBJECT) == 0u, last);
+    if (texelFetch(cone_reach, texel, 0).r != 0u) keep_or_list_cones(texel, (stale & STALE_REAL) == 0u, last_real);
 #endif
     imageStore(stale_out, texel, uvec4(stale));
     imageStore(real_texels_out, texel, real);

@@ -131,7 +131,7 @@ void trace(ivec2 texel) {
     imageStore(specular_rho, texel, vec4(specular.rho, 1.0));
 }
 
-// The texels that select_cone_texels or low_res_grid listed.
+// The texels that low_res_grid or stale_texels listed.
 void main() {
     uint i = first_item();
     if (i < listed_count()) do trace(texel_of_index(texels[i], low_resolution_size.x));
