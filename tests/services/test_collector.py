@@ -1,6 +1,7 @@
 """What a viewer writes of the composites that it receives."""
 
 import resource
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,13 +43,18 @@ def test_a_video_is_written_however_fast_or_slow_pictures_came(tmp_path: Path, a
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """The system refuses to let files grow further, as a full disk does."""
+    """The system refuses to let files grow further, as a full disk does.
+
+    Python ignores the signal that comes with it; LLVM, where it was loaded, ends the process by it.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler or signal.SIG_IGN)
 
 
 def test_a_line_that_the_disk_refuses_is_not_half_written(tmp_path: Path) -> None:
