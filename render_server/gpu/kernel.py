@@ -464,8 +464,8 @@ class RasterKernel(Shader):
 
 
 def _attachments(target: moderngl.Framebuffer) -> dict[str, object]:
-    items = [*target.color_attachments, target.depth_attachment]
-    return {f"attachment {number}": item for number, item in enumerate(items)}
+    items = enumerate([*target.color_attachments, target.depth_attachment])
+    return {f"attachment {number}": item for number, item in items}
 
 
 def merged(own: Bindings, shared: Sequence[Bindings]) -> dict[str, Binding]:
@@ -485,9 +485,7 @@ def label_of(name: str | Path, defines: Mapping[str, float | str]) -> str:
 
 def common_kernel(gpu: GpuContext, name: str) -> Kernel:
     """The kernel that all share, compiled on first use; it ends with the context."""
-    if name not in gpu.common:
-        gpu.common[name] = Kernel(gpu, name)
-    kernel = gpu.common[name]
+    kernel = gpu.common.get(name) or gpu.common.setdefault(name, Kernel(gpu, name))
     assert isinstance(kernel, Kernel)
     return kernel
 

@@ -36,16 +36,19 @@ from deltalight.render_server.methods.method import (
     resolve_joint_maps,
 )
 from deltalight.render_server.methods.surface_shading import (
-    SURFEL_SHADOW_SAMPLES,
     Layers,
     MethodStages,
     ShadingOptions,
     SurfaceShading,
     shading_stages,
-    surfel_scene,
 )
 from deltalight.render_server.methods.volume_placement import Placements, only_one, volume_placements
-from deltalight.render_server.methods.voxel_sets import FAR_SIZE, VoxelSet
+from deltalight.render_server.methods.voxel_sets import (
+    FAR_SIZE,
+    SURFEL_SHADOW_SAMPLES,
+    VoxelSet,
+    surfel_scene,
+)
 from deltalight.render_server.methods.voxel_volumes import DirectionalVoxels, joint_voxels, placed_volume
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones

@@ -22,11 +22,10 @@ from deltalight.render_server.methods.surface_shading import (
     ShadingOptions,
     SurfaceShading,
     shading_stages,
-    surfel_scene,
 )
 from deltalight.render_server.methods.volume_lights import VolumeLights, volume_light_stages
 from deltalight.render_server.methods.volume_placement import Placements
-from deltalight.render_server.methods.voxel_sets import VoxelSet, make_room, voxel_placements
+from deltalight.render_server.methods.voxel_sets import VoxelSet, make_room, surfel_scene, voxel_placements
 from deltalight.render_server.methods.voxel_volumes import joint_voxels, placed_volume
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceConesPaper
 from deltalight.render_server.passes.lights import LightBuffers

@@ -17,7 +17,7 @@ from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.cast_beams import casts_caustics
 from deltalight.render_server.methods.light_maps import LitScene
 from deltalight.render_server.methods.per_volume import ForEachVolume, PerVolume, volume_pool
-from deltalight.render_server.methods.surface_shading import SURFEL_SHADOW_SAMPLES, surfel_scene
+from deltalight.render_server.methods.voxel_sets import SURFEL_SHADOW_SAMPLES, surfel_scene
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import (
     LpvCoverFaces,

@@ -1,6 +1,5 @@
 """Shades the visible surfaces by stages that methods share: direct light, cones, reflections (docs/method.md 3)."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -22,7 +21,6 @@ from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.measured_views import SURFEL_PIXELS
 from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.reflections import (
     RAY_ROUGHNESS,
@@ -33,12 +31,8 @@ from deltalight.render_server.passes.reflections import (
 )
 from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
 from deltalight.render_server.passes.volumes import PlacedVolume
-from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand
 from deltalight.render_server.view import CameraView, Rectangle
-
-SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
-DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
 
 
 def no_voxels(_: object) -> None:
@@ -48,23 +42,6 @@ def no_voxels(_: object) -> None:
 def no_bindings(_: object) -> dict[str, Binding]:
     """Returns no bindings, for methods that march no cones."""
     return {}
-
-
-def surfel_scene(
-    seen: Observation, lights: LightBuffers, albedo: AlbedoTexture, *, measured: bool = True
-) -> dict[str, Binding]:
-    """Returns the bindings for lighting real surfels; without `measured`, none counts as seen by the camera."""
-    return {
-        "SEVERAL_VIEWS": False,
-        **seen.bindings,
-        **lights.bindings,
-        **albedo.bindings,
-        "shadow_samples": SURFEL_SHADOW_SAMPLES,
-        "bias_real": seen.scan.bias_m,
-        "bias_virtual": seen.scan.bias_m,
-        "depth_tolerance": DEPTH_TOLERANCE if measured else -1.0,
-        "picture_lod": math.log2(SURFEL_PIXELS),
-    }
 
 
 def reflects_screen(objects: GeometryState) -> bool:

@@ -1,18 +1,21 @@
-"""Sparse voxel sets of one geometry each, and how many of them the memory budget allows (docs/method.md 4.2)."""
+"""Sparse voxel sets of one geometry each, how many the memory allows, and what lights them (docs/method.md 4.2)."""
 
 import math
 from collections.abc import Sequence
 
 from deltalight.protocol.scene_method import DvctMethod
-from deltalight.render_server.frame import FrameResources
+from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.method import VOLUME_STEP, Setup
 from deltalight.render_server.methods.volume_placement import Placements, volume_placements
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.measured_views import SURFEL_PIXELS
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
-from deltalight.render_server.passes.voxel_light import SurfelGroups
+from deltalight.render_server.passes.voxel_light import AlbedoTexture, SurfelGroups
 from deltalight.render_server.passes.voxelize import Meshes, Voxelize
 from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
@@ -25,6 +28,8 @@ from deltalight.render_server.passes.voxels import (
 )
 
 FAR_SIZE = 32  # voxels an edge of the coarse volume beyond
+SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
+DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
 
 
 def sets_memory_mb(size: int, count: int, directions: int = DIRECTIONS) -> int:
@@ -127,3 +132,20 @@ def voxel_placements(
         return affordable_size(size, count, settings.memory_budget_mb, g.gpu, directions)
 
     return volume_placements(g, s, size_of, settings.volume_edge_m, settings.tier)
+
+
+def surfel_scene(
+    seen: Observation, lights: LightBuffers, albedo: AlbedoTexture, *, measured: bool = True
+) -> dict[str, Binding]:
+    """Returns the bindings for lighting real surfels; without `measured`, none counts as seen by the camera."""
+    return {
+        "SEVERAL_VIEWS": False,
+        **seen.bindings,
+        **lights.bindings,
+        **albedo.bindings,
+        "shadow_samples": SURFEL_SHADOW_SAMPLES,
+        "bias_real": seen.scan.bias_m,
+        "bias_virtual": seen.scan.bias_m,
+        "depth_tolerance": DEPTH_TOLERANCE if measured else -1.0,
+        "picture_lod": math.log2(SURFEL_PIXELS),
+    }

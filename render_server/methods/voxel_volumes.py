@@ -23,9 +23,14 @@ from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.cast_beams import casts_caustics
 from deltalight.render_server.methods.light_maps import LitScene
 from deltalight.render_server.methods.method import march_defines
-from deltalight.render_server.methods.surface_shading import SURFEL_SHADOW_SAMPLES, surfel_scene
 from deltalight.render_server.methods.volume_placement import Placements
-from deltalight.render_server.methods.voxel_sets import FAR_SIZE, VoxelSet, make_room
+from deltalight.render_server.methods.voxel_sets import (
+    FAR_SIZE,
+    SURFEL_SHADOW_SAMPLES,
+    VoxelSet,
+    make_room,
+    surfel_scene,
+)
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.volumes import (
     FarVolumeBlock,
