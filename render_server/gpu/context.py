@@ -57,7 +57,7 @@ NO_ERROR, OUT_OF_MEMORY = "GL_NO_ERROR", "GL_OUT_OF_MEMORY"  # as moderngl names
 OBJECT_KINDS = ("Buffer", "Texture", "Sampler", "Program", "Shader", "Framebuffer", "VertexArray", "Query")
 COPY_WRITE_BUFFER, R32UI, RED_INTEGER, UNSIGNED_INT = 0x8F37, 0x8236, 0x8D94, 0x1405  # OpenGL's numbers
 MOST_GROUP_COUNTERS = 256
-HIGHEST_NAME = 8192  # drivers name objects from 1 on and use freed names again; some hundreds live at a time
+HIGHEST_NAME = 8192  # drivers that use freed names again stay below: some hundreds of objects live at a time
 
 
 class GpuMemoryError(DeltalightError):
@@ -315,17 +315,35 @@ def count_gl_objects() -> dict[str, int]:
     Raises:
         DeltalightError: EGL knows no such function.
     """
-    return {kind: sum(map(_is_one(kind), range(1, HIGHEST_NAME))) for kind in OBJECT_KINDS}
+    return {kind: _count(kind) for kind in OBJECT_KINDS}
 
 
-def _is_one(kind: str) -> Callable[[int], int]:
-    """Whether a name is that of an object of this kind."""
+def _count(kind: str) -> int:
+    """Counts objects up to the newest name: Mesa counts upwards, and does not use freed names again."""
+    is_one = _gl_function(f"glIs{kind}", ctypes.c_ubyte, ctypes.c_uint)
+    newest = _new_name("Program" if kind == "Shader" else kind)  # which share their names
+    return sum(map(is_one, range(1, max(HIGHEST_NAME, newest) + 1)))
+
+
+def _new_name(kind: str) -> int:
+    """Makes an object of this kind and frees it; returns its name."""
+    if kind == "Program":
+        name = int(_gl_function("glCreateProgram", ctypes.c_uint)())
+        _gl_function("glDeleteProgram", None, ctypes.c_uint)(name)
+        return name
+    names, plural = (ctypes.c_uint * 1)(), "Queries" if kind == "Query" else f"{kind}s"
+    for verb in ("Gen", "Delete"):
+        _gl_function(f"gl{verb}{plural}", None, ctypes.c_int, ctypes.POINTER(ctypes.c_uint))(1, names)
+    return names[0]
+
+
+def _gl_function(name: str, result: Any, *arguments: Any) -> Callable[..., Any]:  # noqa: ANN401 (types of ctypes)
     egl = ctypes.CDLL("libEGL.so.1")
     egl.eglGetProcAddress.restype = ctypes.c_void_p
-    address = egl.eglGetProcAddress(f"glIs{kind}".encode())
+    address = egl.eglGetProcAddress(name.encode())
     if address is None:
-        raise DeltalightError(f"This driver has no glIs{kind}; update the graphics driver.")
-    found: Callable[[int], int] = ctypes.CFUNCTYPE(ctypes.c_ubyte, ctypes.c_uint)(address)
+        raise DeltalightError(f"This driver has no {name}; update the graphics driver.")
+    found: Callable[..., Any] = ctypes.CFUNCTYPE(result, *arguments)(address)
     return found
 
 

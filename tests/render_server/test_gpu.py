@@ -4,7 +4,7 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,11 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_method import DifferentialMethod, DvctMethod
 from deltalight.render_server.gpu import shader_source as shader_text
 from deltalight.render_server.gpu.context import (
+    HIGHEST_NAME,
     NEEDED,
     GpuContext,
     check_limits,
+    count_gl_objects,
     explain_context_failure,
     is_software_renderer,
     limits_of,
@@ -453,3 +455,22 @@ def test_shaders_lay_out_and_look_up_the_mipmap_so(
         assert values == pytest.approx(level * 8 + direction + 1, abs=1e-3), (level, direction)
     for item in (volume, mipmap, place_buffer, found):
         item.release()
+
+
+@pytest.mark.parametrize("kind", ["Buffer", "Texture", "Program"])
+def test_objects_are_counted_however_many_were_made_before(gpu: GpuContext, kind: str) -> None:
+    """Mesa does not use freed names again."""
+    make: dict[str, Callable[[], Any]] = {
+        "Buffer": lambda: gpu.ctx.buffer(reserve=4),
+        "Texture": lambda: gpu.ctx.texture((1, 1), 1),
+        "Program": lambda: gpu.ctx.compute_shader(
+            "#version 430\nlayout(local_size_x = 1) in; void main() {}"
+        ),
+    }
+    for _ in range(HIGHEST_NAME if kind != "Program" else 1):
+        make[kind]().release()
+    before = count_gl_objects()[kind]
+    made = make[kind]()
+    assert count_gl_objects()[kind] == before + 1
+    made.release()
+    assert count_gl_objects()[kind] == before
