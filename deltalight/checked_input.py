@@ -7,6 +7,7 @@ from typing import SupportsIndex
 import numpy as np
 
 from deltalight.protocol.array_checks import kind_of, misfit
+from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
 from deltalight.protocol.method_names import require_method
@@ -75,7 +76,7 @@ def _require_frame(frame: object) -> ViewFrame:
         raise DeltalightError(
             f"A frame is needed and {kind_of(frame)} was given; take one of `deltalight.open(...)`."
         )
-    size = (frame.camera.height, frame.camera.width)
+    size = _size(frame.camera, "camera")
     _require_array(frame.color, "color", np.uint8, (*size, 3))
     if frame.response is not None:
         _require_array(frame.response, "response", np.floating, (256, 3))
@@ -91,7 +92,7 @@ def _require_depth(depth: object) -> None:
         return
     if not isinstance(depth, DepthImage):
         raise DeltalightError(f"The frame's depth is {kind_of(depth)}; give a DepthImage.")
-    size = (depth.camera.height, depth.camera.width)
+    size = _size(depth.camera, "depth.camera")
     _require_array(depth.depth_m, "depth.depth_m", np.floating, size)
     _require_array(depth.valid, "depth.valid", np.bool_, size)
 
@@ -102,6 +103,12 @@ def _require_pose(pose: object) -> None:
     if not isinstance(pose, BoardPose):
         raise DeltalightError(f"The frame's pose is {kind_of(pose)}; write `BoardPose(world_from_camera)`.")
     require_rigid(pose.world_from_camera, "the frame's pose")
+
+
+def _size(camera: object, name: str) -> tuple[int, int]:
+    if not isinstance(camera, CameraModel):
+        raise DeltalightError(f"The frame's {name} is {kind_of(camera)}; give a CameraModel.")
+    return camera.height, camera.width
 
 
 def _require_array(array: object, name: str, kind: type[np.generic], shape: tuple[int, ...]) -> None:

@@ -246,6 +246,7 @@ def test_frames_of_a_programs_own_are_checked(take: dl.Take, scene: dl.Scene) ->
             r"color must be an array of uint8 \(480, 640, 3\), and is float32": replace(
                 frame, color=frame.color.astype(np.float32)
             ),
+            "frame's camera is None; give a CameraModel": replace(frame, camera=None),  # type: ignore[arg-type]
             r"uint8 \(480, 640, 3\), and is uint8 \(480, 640\)": replace(frame, color=frame.color[..., 0]),
             r"and is uint8 \(100, 100, 3\); convert it": replace(frame, color=frame.color[:100, :100]),
             "the frame's pose is not a rigid transform": replace(frame, pose=BoardPose(pose * np.nan)),

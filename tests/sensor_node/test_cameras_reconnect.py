@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -136,6 +137,11 @@ BLACK, FLAT = np.zeros((6, 8, 3), np.uint8), np.zeros((6, 8), np.float32)
             BLACK,
             DepthImage(FLAT[1:], FLAT > 0, CAMERA),
             "depth of test must be an array of float32 (6, 8), and",
+        ),
+        (
+            BLACK,
+            DepthImage(FLAT, FLAT > 0, cast(Any, 3)),
+            "lens of the depth of test is `int`, not a CameraModel",
         ),
         (BLACK, DepthImage(FLAT, FLAT, CAMERA), "mask of depth of test must be an array of bool (6, 8), and"),
     ],
