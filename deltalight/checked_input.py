@@ -6,6 +6,8 @@ from typing import SupportsIndex
 
 import numpy as np
 
+from deltalight.protocol.array_checks import kind_of, misfit
+from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
 from deltalight.protocol.method_names import require_method
@@ -22,7 +24,7 @@ def require_method_name(method: object) -> str:
     """
     if not isinstance(method, str):
         raise DeltalightError(
-            f'The name of a method is needed and {_kind(method)} was given; write `method="exact"`, for example.'
+            f'The name of a method is needed and {kind_of(method)} was given; write `method="exact"`, for example.'
         )
     return require_method(method)
 
@@ -51,7 +53,7 @@ def require_document(scene: object) -> SceneDocument:
     document = scene.document if isinstance(scene, Scene) else scene
     if not isinstance(document, SceneDocument):
         raise DeltalightError(
-            f"A scene is needed and {_kind(document)} was given; load one with `Scene.load`, or take `Scene()`."
+            f"A scene is needed and {kind_of(document)} was given; load one with `Scene.load`, or take `Scene()`."
         )
     return document
 
@@ -64,7 +66,7 @@ def require_frames(frames: object) -> list[ViewFrame]:
     """
     if isinstance(frames, ViewFrame) or not hasattr(frames, "__iter__"):
         raise DeltalightError(
-            f"A list with a frame of each camera is needed and {_kind(frames)} was given; write `[frame]`."
+            f"A list with a frame of each camera is needed and {kind_of(frames)} was given; write `[frame]`."
         )
     return [_require_frame(frame) for frame in frames]
 
@@ -72,9 +74,9 @@ def require_frames(frames: object) -> list[ViewFrame]:
 def _require_frame(frame: object) -> ViewFrame:
     if not isinstance(frame, ViewFrame):
         raise DeltalightError(
-            f"A frame is needed and {_kind(frame)} was given; take one of `deltalight.open(...)`."
+            f"A frame is needed and {kind_of(frame)} was given; take one of `deltalight.open(...)`."
         )
-    size = (frame.camera.height, frame.camera.width)
+    size = _size(frame.camera, "camera")
     _require_array(frame.color, "color", np.uint8, (*size, 3))
     if frame.response is not None:
         _require_array(frame.response, "response", np.floating, (256, 3))
@@ -89,8 +91,8 @@ def _require_depth(depth: object) -> None:
     if depth is None:
         return
     if not isinstance(depth, DepthImage):
-        raise DeltalightError(f"The frame's depth is {_kind(depth)}; give a DepthImage.")
-    size = (depth.camera.height, depth.camera.width)
+        raise DeltalightError(f"The frame's depth is {kind_of(depth)}; give a DepthImage.")
+    size = _size(depth.camera, "depth.camera")
     _require_array(depth.depth_m, "depth.depth_m", np.floating, size)
     _require_array(depth.valid, "depth.valid", np.bool_, size)
 
@@ -99,19 +101,17 @@ def _require_pose(pose: object) -> None:
     if pose is None:
         return
     if not isinstance(pose, BoardPose):
-        raise DeltalightError(f"The frame's pose is {_kind(pose)}; write `BoardPose(world_from_camera)`.")
+        raise DeltalightError(f"The frame's pose is {kind_of(pose)}; write `BoardPose(world_from_camera)`.")
     require_rigid(pose.world_from_camera, "the frame's pose")
 
 
+def _size(camera: object, name: str) -> tuple[int, int]:
+    if not isinstance(camera, CameraModel):
+        raise DeltalightError(f"The frame's {name} is {kind_of(camera)}; give a CameraModel.")
+    return camera.height, camera.width
+
+
 def _require_array(array: object, name: str, kind: type[np.generic], shape: tuple[int, ...]) -> None:
-    if isinstance(array, np.ndarray) and np.issubdtype(array.dtype, kind) and array.shape == shape:
-        return
-    found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else _kind(array)
-    wanted = {np.floating: "float32", np.bool_: "bool"}.get(kind, kind.__name__)
-    raise DeltalightError(
-        f"The frame's {name} must be an array of {wanted} {shape}, and is {found}; convert it."
-    )
-
-
-def _kind(value: object) -> str:
-    return "None" if value is None else f"`{type(value).__name__}`"
+    wrong = misfit(array, kind, shape)
+    if wrong is not None:
+        raise DeltalightError(f"The frame's {name} {wrong}; convert it.")

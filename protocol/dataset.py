@@ -35,9 +35,8 @@ from deltalight.protocol.pictures import (
     read_bytes,
 )
 from deltalight.protocol.response_table import load_response_table
+from deltalight.protocol.ros_bag_names import BAG_DATABASE, BAG_METADATA
 from deltalight.protocol.scene import SceneDocument
-
-BAG_METADATA, BAG_DATABASE = "metadata.yaml", ".db3"  # of a ROS 2 bag
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,10 @@ def read_list(path: Path) -> list[ListEntry]:
     if not entries:
         raise DeltalightError(f"{path} names no picture; write lines `timestamp filename`.")
     lost = [entry.path for entry in entries if not is_file(entry.path)]
+    if len(lost) == 1:
+        raise DeltalightError(
+            f"{path} names {lost[0]!s:.500}, which is missing; restore it or take it off the list."
+        )
     if lost:
         raise DeltalightError(
             f"{path} names {len(lost)} missing files, first {lost[0]!s:.500}; restore them or cut the list."

@@ -79,6 +79,8 @@ def parse_mapping(text: str, name: str, *, is_json: bool, unique_keys: bool = Fa
         DeltalightError: the text is malformed or not a mapping.
     """
     kind = "JSON" if is_json else "YAML"
+    if not text.strip():
+        raise DeltalightError(f"{name} is empty; write {kind} with keys and values.")
     try:
         if is_json:
             data = json.loads(text, object_pairs_hook=_unique if unique_keys else None)

@@ -46,6 +46,7 @@ from deltalight.protocol.recording_format import (
     SessionRecord,
     matrix_of,
 )
+from deltalight.protocol.ros_bag_names import refuse_bag
 from deltalight.protocol.scene import SceneDocument, parse_scene, resolve_asset
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
@@ -157,6 +158,7 @@ class RecordingReader:
         try:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                    refuse_bag(self.path)
                     raise DeltalightError(f"{self.path} is not an MCAP recording; give a file that is.")
                 try:
                     summary = _summary(file)
@@ -167,7 +169,7 @@ class RecordingReader:
                 return self._scan(file)
         except OSError as error:
             raise DeltalightError(
-                f"{self.path} cannot be read ({error.strerror}); give a readable file."
+                f"{self.path} cannot be read ({error.strerror}); give an .mcap recording."
             ) from error
 
     def _use_index(self, file: IO[bytes], summary: Summary) -> Times:
@@ -199,8 +201,9 @@ class RecordingReader:
         frames = {time for time, found in topics.items() if {FRAME_TOPIC, COLOR_TOPIC} <= found}
         fisheyes = {time for time, found in topics.items() if FISHEYE_RECORD_TOPIC in found}
         lost = f", without {counted(damaged, 'damaged part')}" if damaged else ""
+        were = "frame was" if len(frames) == 1 else "frames were"
         self.notes.append(
-            f"{self.path} was not finished; {len(frames)} frames were recovered by reading it through{lost}."
+            f"{self.path} was not finished; {len(frames)} {were} recovered by reading it through{lost}."
         )
         return defaultdict(set, {FRAME_TOPIC: frames, FISHEYE_RECORD_TOPIC: fisheyes})
 

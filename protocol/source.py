@@ -9,6 +9,7 @@ from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.ros_bag_names import refuse_bag
 from deltalight.protocol.scene import SceneDocument
 
 RECORDING_SUFFIXES = (".mcap", ".mcap.active")
@@ -71,6 +72,7 @@ def open_source(path: Path, board: BoardSpec | None = None) -> Source:
         return open_dataset(path, board)
     if not path.exists():
         raise DeltalightError(f"{path} does not exist; give a dataset folder or an .mcap recording.")
+    refuse_bag(path)
     if not path.name.endswith(RECORDING_SUFFIXES):
         raise DeltalightError(f"{path} is neither a folder nor an .mcap recording; give one of these.")
     from deltalight.protocol.recording_reader import RecordingReader

@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong us
 130 Ctrl-C, 143 SIGTERM.
 """
 
+import errno
 import os
 import signal
 import sys
@@ -53,6 +54,7 @@ LIVE_COMMANDS = frozenset(
     {"node", "server", "api", "demo", "up"}
 )  # they do the same for each frame, or fork who does
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+FULL_DISK = frozenset({errno.ENOSPC, errno.EDQUOT})
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
 
 
@@ -182,6 +184,10 @@ def run(arguments: list[str]) -> int:
 
 
 def _report(fault: Exception) -> int:
+    if isinstance(fault, OSError) and fault.errno in FULL_DISK:  # that of standard output, say
+        fault = DeltalightError(
+            f"the output cannot be written ({fault.strerror}); free some space, and run it again."
+        )
     if isinstance(fault, DeltalightError):
         print(f"deltalight: {' '.join(str(fault).split())}", file=sys.stderr)
         return fault.exit_code

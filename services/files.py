@@ -19,7 +19,7 @@ def make_output_folder(folder: Path) -> Path:
         DeltalightError: it is a file, or cannot be created or written.
     """
     if folder.exists() and not folder.is_dir():
-        raise DeltalightError(f"The output '{folder}' is a file; name a folder with --out.")
+        raise DeltalightError(f"The output folder '{folder}' is a file; name a folder.")
     probe = folder / f".write-test-{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -27,7 +27,7 @@ def make_output_folder(folder: Path) -> Path:
         probe.unlink()
     except OSError as fault:
         raise DeltalightError(
-            f"The output folder '{folder}' cannot be written ({fault.strerror}); choose another with --out."
+            f"The output folder '{folder}' cannot be written ({fault.strerror}); choose another."
         ) from fault
     return folder
 

@@ -21,6 +21,7 @@ from deltalight.protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneM
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods import registry
 from deltalight.render_server.methods.method import RelightingMethod
+from deltalight.render_server.methods.surface_shading import Layers
 from deltalight.sensor_node.cameras.discovery import discover
 from deltalight.sensor_node.cameras.drivers import driver_plugins
 from deltalight.sensor_node.cameras.open import is_live, open_camera
@@ -252,6 +253,7 @@ BROKEN = {
         "licence has ended",
     ),
     "another": ("another:thing", {"another": "thing = 3"}, "it names no"),
+    "ending": ("ending:thing", {"ending": "raise SystemExit(3)"}, "SystemExit: 3"),
 }
 
 
@@ -372,6 +374,12 @@ def test_a_method_that_cannot_declare_its_stages_is_named(
     nothing = cast(Any, None)
     with pytest.raises(DeltalightError, match=r"`direct` of package direct-light 1\.0 .*no module of mine"):
         choice.declare(Graph(nothing), nothing, nothing)
+    silent = RelightingMethod(direct.settings, lambda *_: cast(Any, None))
+    forgetful = InstalledMethod(direct.plugin, direct.settings, silent)
+    monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": forgetful}, {}))
+    choice = registry.choose_method(direct.settings(), software=True)
+    with pytest.raises(DeltalightError, match=r"`direct` of package .* returns None, not Layers"):
+        choice.declare(Graph(nothing), nothing, nothing)
     light = InstalledMethod(direct.plugin, direct.settings, DvctMethod)
     monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": light}, {}))
     with pytest.raises(DeltalightError, match="it names no RelightingMethod"):
@@ -388,7 +396,7 @@ def test_a_stage_that_fails_is_named_with_its_plugin(
         raise ValueError("too thin")
 
     def declare(graph: Graph, *_: object) -> Any:  # noqa: ANN401
-        return graph.stage("fog", fail)
+        return Layers(*[graph.stage("fog", fail)] * 9)
 
     weak = InstalledMethod(direct.plugin, direct.settings, RelightingMethod(direct.settings, declare))
     monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": weak}, {}))

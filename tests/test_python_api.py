@@ -179,6 +179,8 @@ def test_objects_are_named_changed_and_saved(scene: dl.Scene, cube: Path, tmp_pa
 
 
 def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "desk.bag"
+    bag.touch()
     cases = {
         "no object `cup`; it has: ": lambda: scene.move("cup", to=(0, 0, 0)),
         "does not exist; correct the path": lambda: scene.add(tmp_path / "cup.glb"),
@@ -190,6 +192,8 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         ),
         "device '0' is not possible": lambda: dl.Renderer(device="0"),  # type: ignore[arg-type]
         "device True is not possible": lambda: dl.Renderer(device=True),
+        "no such GPU; name no device, or one that": lambda: dl.Renderer(device=99),
+        "is a ROS bag; make a recording of it": lambda: dl.open(bag),
         "'fast' is not a quality; use one of live, balanced, best": lambda: dl.Renderer(quality="fast"),  # type: ignore[arg-type]
         r"the object `cube`: the key `pose.translation_m\[2\]` is missing": lambda: scene.add(
             cube, at=(1, 2)
@@ -208,8 +212,9 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         "rgb.yaml": lambda: dl.open("uvc:0", calibration=tmp_path),
     }
     for sentence, call in cases.items():
-        with pytest.raises(dl.DeltalightError, match=sentence):
+        with pytest.raises(dl.DeltalightError, match=sentence) as caught:
             call()
+        assert "--device" not in str(caught.value)
 
 
 def test_a_changed_asset_is_found_from_the_working_folder(
@@ -241,6 +246,7 @@ def test_frames_of_a_programs_own_are_checked(take: dl.Take, scene: dl.Scene) ->
             r"color must be an array of uint8 \(480, 640, 3\), and is float32": replace(
                 frame, color=frame.color.astype(np.float32)
             ),
+            "frame's camera is None; give a CameraModel": replace(frame, camera=None),  # type: ignore[arg-type]
             r"uint8 \(480, 640, 3\), and is uint8 \(480, 640\)": replace(frame, color=frame.color[..., 0]),
             r"and is uint8 \(100, 100, 3\); convert it": replace(frame, color=frame.color[:100, :100]),
             "the frame's pose is not a rigid transform": replace(frame, pose=BoardPose(pose * np.nan)),

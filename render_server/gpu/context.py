@@ -29,8 +29,9 @@ HINTS = {
     "eglInitialize failed": "EGL found no driver: install libgl1-mesa-dri, or the NVIDIA driver's EGL library",
     "XOpenDisplay": "a display was requested, but there is none: use the EGL backend",
     "eglCreateContext failed": "the driver offers less than OpenGL 4.3: update the graphics driver",
-    "found 0 devices": "EGL sees no device: in a container, pass the GPU with its graphics capability",
-    "requested device": "there is no such GPU; leave --device out, or see `deltalight doctor` for the list",
+    "found 0 devices": "EGL sees no device: install libgl1-mesa-dri or the graphics driver; in a container, pass"
+    " the GPU with its graphics capability",
+    "requested device": "there is no such GPU; name no device, or one that `deltalight doctor` lists",
 }
 
 # What the assembled shaders and the buffers of a small scene need of a device, by OpenGL's name. Devices that conform

@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from deltalight.protocol.array_checks import kind_of
 from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.plugins import Plugin
 from deltalight.protocol.quality import Quality
@@ -90,10 +91,13 @@ class MethodChoice:
         """Declares the method's stages.
 
         Raises:
-            DeltalightError: a plugin cannot.
+            DeltalightError: a plugin cannot, or declares something else.
         """
         with _blamed(self.plugin), graph.of_plugin(self.plugin):
-            return self.method.declare(graph, resources, setup)
+            layers = self.method.declare(graph, resources, setup)
+        if self.plugin is not None and not isinstance(layers, Layers):
+            raise self.plugin.fault(f"its `declare` returns {kind_of(layers)}, not Layers")
+        return layers
 
     def shaded(
         self,

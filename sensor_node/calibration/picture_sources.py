@@ -15,6 +15,7 @@ from deltalight.protocol.dataset_lists import ListEntry, read_list
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.pictures import decode_rgb, read_bytes
+from deltalight.protocol.ros_bag_names import refuse_bag
 from deltalight.protocol.source import RECORDING_SUFFIXES, open_source
 from deltalight.sensor_node.calibration.targets import Target
 from deltalight.sensor_node.calibration.views import Picture, ViewCollector
@@ -62,6 +63,9 @@ def open_series(source: str, eye: Eye) -> Series:
         frames = open_source(path)
         film = _is_film(frames.timestamps_ns)
         return Series(_of_frames(iter(frames), eye), len(frames), film, board=frames.board)
+    refuse_bag(path)
+    if path.is_file():
+        raise DeltalightError(f"{path} is one file; give the folder of the pictures, or an .mcap recording.")
     if not path.is_dir():
         raise DeltalightError(
             f"there is no folder, recording or camera '{source}'; give a folder of pictures, an .mcap recording "

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import SensorFrame
 from deltalight.sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StaleFrameError, StreamState
+from deltalight.sensor_node.cameras.fitting_frames import require_fitting
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 10.0
 # Frames buffered for a late reader: an eighth of a second at 30 per second.
@@ -185,6 +186,7 @@ class ReconnectingCamera(Camera):
 
     def _read_one(self) -> None:
         frame = self._inner.read()
+        require_fitting(frame, self._name)
         with self._changed:
             self._kept.append(_Kept(self._numbering.numbered(frame), self._inner.capture_ns))
             self._seen_at, self._is_given_up = time.monotonic(), False

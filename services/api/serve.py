@@ -134,8 +134,9 @@ def listening(host: str, port: int) -> socket.socket:
     try:
         listener = socket.create_server((host, port), family=family, backlog=128)
     except OSError as fault:
+        reason, _, _ = str(fault.strerror).partition(" (while attempting")  # Python names the address again
         raise DeltalightError(
-            f"cannot listen on {host} port {port} ({fault.strerror}); stop the program that uses it, or choose "
+            f"cannot listen on {host} port {port} ({reason}); stop the program that uses it, or choose "
             "others with --host and --port."
         ) from fault
     # Connections inherit it. asyncio sets it only on sockets that it creates, and without it the body of each

@@ -21,13 +21,13 @@ from pydantic import Field
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.dataset import BAG_METADATA
 from deltalight.protocol.documents import StrictModel, validate
 from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.protocol.pictures import decode_rgb, depth_from_steps, is_jpeg, known_depth, steps_from_depth
 from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz, wxyz_from_rotation
 from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.ros_bag_names import BAG_METADATA, BAG_SUFFIX
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import Source
 from deltalight.services.exports.ros_fisheye import FISHEYE_TOPICS, FisheyeReader, write_fisheye
@@ -226,7 +226,7 @@ def _transform(bag: _Bag, time_ns: int, parent: str, child: str, matrix: Float64
 
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a ROS bag and not like a dataset folder."""
-    return path.suffix == ".bag" or (path / BAG_METADATA).is_file()
+    return path.suffix == BAG_SUFFIX or (path / BAG_METADATA).is_file()
 
 
 def import_bag(path: Path, out: Path, track: Track) -> Copied:

@@ -212,7 +212,9 @@ def _unpack(path: Path, to: Path) -> Contents:
             for entry in _entries(archive, path):
                 _extract(archive, entry, to / entry.name, path)
     except OSError as fault:
-        raise DeltalightError(f"{path} cannot be restored ({fault.strerror or fault}).") from fault
+        raise DeltalightError(
+            f"{path} cannot be restored ({fault.strerror or fault}); check the file and the disk."
+        ) from fault
     except (*DAMAGE, KeyError, ValueError, TypeError, RuntimeError) as fault:
         raise DeltalightError(f"{path} is not a complete backup ({fault}); give another one.") from fault
     contents, digests = _examined(to / DATABASE, path)

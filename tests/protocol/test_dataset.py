@@ -209,8 +209,9 @@ BAD_FOLDERS: list[tuple[Callable[[Path], None], str]] = [
         r"has no rgb\.txt, but a\.mcap; name that recording, or, if the folder is a ROS 2 bag, let",
     ),
     (remove("calibration/rgb.yaml"), r"has no calibration/rgb\.yaml"),
-    (remove("rgb/1.png"), r"rgb\.txt names 1 missing files, first .*1\.png"),
-    (remove("depth/3.png"), r"depth\.txt names 1 missing files"),
+    (remove("rgb/1.png"), r"rgb\.txt names .*1\.png, which is missing; restore it"),
+    (remove("depth/3.png"), r"depth\.txt names .*3\.png, which is missing; restore it"),
+    (edit("rgb.txt", "10.0 a.png\n11.0 b.png\n"), r"rgb\.txt names 2 missing files, first .*a\.png"),
     (edit("rgb.txt", "# nothing\n"), r"rgb\.txt names no picture"),
     (edit("rgb.txt", "10.0\n"), r"rgb\.txt line 1 has no filename"),
     (edit("rgb.txt", "#\nten rgb/0.png\n"), r"rgb\.txt line 2 has the timestamp `ten`"),
@@ -272,6 +273,9 @@ def test_what_is_no_source_is_told(tmp_path: Path) -> None:
     (tmp_path / "a.txt").touch()
     with pytest.raises(DeltalightError, match="neither a folder nor"):
         open_source(tmp_path / "a.txt")
+    (tmp_path / "a.bag").touch()
+    with pytest.raises(DeltalightError, match=r"a\.bag is a ROS bag; .*`deltalight recordings import`"):
+        open_source(tmp_path / "a.bag")
 
 
 def random_frames(count: int, scale: float = 0.0005) -> list[SensorFrame]:

@@ -213,6 +213,8 @@ def test_json_and_yaml_say_the_same_and_assets_become_absolute(tmp_path: Path) -
         ("s.json", '{"objects": [{"asset": "gone.ply"}]}', r"`objects\[0\]\.asset` names .*gone\.ply"),
         ("s.json", '{"objects": [', "not valid JSON"),
         ("s.json", "[]", "keys and values"),
+        ("s.json", "", r"s\.json is empty; write JSON"),
+        ("s.yaml", "\n", r"s\.yaml is empty; write YAML"),
         ("s.yaml", "objects: [", "not valid YAML"),
         ("s.json", '{"lights": {"manual": [{"intensity": NaN}]}}', "finite"),
     ],

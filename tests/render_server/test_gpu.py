@@ -192,6 +192,7 @@ def test_what_was_read_back_is_as_old_as_the_push(gpu: GpuContext) -> None:
         ("eglInitialize failed (0x3001)", "libgl1-mesa-dri"),
         ("(standalone) XOpenDisplay: cannot open display", "EGL backend"),
         ("eglCreateContext failed (0x3009)", "update the graphics driver"),
+        ("requested device index 0, but found 0 devices", "install libgl1-mesa-dri or the graphics driver"),
         ("requested device index 1, but found 1 devices", "no such GPU"),
         ("something new", "deltalight doctor"),
     ],

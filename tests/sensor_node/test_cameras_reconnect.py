@@ -4,13 +4,15 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError, StreamState
 from deltalight.sensor_node.cameras.live import CameraFailure
 from deltalight.sensor_node.cameras.reconnect import ReconnectingCamera
@@ -117,6 +119,43 @@ def test_after_a_failure_ids_and_times_go_on_rising(fault: str) -> None:
     assert all(frame.depth_timestamp_ns == frame.timestamp_ns + 7 for frame in frames)
     assert inner.opened >= 3
     assert inner.closed >= 2
+
+
+BLACK, FLAT = np.zeros((6, 8, 3), np.uint8), np.zeros((6, 8), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "said"),
+    [
+        (
+            FLAT,
+            None,
+            "colour of test must be an array of uint8 (6, 8, 3), and is float32 (6, 8); correct its",
+        ),
+        (None, None, "colour of test must be an array of uint8 (6, 8, 3), and is None; correct its driver"),
+        (
+            BLACK,
+            DepthImage(FLAT[1:], FLAT > 0, CAMERA),
+            "depth of test must be an array of float32 (6, 8), and",
+        ),
+        (
+            BLACK,
+            DepthImage(FLAT, FLAT > 0, cast(Any, 3)),
+            "lens of the depth of test is `int`, not a CameraModel",
+        ),
+        (BLACK, DepthImage(FLAT, FLAT, CAMERA), "mask of depth of test must be an array of bool (6, 8), and"),
+    ],
+)
+def test_frames_that_do_not_fit_their_camera_are_a_fault_of_the_driver(
+    color: np.ndarray, depth: DepthImage | None, said: str
+) -> None:
+    class Wrong(Scripted):
+        def read(self) -> SensorFrame:
+            return replace(super().read(), color=color, depth=depth)
+
+    with reconnecting(Wrong(), first_wait_s=WAIT_S) as camera:
+        wait_for(lambda: camera.state.name == "lost")
+        assert said in camera.state.detail
 
 
 def test_lost_is_said_in_a_sentence_until_it_is_back() -> None:

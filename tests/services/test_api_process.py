@@ -181,7 +181,7 @@ def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:
     with listening(ports.LOOPBACK, port):
         done = cli("api", "--port", port, "--data", tmp_path)
     assert done.returncode == 2
-    assert f"cannot listen on 127.0.0.1 port {port}" in done.stderr
+    assert f"cannot listen on 127.0.0.1 port {port} (Address already in use); stop" in done.stderr
     (tmp_path / "file").touch()
     with pytest.raises(DeltalightError, match="--data"):
         run_api(ApiSettings(port=port, data=tmp_path / "file"))

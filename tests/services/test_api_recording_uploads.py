@@ -131,7 +131,7 @@ def test_hostile_folders_are_refused_in_a_sentence(api: RunningApi, folder: Path
     assert "outside of the dataset folder" in told(
         ("desk/depth.txt", b"1.0 /etc/passwd"), without="depth.txt"
     )
-    assert "missing files" in told(("desk/rgb.txt", b"1.0 gone.png"), without="rgb.txt")
+    assert "which is missing" in told(("desk/rgb.txt", b"1.0 gone.png"), without="rgb.txt")
     assert nothing_is_left(api)
 
 

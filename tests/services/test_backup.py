@@ -105,7 +105,8 @@ def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(cli: RunCli, tm
         refused = cli("restore", kept, "--data", data)
     assert refused.returncode == 2
     assert "is in use; stop the service" in refused.stderr
-    assert "cannot be restored" in cli("restore", tmp_path / "none.zip", "--data", data).stderr
+    missing = cli("restore", tmp_path / "none.zip", "--data", data).stderr
+    assert "none.zip cannot be restored (No such file or directory); check the file" in missing
     assert shown(data) == "first"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "kept.zip"]
 

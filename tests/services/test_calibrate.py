@@ -119,6 +119,12 @@ def test_wrong_use_ends_with_code_2_and_one_sentence(cli: RunCli, shots: Path, t
     assert done.stderr.strip().count("\n") == 0
     assert "name the target with --target" in done.stderr
     assert "give 5 or 8" in sentence(calibrate("camera", shots, "--out", tmp_path, "--coefficients", 6))
+    for name, said in (
+        ("a.bag", "a.bag is a ROS bag; make"),
+        ("a.mp4", "a.mp4 is one file; give the folder"),
+    ):
+        (tmp_path / name).touch()
+        assert said in sentence(calibrate("camera", tmp_path / name, "--out", tmp_path))
     wrong = calibrate("camera", shots, "--out", tmp_path, "--target", "chessboard:9x7:0.04")
     assert "only 0 of 14 pictures" in sentence(wrong)
 

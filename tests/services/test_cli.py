@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 
 from deltalight.services import doctor, ports
 from deltalight.services.api.serve import listening
-from deltalight.services.cli import BLAS_THREADS, app, limit_blas_threads
+from deltalight.services.cli import BLAS_THREADS, app, limit_blas_threads, run
 from deltalight.services.commands.examples import EXAMPLES
 from tests.services.conftest import ROOT, RunCli
 
@@ -175,6 +176,14 @@ def test_help_loads_no_heavy_module() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_output_that_the_disk_refuses_is_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    with suppress(OSError), Path("/dev/full").open("w") as full, redirect_stdout(full):
+        assert run(["schema"]) == 2
+    assert capsys.readouterr().err == (
+        "deltalight: the output cannot be written (No space left on device); free some space, and run it again.\n"
+    )
 
 
 def test_schema_is_json_schema(cli: RunCli) -> None:

@@ -134,6 +134,14 @@ def test_wrong_method_is_one_sentence_with_the_nearest_name(cli: RunCli) -> None
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_picture_that_cannot_be_written_is_told_at_once(cli: RunCli, tmp_path: Path) -> None:
+    folder = tmp_path / "file"
+    folder.touch()
+    done = cli("graph", "--svg", folder / "frame.svg")
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [f"deltalight: The output folder '{folder}' is a file; name a folder."]
+
+
 def test_page_has_the_table_of_the_graph(account: FrameAccount) -> None:
     page = frame_docs.PAGE.read_text(encoding="utf-8")
     assert frame_docs.with_table(page, account) == page, "run `python -m deltalight.benchmarks.frame_docs`"

@@ -290,6 +290,7 @@ def test_every_foxglove_topic_of_a_mended_recording_decodes(tmp_path: Path) -> N
         (["info", "{folder}/none.mcap"], "none.mcap"),
         (["info", "{folder}"], "Is a directory"),
         (["info", "{folder}/empty.mcap"], "not an MCAP recording"),
+        (["info", "{folder}/a.bag"], "a.bag is a ROS bag; make a recording of it"),
         (["recover", "{folder}/empty.mcap"], "not an MCAP recording"),
         (["recover", "{folder}/none.mcap.active"], "none.mcap.active"),
         (["recover", "{folder}/a.mcap", "--out", "{folder}/b"], "must end in .mcap"),
@@ -308,9 +309,10 @@ def test_every_foxglove_topic_of_a_mended_recording_decodes(tmp_path: Path) -> N
 )
 def test_wrong_input_is_a_sentence(tmp_path: Path, words: list[str], message: str) -> None:
     write(tmp_path / "a.mcap", frames(1))
-    (tmp_path / "empty.mcap").touch()
+    for name in ("a.bag", "empty.mcap"):
+        (tmp_path / name).touch()
     done = CliRunner().invoke(app, ["recordings", *(word.format(folder=tmp_path) for word in words)])
     assert isinstance(done.exception, DeltalightError), done.exception
     assert message in str(done.exception)
     assert "\n" not in str(done.exception)
-    assert names(tmp_path) == ["a.mcap", "empty.mcap"]
+    assert names(tmp_path) == ["a.bag", "a.mcap", "empty.mcap"]

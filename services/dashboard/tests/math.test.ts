@@ -6,7 +6,7 @@ import { anglesFromDirection, directionFromAngles } from "../src/math/direction"
 import { convexHull, isInside } from "../src/math/hull";
 import { anglesFromQuaternion, quaternionFromAngles, rotate, turnBetween } from "../src/math/rotation";
 import { snap } from "../src/math/snap";
-import { bytes, clock, labelOf, milliseconds, size, sizesText, trimmed, unitOf } from "../src/math/units";
+import { bytes, clock, counted, labelOf, milliseconds, size, sizesText, trimmed, unitOf } from "../src/math/units";
 
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
 
@@ -97,6 +97,14 @@ describe("small things", () => {
     expect(snap(0.123, 0.01)).toBe(0.12);
     expect(snap(-0.126, 0.01)).toBe(-0.13);
     expect(snap(37, 15)).toBe(30);
+  });
+
+  it("counts one thing and several", () => {
+    expect([0, 1, 1200].map((count) => counted(count, "relit picture"))).toEqual([
+      "0 relit pictures",
+      "1 relit picture",
+      "1,200 relit pictures",
+    ]);
   });
 
   it("reads units and words off keys", () => {

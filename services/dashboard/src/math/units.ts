@@ -28,6 +28,11 @@ export function trimmed(value: number, decimals = 4): string {
   return short === "-0" ? "0" : short;
 }
 
+/** A count with its noun, whose plural is formed with an s: "1 frame", "1,200 frames". */
+export function counted(count: number, noun: string): string {
+  return `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;
+}
+
 export function bytes(count: number): string {
   let value = count;
   let index = 0;

@@ -1,7 +1,7 @@
 import { API } from "../../api/http";
 import type { Fisheye } from "../../api/types";
 import { hexFromLinear } from "../../math/color";
-import { trimmed } from "../../math/units";
+import { counted, trimmed } from "../../math/units";
 import { fisheye } from "../../state/processes";
 import { Icon } from "../ui/Icon";
 import { SecureImage } from "../ui/SecureImage";
@@ -22,7 +22,7 @@ export function FisheyePicture() {
       </article>
     );
   }
-  const found = seen.lights.length === 1 ? "1 light" : `${seen.lights.length} lights`;
+  const found = counted(seen.lights.length, "light");
   return (
     <article class="card fisheye" aria-label="Fish-eye camera">
       <div class="fisheye-picture" style={{ aspectRatio: `${seen.width} / ${seen.height}` }}>

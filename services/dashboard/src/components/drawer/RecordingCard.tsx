@@ -1,7 +1,7 @@
 import { API } from "../../api/http";
 import { role } from "../../api/session";
 import type { Recording } from "../../api/types";
-import { bytes, clock } from "../../math/units";
+import { bytes, clock, counted } from "../../math/units";
 import {
   deleteRecording,
   isGrowing,
@@ -113,8 +113,8 @@ function factsText({ duration_s, frames, composites, size_bytes, changed }: Reco
   const day = new Date(changed).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
   const facts = [
     duration_s === null ? "" : clock(duration_s),
-    frames === null ? "" : `${frames} frames`,
-    composites === 0 ? "" : `${composites} relit pictures`,
+    frames === null ? "" : counted(frames, "frame"),
+    composites === 0 ? "" : counted(composites, "relit picture"),
     bytes(size_bytes),
     day,
   ];

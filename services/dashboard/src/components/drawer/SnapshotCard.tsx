@@ -1,6 +1,7 @@
 import { API } from "../../api/http";
 import { role } from "../../api/session";
 import type { Snapshot } from "../../api/types";
+import { counted } from "../../math/units";
 import { deleteSnapshot } from "../../state/takes";
 import { save } from "../ui/download";
 import { Icon } from "../ui/Icon";
@@ -40,7 +41,7 @@ export function SnapshotCard({ snapshot }: { readonly snapshot: Snapshot }) {
         <h3>Frame {snapshot.frame_id}</h3>
         <p class="quiet small">{taken}</p>
         <Menu label={`Files of frame ${snapshot.frame_id}`} entries={entries} kind="plain">
-          <Icon name="download" /> {files.length} files
+          <Icon name="download" /> {counted(files.length, "file")}
         </Menu>
       </div>
     </article>

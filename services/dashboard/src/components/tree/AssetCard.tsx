@@ -1,7 +1,7 @@
 import { API } from "../../api/http";
 import type { AssetAnswer } from "../../api/types";
 import { boundsOf, size } from "../../math/bounds";
-import { bytes, sizesText } from "../../math/units";
+import { bytes, counted, sizesText } from "../../math/units";
 import { addObject } from "../../state/actions";
 import { assetName, removeAsset } from "../../state/assets";
 import { ASSET_DRAG } from "../../state/drag";
@@ -86,7 +86,7 @@ function factsText(asset: AssetAnswer): string {
   const facts = [
     asset.format.toUpperCase(),
     bytes(asset.size_bytes),
-    ...(typeof triangles === "number" ? [`${triangles.toLocaleString("en")} triangles`] : []),
+    ...(typeof triangles === "number" ? [counted(triangles, "triangle")] : []),
     ...(bounds ? [sizesText(size(bounds))] : []),
     ...(typeof width === "number" && typeof height === "number" ? [`${width} × ${height}`] : []),
   ];
