@@ -14,7 +14,7 @@ from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import EYE, LATER_NS, TARGET, TURNED, Case, scene_of
 from tests.render_server.scenes import Stage, checkered, frame, look_at
 
-pytestmark = [pytest.mark.slow(seconds=20), pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=8), pytest.mark.usefixtures("clean_gl")]
 
 INTERRUPTED = [  # a method, and the run of a kernel after which it fails: within a stage that changes its input
     ("dlpv", "lpv_bounce_share", 1),  # after the first of two bounces
