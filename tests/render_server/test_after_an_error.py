@@ -14,7 +14,7 @@ from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import EYE, LATER_NS, TARGET, TURNED, Case, scene_of
 from tests.render_server.scenes import Stage, checkered, frame, look_at
 
-pytestmark = [pytest.mark.slow(seconds=20), pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=8), pytest.mark.usefixtures("clean_gl")]
 
 INTERRUPTED = [  # a method, and the run of a kernel after which it fails: within a stage that changes its input
     ("dlpv", "lpv_bounce_share", 1),  # after the first of two bounces
@@ -45,8 +45,7 @@ class Turn:
     """A renderer, and frames of a camera that turns."""
 
     def __init__(self, gpu: GpuContext, method: str, folder: Path) -> None:
-        folder.mkdir()
-        self.renderer = SceneRenderer(gpu, scene_of(Case(method, "model", "plain"), Stage(folder)))
+        self.renderer = SceneRenderer(gpu, scene_of(Case(method, "model", "mirror"), Stage(folder)))
         self._render(0, TARGET)
 
     def _render(self, number: int, target: tuple[float, float, float]) -> np.ndarray:
@@ -58,21 +57,38 @@ class Turn:
         return self._render(1, TURNED)
 
 
-@pytest.fixture(params=[True, False], ids=["software", "gpu"])
-def device(request: pytest.FixtureRequest, gpu: GpuContext) -> GpuContext:
-    """The device, as it is, and taken for a GPU."""
-    return replace(gpu, is_software=request.param)
+class Turns:
+    """What turns on one device, and the pictures after a turn without an error: of a method once for all kernels."""
+
+    def __init__(self, gpu: GpuContext, make_folder: Callable[[str], Path]) -> None:
+        self.gpu, self._make_folder = gpu, make_folder
+        self._pictures: dict[str, np.ndarray] = {}
+
+    def begin(self, method: str) -> Turn:
+        return Turn(self.gpu, method, self._make_folder(method))
+
+    def undisturbed(self, method: str) -> np.ndarray:
+        if method not in self._pictures:
+            turn = self.begin(method)
+            self._pictures[method] = turn.turned()
+            turn.renderer.release()
+        return self._pictures[method]
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["software", "gpu"])
+def turns(request: pytest.FixtureRequest, gpu: GpuContext, tmp_path_factory: pytest.TempPathFactory) -> Turns:
+    """Those of the device, as it is, and taken for a GPU."""
+    return Turns(replace(gpu, is_software=request.param), tmp_path_factory.mktemp)
 
 
 @pytest.mark.parametrize(("method", "kernel", "runs"), INTERRUPTED)
 def test_the_frame_after_an_error_is_as_if_there_had_been_none(
-    method: str, kernel: str, runs: int, device: GpuContext, tmp_path: Path
+    method: str, kernel: str, runs: int, turns: Turns
 ) -> None:
-    undisturbed, disturbed = (Turn(device, method, tmp_path / name) for name in ("one", "other"))
-    expected = undisturbed.turned()
-    with watched(device, failing_after(kernel, runs)), pytest.raises(MemoryError):
+    expected = turns.undisturbed(method)
+    disturbed = turns.begin(method)
+    with watched(turns.gpu, failing_after(kernel, runs)), pytest.raises(MemoryError):
         disturbed.turned()
     found = disturbed.turned()
-    for each in (undisturbed, disturbed):
-        each.renderer.release()
+    disturbed.renderer.release()
     np.testing.assert_array_equal(found, expected)

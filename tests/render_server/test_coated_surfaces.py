@@ -137,8 +137,8 @@ def ggx(n: Vectors, v: Vectors, l: Vectors, alpha: float) -> np.ndarray:  # noqa
 
 
 def coat_albedo(cosine: float, alpha: float, side: int = 400) -> float:
-    """Of that lobe, by quadrature."""
-    z, turn = np.meshgrid((np.arange(side) + 0.5) / side, 2 * np.pi * (np.arange(side) + 0.5) / side)
+    """Of that lobe, by quadrature over half a turn: the other half is its image in a mirror."""
+    z, turn = np.meshgrid((np.arange(side) + 0.5) / side, 2 * np.pi * (np.arange(side // 2) + 0.5) / side)
     level = np.sqrt(1 - z * z)
     l = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=-1)  # noqa: E741
     v = np.array([np.sqrt(1 - cosine**2), 0, cosine])

@@ -44,7 +44,7 @@ def test_holes_in_the_heap_are_given_back() -> None:
 @pytest.fixture
 def document(tmp_path: Path) -> SceneDocument:
     document = everyday(Stage(tmp_path))
-    return document.replaced(method={"name": "none"}, output=document.output.replaced(width=64))
+    return document.replaced(method={"name": "none"}, output=document.output.replaced(width=80))
 
 
 def test_they_are_when_the_method_changes_and_only_then(

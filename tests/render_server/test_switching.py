@@ -53,7 +53,7 @@ def check(shown: CompositeFrame, frame_id: int) -> None:
 
 def test_other_views_of_a_frame_are_what_each_alone_would_show(gpu: GpuContext, tmp_path: Path) -> None:
     document = everyday(Stage(tmp_path), cone_scale=2, cone_count=4)
-    document = document.replaced(output=document.output.replaced(width=64))
+    document = document.replaced(output=document.output.replaced(width=80))
     renderer = SceneRenderer(gpu, document)
     try:
         alone, _ = (renderer.render(frame(frame_id=index)) for index in range(2))
@@ -70,7 +70,7 @@ def test_other_views_of_a_frame_are_what_each_alone_would_show(gpu: GpuContext, 
         assert views["rsm"].world_from_camera is None, "not the camera's picture"
         np.testing.assert_array_equal(views["delta"].world_from_camera, alone.world_from_camera)
         np.testing.assert_array_equal(views["camera"].color, renderer.sized(frame()).color)
-        assert renderer.pick(32, 24).kind != "nothing", "picking goes on"
+        assert renderer.pick(40, 30).kind != "nothing", "picking goes on"
         for view in ("delta", "rsm"):
             renderer.set_scene(document.replaced(output=document.output.replaced(view=view)))
             np.testing.assert_array_equal(views[view].color, renderer.render(frame(frame_id=4)).color)
