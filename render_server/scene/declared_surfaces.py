@@ -24,6 +24,7 @@ FLUSH = 0.7071
 SAMPLE_STEP, LEAST_SAMPLES = 4, 30
 UNBOUNDED_M = 1e6
 UNBOUNDED = np.tile(np.array([0.0, UNBOUNDED_M], np.float32), (MAX_ROWS, 1))
+UNBOUNDED.flags.writeable = False
 # Reflectance of a declared metal without a colour in the document (that of silver and aluminium).
 ASSUMED_METAL_F0 = 0.9
 
