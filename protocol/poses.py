@@ -12,7 +12,8 @@ from deltalight.protocol.errors import DeltalightError
 
 def rotation_from_wxyz(quaternion: Sequence[float]) -> Float64[np.ndarray, "3 3"]:
     """Return the rotation matrix of a quaternion (w, x, y, z) of any length but zero."""
-    w, x, y, z = np.asarray(quaternion, np.float64) / math.sqrt(sum(part * part for part in quaternion))
+    length = math.sqrt(sum(part * part for part in quaternion))
+    w, x, y, z = (float(part) / length for part in quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

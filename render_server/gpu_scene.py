@@ -43,7 +43,7 @@ class ObjectExtent:
         if len(parts) == 1:
             return cls(parts[0].points, parts[0].upright, tuple(parts))
         points = np.concatenate([each.points for each in parts])
-        upright = np.stack(short_axis.bounds(np.concatenate([each.upright for each in parts])))
+        upright = np.array(short_axis.bounds(np.concatenate([each.upright for each in parts])))
         return cls(points, upright, tuple(parts))
 
     def equals(self, other: "ObjectExtent") -> bool:
@@ -57,14 +57,20 @@ class ObjectExtent:
         """Least and greatest coordinates of the points, m."""
         return short_axis.bounds(self.points)
 
-    @property
+    @cached_property
+    def extended_parts(self) -> Sequence["ObjectExtent"]:
+        """Those of several parts that are no mere points; none if there is one."""
+        return [each for each in self.parts if each.volume_edge > 0] if len(self.parts) > 1 else ()
+
+    @cached_property
     def volume_edge(self) -> float:
         """Edge of a volume around the objects, m: twice the longest edge of `upright` ([P1] 3.2).
 
         It is larger only where several objects that turn come nearer to the border than a single one can.
         """
-        reach = float(np.abs(self.points - self.upright.mean(axis=0)).max())
-        return 2.0 * max(float(np.ptp(self.upright, axis=0).max()), TURN_CLEARANCE * reach)
+        low, high = self.upright
+        reach = float(np.abs(self.points - short_axis.mean(self.upright)).max())
+        return 2.0 * max(float((high - low).max()), TURN_CLEARANCE * reach)
 
 
 @dataclass(frozen=True, eq=False)

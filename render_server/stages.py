@@ -16,7 +16,7 @@ class GraphError(RuntimeError):
     """Stages and resources do not fit together."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Resource(Generic[T]):
     """A named texture, buffer or plain value, and its `version`, which counts its changes; 0: never written.
 
@@ -48,7 +48,7 @@ class Resource(Generic[T]):
         self._value = value
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Stage:
     """A function of resources.
 

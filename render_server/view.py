@@ -62,6 +62,8 @@ class CameraView:
     matting_px: int = 0
 
     def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
         if not isinstance(other, CameraView):
             return NotImplemented
         same_kind = self.antialiased == other.antialiased and self.matting_px == other.matting_px
@@ -128,6 +130,11 @@ class CameraView:
         """Projection of the raster pinhole; row 0 of the picture comes first in memory."""
         return _clip_from(self.camera)
 
+    @cached_property
+    def clip_from_world(self) -> Float64[np.ndarray, "4 4"]:
+        """`clip_from_camera`, of points in the world."""
+        return np.asarray(self.clip_from_camera @ self.camera_from_world)
+
     def rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
         """Returns the pixels that can show the convex hull of world points.
 
@@ -138,8 +145,8 @@ class CameraView:
             return _rectangle(None, self.size)
         # Far outside the picture a lens model may fold back into it.
         low, high = _ray_bounds(self.camera)
-        rays = np.clip(seen[:, :2] / seen[:, 2:], low, high)
-        return _rectangle(self.camera.project(np.column_stack([rays, np.ones(len(rays))])), self.size)
+        rays = np.minimum(np.maximum(seen / seen[:, 2:], low), high)
+        return _rectangle(self.camera.project(rays), self.size)
 
     def raster_rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
         """Like `rectangle_around`, for the raster's texels."""
@@ -165,8 +172,8 @@ class CameraView:
             camera_from_world=self.camera_from_world,
             world_from_camera=self.world_from_camera,
             camera_pinhole=(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
-            raster_pinhole=tuple(self.raster[0]),
-            camera_position=tuple(self.position),
+            raster_pinhole=self.raster[0].tolist(),
+            camera_position=self.position.tolist(),
             picture_size=self.size,
         )
 
@@ -259,17 +266,19 @@ def _clip_from(camera: CameraModel) -> Float64[np.ndarray, "4 4"]:
 
 
 @lru_cache(maxsize=LENSES_KEPT)
-def _ray_bounds(camera: CameraModel) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
-    """Returns the least and greatest (x/z, y/z) that the picture shows, two pixels wider."""
+def _ray_bounds(camera: CameraModel) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    """Returns the least and greatest (x/z, y/z, 1) that the picture shows, two pixels wider."""
     (low, high), margin = _ray_extremes(camera), 2 / camera.matrix[[0, 1], [0, 1]]
-    return low - margin, high + margin
+    return np.append(low - margin, 1.0), np.append(high + margin, 1.0)
 
 
 def _rectangle(places: Float64[np.ndarray, "n 2"] | None, size: tuple[int, int]) -> Rectangle:
     """Returns the rectangle around positions, with a margin; the whole picture if none is finite."""
-    if places is None or not np.isfinite(places).all():
+    if places is None:
         return 0, 0, *size
     lows, highs = (each.tolist() for each in short_axis.bounds(places))
+    if not all(map(math.isfinite, (*lows, *highs))):
+        return 0, 0, *size
     x, y = (_within(math.floor(low) - RECTANGLE_MARGIN_PX, end) for low, end in zip(lows, size, strict=True))
     right, bottom = (
         _within(math.ceil(high) + RECTANGLE_MARGIN_PX, end) for high, end in zip(highs, size, strict=True)

@@ -31,6 +31,7 @@ MARKER_FRAME = "marker:"
 CORNER_PICKS = np.array(
     [[(index >> axis) & 1 for axis in range(3)] for index in range(8)]
 )  # of least, greatest
+EACH_AXIS = np.arange(3)
 
 
 class AnimatedObject:
@@ -212,7 +213,8 @@ class VirtualObjects:
         each = [self._placed(item) for item in objects]
         merged = self._merged([mesh for placed in each for mesh in placed.meshes])
         swept = [self._swept(item, placed.points) for item, placed in zip(objects, each, strict=True)]
-        if not np.ptp(np.vstack(swept), axis=0).any():
+        low, high = short_axis.bounds(np.concatenate(swept))
+        if not (low < high).any():
             return None
         self._buffers.write(merged)
         materials = self._material_table(merged)
@@ -227,9 +229,9 @@ class VirtualObjects:
                 for item, placed in zip(self._shown, objects, strict=True)
                 for lamp in self._lamps(item, placed.world_from_asset)
             ),
-            swept_points=np.vstack(swept) if any(item.moves for item in objects) else None,
+            swept_points=np.concatenate(swept) if any(item.moves for item in objects) else None,
             extents=tuple(
-                ObjectExtent(lasting, np.stack(short_axis.bounds(self._upright(item, placed))))
+                ObjectExtent(lasting, np.array(short_axis.bounds(self._upright(item, placed))))
                 for item, placed, lasting in zip(self._shown, objects, swept, strict=True)
             ),
         )
@@ -299,7 +301,7 @@ class VirtualObjects:
     def _upright(self, item: SceneObject, placed: PlacedObject) -> Float64[np.ndarray, "8 3"]:
         """Returns the corners of the object's box at all times, about its middle in the world but not turned."""
         corners = _box_corners(self._lasting_bounds(item))
-        middle, matrix = corners.mean(axis=0), placed.world_from_asset
+        middle, matrix = short_axis.mean(corners), placed.world_from_asset
         from_middle = (corners - middle) @ item.asset_rotation.T * item.pose.scale
         return np.asarray(matrix[:3, :3] @ middle + matrix[:3, 3] + from_middle)
 
@@ -361,4 +363,4 @@ def world_from_frame(item: SceneObject, board: BoardSpec | None) -> Float64[np.n
 
 def _box_corners(bounds: np.ndarray) -> Float64[np.ndarray, "8 3"]:
     """Returns the eight corners of a box given as (least, greatest)."""
-    return np.asarray(np.asarray(bounds, np.float64)[CORNER_PICKS, range(3)])
+    return np.asarray(np.asarray(bounds, np.float64)[CORNER_PICKS, EACH_AXIS])

@@ -116,6 +116,9 @@ class Program:
         self._resources = values_of([slot.name for slot, _ in bound])
         self._calls = BindingCalls([partial(binder, slot) for slot, binder in bound])
         self._values = values_of([slot.name for slot in self._uniforms])
+        self._held: tuple[Any, ...] | None = (
+            None  # values of the uniforms, if nobody can change them in place
+        )
         self._switch_values = values_of(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:
@@ -161,9 +164,14 @@ class Program:
             raise
         for call in self._calls.of(resources):
             call()
-        for slot, value in zip(self._uniforms, values, strict=True):
-            if type(value) not in CONSTANT or slot.last != value:
-                self._write(slot, value)
+        # Compared all at once: of most programs none is another, and to look at each would take longest of all here.
+        is_constant = CONSTANT.issuperset(map(type, values))
+        if not is_constant or values != self._held:
+            self._held = None  # until all of them are written
+            for slot, value in zip(self._uniforms, values, strict=True):
+                if type(value) not in CONSTANT or slot.last != value:
+                    self._write(slot, value)
+            self._held = values if is_constant else None
 
     def _require(self, names: Set[str], known: Bindings) -> None:
         if not names <= known.keys():

@@ -12,7 +12,7 @@ Value = float | int | bool | Sequence[float] | Sequence[Sequence[float]] | np.nd
 Calls = Sequence[Callable[[], None]]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Slot:
     """An active resource of a linked program with its unit or binding point; `last` is what a uniform holds."""
 

@@ -122,8 +122,8 @@ class LightStages:
     ) -> None:
         receivers = self._receivers_of(real, extent) if is_around_objects else real.points
         mirrors = (
-            mirror_lights([*lights, *lamps], surfaces, np.mean(extent.points, axis=0))
-            if self._mirrors
+            mirror_lights([*lights, *lamps], surfaces, short_axis.mean(extent.points))
+            if self._mirrors and len(surfaces)
             else []
         )
         self.buffers.place(
@@ -281,9 +281,9 @@ def _extent_of(objects: GeometryState) -> ObjectExtent:
 def _snapped(extent: Points) -> Points:
     """Returns the corners of a box around points, snapped to half of its longest edge."""
     low, high = short_axis.bounds(extent)
-    step = max(float(np.max(high - low)) / 2, 1e-6)
+    step = max(float((high - low).max()) / 2, 1e-6)
     step = 2.0 ** np.ceil(np.log2(step))  # an object that turns keeps it
-    return np.stack([np.floor(low / step) * step, np.ceil(high / step) * step])
+    return np.array([np.floor(low / step) * step, np.ceil(high / step) * step])
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:

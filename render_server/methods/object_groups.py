@@ -12,7 +12,7 @@ from deltalight.render_server.passes.volumes import MOST_VOLUMES
 
 def points_of_groups(extent: ObjectExtent) -> list[Float64[np.ndarray, "n 3"]]:
     """Returns the points of each group of objects whose own volumes do not meet those of others; world, m."""
-    parts = [each for each in extent.parts if each.volume_edge > 0]
+    parts = extent.extended_parts
     if len(parts) < 2:
         return [extent.points]
     return [

@@ -173,14 +173,15 @@ class SurfaceShading:
         Geometry, lights, volume, and values derived from them.
         """
         has_caustics = self._caustics is not None and casts_caustics(objects)
+        focal = float(view.camera.matrix[0, 0])
         return {
             **geometry,
             **self._lights.bindings,
             **volume.bindings,
             **object_boxes(objects, volume.placements),
             "normal_offset": self._normal_offset(objects),
-            "pixel_size": 1.0 / view.camera.matrix[0, 0],
-            "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
+            "pixel_size": 1.0 / focal,
+            "sample_distance": 1.5 * self._scale / focal,
             "lit_area": (0, 0, *self.size) if self._options.is_everywhere else area,
             "has_caustics": has_caustics,
             "beam_alpha": GREATEST_ALPHA if has_caustics else 0.0,

@@ -73,16 +73,18 @@ def object_boxes(objects: GeometryState, placements: Placements) -> dict[str, Bi
 
     Each object belongs to one volume, so that none counts twice where volumes overlap.
     """
-    boxes = [np.stack(objects.bounds)]
+    boxes = [np.array(objects.bounds)]
     if len(placements) > 1:
         own = own_extents(objects.extents, placements)
         boxes = [_box(each, placement) for each, placement in zip(own, placements, strict=True)]
-    corners = np.zeros((2, MOST_VOLUMES, 4))
-    for volume, (placement, box) in enumerate(zip(placements, boxes, strict=True)):
-        bounds = placement.voxel_bounds(box)
-        corners[:, volume, :3] = bounds[:3], 1 - bounds[3:]
-    lows, highs = (tuple(each.ravel().tolist()) for each in corners)
-    return {"object_lows": lows, "object_highs": highs}
+    lows: list[int] = []
+    highs: list[int] = []
+    for placement, box in zip(placements, boxes, strict=True):
+        bounds = placement.voxel_bounds(box).tolist()
+        lows += *bounds[:3], 0
+        highs += *(1 - each for each in bounds[3:]), 0
+    unused = [0] * (4 * MOST_VOLUMES - len(lows))
+    return {"object_lows": (*lows, *unused), "object_highs": (*highs, *unused)}
 
 
 def own_extents(extents: Sequence[ObjectExtent], placements: Placements) -> list[list[ObjectExtent]]:
@@ -132,7 +134,7 @@ def place_volumes(
     """
     whole = extent.volume_edge if edge_m is None else edge_m
     single = [extent], (_placed(extent, size_of(1), whole),)
-    parts = [each for each in extent.parts if each.volume_edge > 0]
+    parts = extent.extended_parts
     if edge_m is not None or len(parts) < 2:
         return single
     gaps = relative_gaps(parts)

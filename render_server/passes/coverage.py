@@ -108,7 +108,7 @@ class EdgeTriangles:
             own,
             mesh.solid,
             mesh.corners,
-            clip_from_world=view.clip_from_camera @ view.camera_from_world,
+            clip_from_world=view.clip_from_world,
             triangle_count=mesh.triangle_count,
         )
 

@@ -251,9 +251,9 @@ class LightBuffers:
         return self._texel_m(self.real_views, point)
 
     def _texel_m(self, views: list[LightView], point: Float64[np.ndarray, "3"]) -> float:
-        sizes = []
+        sizes, place = [], np.array([*point.tolist(), 1.0])
         for view in views:
-            depth = (view.view_from_world @ np.append(point, 1.0))[2]
+            depth = (view.view_from_world @ place)[2]
             sizes.append(texel_size_m(view, self.tile_size, float(depth)))
         return max(sizes, default=0.0)
 

@@ -29,6 +29,7 @@ CASTER_CELL = 8
 """Texels an edge of the cells in which distances to casters are known; as in shaders/common/object_shadows.glsl."""
 MOST_VIEWS = 6  # of a light: the faces of a cube
 TEXEL_BYTES = 4 + 8 + 16  # of an atlas: depth, `normal` and `uv`
+AXES = np.eye(3)
 EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
 
 
@@ -267,24 +268,23 @@ def _views_around(
     receivers: Float64[np.ndarray, "n 3"],
     occluders: Float64[np.ndarray, "m 3"],
 ) -> list[LightView]:
-    view = _perspective_view(position, receivers.mean(axis=0) - position, receivers, occluders)
+    view = _perspective_view(position, short_axis.mean(receivers) - position, receivers, occluders)
     if view is not None:
         return [view]
-    axes = np.vstack([np.eye(3), -np.eye(3)])
     return [
         _wide_view(position, axis, 1.0, receivers, occluders)
-        for axis in axes
+        for axis in (*AXES, *-AXES)
         if (_tangents((receivers - position) @ frame_along(axis).T) <= 1.0).any()
     ]
 
 
 def frame_along(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     """Returns the rotation whose rows are right, down, and the unit axis."""
-    z = axis / np.linalg.norm(axis)
-    helper = np.eye(3)[np.argmin(np.abs(z))]
+    z = axis / short_axis.length(axis)
+    helper = AXES[np.abs(z).argmin()]
     x = _cross(helper, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, _cross(z, x), z])
+    x /= short_axis.length(x)
+    return np.array([x, _cross(z, x), z])
 
 
 def _cross(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
@@ -351,16 +351,15 @@ def _perspective_view(
     occluders: Float64[np.ndarray, "m 3"],
 ) -> LightView | None:
     """Returns the view along `axis` around all receivers; None if that is too wide for one view."""
-    if np.linalg.norm(axis) < NEAREST_M:
+    if short_axis.length(axis) < NEAREST_M:
         return None
     rotation = frame_along(axis)
     local = (receivers - position) @ rotation.T
     half = float(_tangents(local).max()) * 1.01 + 1e-4
     if half > WIDEST_SINGLE_TANGENT:
         return None
-    depths = local[
-        :, 2
-    ]  # all of them are inside, and need not be looked at again if they are the occluders, too
+    # All of them are inside, and need not be looked at again if they are the occluders, too.
+    depths = local[:, 2]
     others = occluders[:0] if occluders is receivers else (occluders - position) @ rotation.T
     near, far = _range_around(depths, others, half, float(depths.max()))
     return LightView(_matrix(rotation, position), half, near, far, False)

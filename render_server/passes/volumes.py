@@ -1,5 +1,6 @@
 """Where the volumes around the objects lie: cubes of voxels along the world axes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -101,10 +102,14 @@ class VolumePlacement:
 
     def voxel_bounds(self, points: Float64[np.ndarray, "n 3"]) -> np.ndarray[Any, np.dtype[np.int32]]:
         """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
-        voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
-        voxels = np.clip(voxels, 0, self.size - 1)
-        low, high = short_axis.bounds(voxels)
-        return np.concatenate([low, -high]).astype(np.int32)
+        low, high = (
+            map(self._voxel, box, self.origin) for box in map(np.ndarray.tolist, short_axis.bounds(points))
+        )
+        return np.array([*low, *(-each for each in high)], np.int32)
+
+    def _voxel(self, place: float, origin: float) -> int:
+        """Returns the number of the voxel at a place along one axis, or of the nearest."""
+        return min(max(math.floor((place - origin) / self.voxel_edge), 0), self.size - 1)
 
 
 def place_volume(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
@@ -22,6 +23,8 @@ SHEET_TOLERANCE_M = 0.005
 FLUSH = 0.7071
 SAMPLE_STEP, LEAST_SAMPLES = 4, 30
 UNBOUNDED_M = 1e6
+UNBOUNDED = np.tile(np.array([0.0, UNBOUNDED_M], np.float32), (MAX_ROWS, 1))
+UNBOUNDED.flags.writeable = False
 # Reflectance of a declared metal without a colour in the document (that of silver and aluminium).
 ASSUMED_METAL_F0 = 0.9
 
@@ -57,7 +60,7 @@ class SurfaceTable:
         """Perceptual roughness."""
         return self.packed[:, 1, 0]
 
-    @property
+    @cached_property
     def is_specular(self) -> bool:
         """Whether any of them reflects, other than sheets."""
         return bool((self.packed[:, 3, 3] < SHEET).any())
@@ -173,10 +176,10 @@ def plane_fits(
     the height is the median of what lies within the tolerance and faces the plane's way, the noise the larger of
     `noise_sigma` and what the median deviation says. Unbounded where there is no depth, or too little of the plane.
     """
-    fits = np.tile(np.array([0.0, UNBOUNDED_M], np.float32), (MAX_ROWS, 1))
     planes = np.flatnonzero(table.packed[:, 3, 3] == PLANE)
     if depth is None or not len(planes):
-        return fits
+        return UNBOUNDED
+    fits = UNBOUNDED.copy()
     seen = _sampled(depth, fitted().normals, world_from_camera)
     for index in planes:
         fits[index] = _plane_fit(table.packed[index].astype(float), seen, noise_sigma)

@@ -36,6 +36,13 @@ def test_bounds_greatest_and_lengths_are_those_of_numpy(values: np.ndarray) -> N
     _same(short_axis.lengths(values[:, :3]), np.linalg.norm(values[:, :3], axis=-1))
 
 
+@given(st.integers(0, 2**32 - 1), SHAPES)
+def test_mean_and_length_are_those_of_numpy(seed: int, shape: tuple[int, int]) -> None:
+    values = _values(seed, np.float64, shape)
+    _same(short_axis.mean(values), values.mean(axis=0))
+    np.testing.assert_array_equal(short_axis.length(values[0]), np.linalg.norm(values[0]))
+
+
 @given(arrays.arrays(bool, st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 5))))
 def test_masks_of_any_shape_are_reduced_along_their_last_axis(mask: np.ndarray) -> None:
     _same(short_axis.all_of(mask), mask.all(axis=-1))
