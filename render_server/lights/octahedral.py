@@ -59,25 +59,31 @@ def prefilter(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
 
 @cache
 def _black(size: int) -> PrefilteredMap:
-    """Returns a black map; cached, because estimates of bounced light ask for it whenever lights change."""
-    return _prefiltered(np.zeros((size, size, 3), np.float32))
+    """Returns a black map, of which nothing has to be averaged; estimates of bounced light ask for it often."""
+    angles, sizes = _cones(size)
+    return PrefilteredMap(tuple(np.zeros((each, each, 3), np.float32) for each in sizes), angles)
+
+
+def _cones(size: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
+    """Returns half angles (radians) and sizes of all levels of a map of this size."""
+    angles, sizes = [float(np.sqrt(4 * np.pi)) / size], [size]
+    while angles[-1] < np.pi / 2:
+        angles.append(min(2 * angles[-1], np.pi / 2))
+        sizes.append(max(size >> len(sizes), min(size, MIN_LEVEL_SIZE)))
+    return tuple(angles), tuple(sizes)
 
 
 def _prefiltered(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
-    size = len(radiance)
     halved = [radiance]
     while len(halved[-1]) > SUMMED_SIZE // 4:
         halved.append(_halved(halved[-1]))
     summed = next((source for source in halved if len(source) <= SUMMED_SIZE), radiance)
-    levels, angles = [radiance], [float(np.sqrt(4 * np.pi)) / size]
-    while angles[-1] < np.pi / 2:
-        angles.append(min(2 * angles[-1], np.pi / 2))
-        level_size = max(size >> len(levels), min(size, MIN_LEVEL_SIZE))
-        if angles[-1] < SUMMED_FROM_RAD:
-            levels.append(_cone_average(halved, angles[-1], level_size))
-        else:
-            levels.append(_cone_sum(summed, angles[-1], level_size))
-    return PrefilteredMap(tuple(levels), tuple(angles))
+    angles, sizes = _cones(len(radiance))
+    levels = [radiance]
+    for angle, size in zip(angles[1:], sizes[1:], strict=True):
+        is_narrow = angle < SUMMED_FROM_RAD
+        levels.append(_cone_average(halved, angle, size) if is_narrow else _cone_sum(summed, angle, size))
+    return PrefilteredMap(tuple(levels), angles)
 
 
 def _halved(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:

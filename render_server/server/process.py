@@ -218,7 +218,7 @@ def _topic(item: Sendable) -> str:
 
 def warm_up() -> None:
     """Prepares what every renderer needs before its first picture and what takes no OpenGL, for spare processes."""
-    prefilter(np.zeros((ENVIRONMENT_SIZE, ENVIRONMENT_SIZE, 3), np.float32))
+    prefilter(np.ones((ENVIRONMENT_SIZE, ENVIRONMENT_SIZE, 3), np.float32))  # what it looks up is kept
 
 
 def run_server(settings: ServerSettings, keys: Keys | None = None, ahead: BuiltAhead | None = None) -> None:

@@ -19,7 +19,7 @@ from deltalight.services.api.credentials import SecretToken
 from deltalight.services.api.head_requests import HeadRequests
 from deltalight.services.api.host_names import HostNames
 from deltalight.services.api.metrics import MetricsMiddleware
-from deltalight.services.api.problems import describe_problems, responses
+from deltalight.services.api.problems import problem_schema
 from deltalight.services.api.room_paths import RoomPaths
 from deltalight.services.api.rooms import Rooms
 from deltalight.services.api.routes import (
@@ -41,7 +41,6 @@ from deltalight.services.live_message import LiveHeader
 from deltalight.services.storage.store import Store
 from deltalight.services.storage.tokens import Role
 
-PREFIX = "/api/v1"
 ROUTERS = (
     *scenes.ROUTERS,
     *assets.ROUTERS,
@@ -55,7 +54,6 @@ ROUTERS = (
     *rooms.ROUTERS,
     *state.ROUTERS,
 )
-ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # raised by the middleware, by a body, or by the disk
 DESCRIPTION = """Scenes, assets and the state of a Deltalight installation.
 
 Every change of a scene is a revision; `If-Match` with the revision that a change is made to refuses it (409) where
@@ -94,13 +92,14 @@ TAGS = [
 
 
 class _App(FastAPI):
-    """FastAPI with additions to its OpenAPI document: media type of problems, tokens, and the live header."""
+    """FastAPI with additions to its OpenAPI document: problems, tokens, and the live header."""
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document."""
         if self.openapi_schema is None:
-            schema = describe_problems(super().openapi())
-            schema["components"]["schemas"].update(_live_header_schemas())
+            schema = super().openapi()
+            schemas = schema["components"]["schemas"] | problem_schema()
+            schema["components"]["schemas"] = dict(sorted(schemas.items())) | _live_header_schemas()
             schema["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
             schema["security"] = [{}, {"token": []}]
             self.openapi_schema = schema
@@ -139,13 +138,11 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         redoc_url=None,
         lifespan=lifespan,
         separate_input_output_schemas=False,
-        generate_unique_id_function=lambda route: route.name,
         middleware=_middleware(settings, store, context),
     )
     app.state.context, app.state.contexts, app.state.rooms = context, contexts, all_rooms
     context.problems.install(app)
-    for router in ROUTERS:
-        app.include_router(router, prefix=PREFIX, responses=responses(*ANYWHERE))
+    app.router.routes.extend(route for router in ROUTERS for route in router.routes)
     app.router.default = StaticPage(app.router.not_found)
     return app
 

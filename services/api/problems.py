@@ -7,6 +7,7 @@ from typing import Any
 
 import structlog
 from fastapi import FastAPI, Request
+from fastapi.encoders import jsonable_encoder
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
@@ -166,25 +167,26 @@ class Problems:
         return self.response(422, "invalid", f"`{_place(first['loc'])}` is wrong: {wrong_in_words(first)}.")
 
 
-def describe_problems(schema: dict[str, Any]) -> dict[str, Any]:
-    """Return an OpenAPI document whose errors have the media type of problem details."""
-    for path in schema["paths"].values():
-        for operation in path.values():
-            for status, response in operation.get("responses", {}).items():
-                if status >= "400" and "content" in response:
-                    (described,) = response["content"].values()
-                    response["content"] = {MEDIA_TYPE: described}
-    return schema
+def problem_schema() -> dict[str, Any]:
+    """Return the schema of a problem for an OpenAPI document's components, where descriptions refer to it."""
+    schema = Problem.model_json_schema(mode="serialization")
+    return {Problem.__name__: jsonable_encoder(schema, exclude_none=True)}
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the errors of a route for its OpenAPI description."""
-    return {status: {"model": Problem, "description": HTTPStatus(status).phrase} for status in statuses}
+    return {status: _described(HTTPStatus(status).phrase) for status in statuses}
 
 
 def unavailable(when: str) -> dict[int | str, dict[str, Any]]:
     """Return the 503 of a route for its OpenAPI description; `when` is a sentence."""
-    return {503: {"model": Problem, "description": when}}
+    return {503: _described(when)}
+
+
+def _described(what: str) -> dict[str, Any]:
+    """Describe an error by a reference: FastAPI would make a validator of each `model` that is named here."""
+    schema = {"$ref": f"#/components/schemas/{Problem.__name__}"}
+    return {"description": what, "content": {MEDIA_TYPE: {"schema": schema}}}
 
 
 def _slug(status: int) -> str:

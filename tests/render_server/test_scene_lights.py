@@ -57,6 +57,16 @@ def test_constant_environment_gives_pi_times_radiance_everywhere() -> None:
         np.testing.assert_allclose(level, 0.7, rtol=1e-4)
 
 
+@pytest.mark.parametrize("size", [8, 64, 256])
+def test_black_has_the_levels_of_any_map(size: int) -> None:
+    black, white = (prefilter(np.full((size, size, 3), value, np.float32)) for value in (0.0, 1.0))
+    assert black.half_angles == white.half_angles
+    assert [(each.shape, each.dtype) for each in black.levels] == [
+        (each.shape, each.dtype) for each in white.levels
+    ]
+    assert not any(each.any() for each in black.levels)
+
+
 def test_linear_sky_gives_its_closed_form() -> None:
     """L = 1 + d.z: E(n) = pi + 2 pi/3 n.z."""
 

@@ -20,7 +20,7 @@ from tests.services.conftest import HEIGHT, WIDTH
 from tests.services.live_samples import composite, report, wait_for_frames
 
 SHADES = {"left": 60, "right": 180}
-PERIOD_S = 0.02
+PERIOD_S = 0.1
 
 
 def cameras_message(statuses: Mapping[str, CameraStatus], number: int = 1) -> CamerasMessage:

@@ -64,10 +64,14 @@ NEEDS_BROWSER = [pytest.mark.slow(seconds=6), USES_BROWSER]
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A running browser; `expect` waits for it as long as everything else does."""
+    """A running browser; `expect` waits for it as long as everything else does.
+
+    It keeps no process in reserve for the next page, which would take a third of a second of the processor each time.
+    """
     expect.set_options(timeout=PATIENCE_S * 1000)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        options = ["--no-sandbox", "--renderer-process-limit=1"]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
         yield browser
         browser.close()
 
@@ -116,7 +120,8 @@ class Stack:
 @contextmanager
 def demo_stack(data: Path) -> Iterator[Stack]:
     """The demo with small pictures, so that a software renderer makes several a second."""
-    with running_stack(data, _scene(), slow_demo(data)) as stack:
+    source = slow_demo(data, (640, 480)) if SCREENSHOTS else slow_demo(data)
+    with running_stack(data, _scene(), source) as stack:
         yield stack
 
 

@@ -25,7 +25,7 @@ from deltalight.services import ports
 from tests.services.api_samples import RenderServer, RunningApi, running_api
 from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera
 
-PERIOD_S = 0.02
+PERIOD_S = 0.1  # each picture takes 1 ms of its processor, and of that of each process that hears it
 PATIENCE_S = 60.0  # on a busy machine
 AGE_S = 0.005
 NOISE = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
@@ -34,7 +34,7 @@ AROUND = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
 
 
 class StandInStream:
-    """Publishes a composite every `period_s`, each tenth time a report too; `scene` = id and revision of what it has.
+    """Publishes a composite every `period_s`, each second time a report too; `scene`: id and revision of what it has.
 
     While `is_busy` it does neither, as a renderer that is at work on a slow frame; a camera that sends `camera_fps`
     frames a second reports meanwhile. `ages_s` are the times since the composites' capture, in turn. `watched`
@@ -65,7 +65,7 @@ class StandInStream:
         for number in itertools.count(1):
             if self._stop.wait(self._period_s):
                 return
-            if number % 10 == 0 and self.camera_fps is not None:
+            if number % 2 == 0 and self.camera_fps is not None:
                 self.publisher.send(encode(report("camera", rates={"fps": self.camera_fps})))
             if self.is_busy:
                 continue
@@ -76,7 +76,7 @@ class StandInStream:
             )
             pictures = [encode_color(np.full(shape, shade(each.view), np.uint8)) for each in others]
             self.publisher.send(encode(message, [jpeg, *pictures]))
-            if number % 10 == 0:
+            if number % 2 == 0:
                 self.publisher.send(encode(report("render-server", "stand-in renderer")))
             self.sent = number
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from deltalight.benchmarks.soak.station import write_take
 from deltalight.benchmarks.speed.motions import STANDING
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
@@ -20,7 +21,6 @@ from deltalight.protocol.frames import BoardPose, SensorFrame
 from deltalight.protocol.messages import CompositeMessage
 from deltalight.protocol.pictures import depth_from_steps
 from deltalight.protocol.publisher import Publisher
-from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
 from deltalight.sensor_node.frame_messages import (
@@ -30,7 +30,6 @@ from deltalight.sensor_node.frame_messages import (
     fisheye_multipart,
     pose_multipart,
 )
-from deltalight.services.demo import RECORDING
 from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
 from deltalight.services.stream_queue import StreamQueue
 from tests.protocol.fisheye_samples import coded
@@ -39,21 +38,20 @@ WIDTH, HEIGHT = 72, 54  # no power of two (CONTRIBUTING.md)
 PATIENCE_S = 60
 STARTED_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 33_333_333
+DEMO_FRAMES_PER_S = 15.0
 BOARD = BoardSpec(
     type="aruco_grid", dictionary="DICT_4X4_50", marker_length_m=0.04, separation_m=0.01, rows=3, columns=4
 )
 
 
-def slow_demo(folder: Path) -> Path:
-    """Every third frame of the demo's recording while its camera stands still: five a second, not fifteen.
+def slow_demo(folder: Path, size: tuple[int, int] = (320, 240)) -> Path:
+    """Every sixth frame of the demo's recording while its camera stands still: 2.5 a second, not 15, and smaller.
 
     For tests that wait for pictures of running processes: a node and a renderer of the whole recording keep two cores
-    busy all the time.
+    busy all the time. The node of four times as many pixels takes as much of the processor as the renderer.
     """
-    reader, out = RecordingReader(RECORDING), folder / "demo.mcap"
-    with RecordingWriter(out, board=reader.board, extrinsics=reader.extrinsics) as writer:
-        for number in STANDING[::3]:
-            writer.add(reader[number])
+    out = folder / "demo.mcap"
+    write_take(out, size, DEMO_FRAMES_PER_S / 6, STANDING[::6])
     return out
 
 

@@ -17,6 +17,7 @@ import pytest
 
 from deltalight.services import ports
 from deltalight.services.api import camera_finder, recording_session, replay_control
+from deltalight.services.api.problems import Problem
 from deltalight.services.storage import assets
 from deltalight.services.storage.asset_kinds import Facts
 from deltalight.services.storage.asset_sandbox import Task, run_limited
@@ -28,6 +29,7 @@ from tests.services.render_server_samples import Recorder
 from tests.services.storage_samples import TETRAHEDRON, upload
 
 PROBLEM = "application/problem+json"
+PROBLEM_SCHEMA = "#/components/schemas/Problem"
 CHECKS = (
     "not_a_server_error",
     "status_code_conformance",
@@ -185,7 +187,8 @@ def test_the_description_tells_what_clients_need(api: RunningApi) -> None:
             body = content["application/json"]
             assert body["schema"].get("examples"), (method, operation["operationId"])
         for status, response in operation["responses"].items():
-            assert status < "400" or list(response["content"]) == [PROBLEM]
+            assert status < "400" or response["content"] == {PROBLEM: {"schema": {"$ref": PROBLEM_SCHEMA}}}
+    assert description["components"]["schemas"]["Problem"]["properties"].keys() == Problem.model_fields.keys()
 
 
 @pytest.mark.parametrize("part", ["scene", "object", "lights", "method", "real", "output"])

@@ -2,10 +2,11 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from deltalight.protocol.scene import DIGEST_PREFIX
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.models import AssetAnswer
@@ -14,7 +15,7 @@ from deltalight.services.api.request_bodies import UPLOAD_TYPE, require_upload_t
 from deltalight.services.storage.asset_kinds import FORMATS
 from deltalight.services.storage.assets import Asset
 
-router = APIRouter(tags=["assets"], prefix="/assets")
+router = api_router("/assets", tags=["assets"])
 ROUTERS = (router,)
 Digest = Annotated[
     str, Path(description="`sha256:<hex>` or the digits alone.", examples=["sha256:2c26b46b68ffc68f..."])

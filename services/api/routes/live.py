@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from fastapi import APIRouter, Body, Query, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import Body, Query, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -13,6 +13,7 @@ from deltalight import __version__
 from deltalight.protocol.message_fields import MAX_EDGE_PX
 from deltalight.protocol.messages import RadianceMessage
 from deltalight.protocol.scene_fields import ShownView
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.credentials import TICKET_LIFE_S, principal_of
 from deltalight.services.api.events import EventQueue, packed
@@ -51,8 +52,8 @@ WantedCamera = Annotated[
     Query(max_length=64, description="Name of the camera's node; default: the first camera."),
 ]
 
-live_router = APIRouter(tags=["live"])
-events_router = APIRouter(tags=["state"])
+live_router = api_router(tags=["live"])
+events_router = api_router(tags=["state"])
 ROUTERS = (live_router, events_router)
 
 

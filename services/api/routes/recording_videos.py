@@ -5,15 +5,14 @@ import time
 from functools import partial
 from typing import Any
 
-from fastapi import APIRouter
-
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import JOBS, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.recording_videos import VideoAnswer, was_stopped
 from deltalight.services.api.routes.recordings import RecordingId, require_at_rest
 
-router = APIRouter(tags=["recordings"], prefix="/recordings", dependencies=[JOBS])
+router = api_router("/recordings", tags=["recordings"], dependencies=[JOBS])
 ROUTERS = (router,)
 
 WAIT_S = 10.0  # for a short video; proxies give up after 30 s and more

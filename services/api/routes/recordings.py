@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from fastapi import APIRouter, Body, Path, Query, Request, Response
+from fastapi import Body, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field, StrictBool, ValidationError
 
@@ -13,6 +13,7 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import Name
 from deltalight.sensor_node.cameras.playback import MAX_RATE, MIN_RATE
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import JOBS, Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.playback_client import Position
@@ -23,8 +24,8 @@ from deltalight.services.api.replay_control import ReplayOrder
 from deltalight.services.api.request_bodies import AS_SENT, UPLOAD_TYPE, checked, require_upload_type
 from deltalight.services.storage.faults import ConflictError
 
-router = APIRouter(tags=["recordings"], prefix="/recordings", dependencies=[JOBS])
-replay_router = APIRouter(tags=["recordings"], prefix="/replay", dependencies=[JOBS])
+router = api_router("/recordings", tags=["recordings"], dependencies=[JOBS])
+replay_router = api_router("/replay", tags=["recordings"], dependencies=[JOBS])
 ROUTERS = (router, replay_router)
 Heard = TypeVar("Heard", bound=StrictModel)
 

@@ -3,9 +3,10 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fastapi import APIRouter, Response
+from fastapi import Response
 
 from deltalight.protocol.pictures import read_bytes
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.routes.live import NO_ANSWER, PICTURE_HEADERS
@@ -13,7 +14,7 @@ from deltalight.services.api.routes.live import NO_ANSWER, PICTURE_HEADERS
 TIMEOUT_S = 15.0  # some frames of the slowest renderer, and the file
 GLB_TYPE = "model/gltf-binary"
 
-router = APIRouter(tags=["live"])
+router = api_router(tags=["live"])
 ROUTERS = (router,)
 
 

@@ -3,12 +3,13 @@
 from collections.abc import Callable, Sequence
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Depends, Path
+from fastapi import Body, Depends, Path
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
 
 from deltalight.protocol.documents import NAME_PATTERN
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.rooms import Rooms
@@ -24,7 +25,7 @@ from deltalight.services.rooms.directory import (
 from deltalight.services.rooms.status import HOST_PATTERN, RoomList, RoomState, RoomStatus, SlotStatus
 from deltalight.services.storage.faults import ConflictError, NotFoundError, StorageFaultError
 
-router = APIRouter(tags=["rooms"])
+router = api_router(tags=["rooms"])
 ROUTERS = (router,)
 
 NO_DIRECTORY = "The directory of rooms does not respond, or (with Retry-After) has too many pending requests."

@@ -4,13 +4,14 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query, Response
+from fastapi import Path, Query, Response
 
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_lights import Lights, ManualLight
 from deltalight.protocol.scene_objects import RealScene, SceneObject
 from deltalight.protocol.scene_output import Output, Shading
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import ExpectedRevision, IfUnchanged, Shared, with_revision_of
 from deltalight.services.api.models import RevisionEntry, SceneAnswer, SceneSummary
 from deltalight.services.api.problems import responses
@@ -49,10 +50,10 @@ from deltalight.services.storage.documents import (
 )
 from deltalight.services.storage.faults import NotFoundError
 
-scenes_router = APIRouter(tags=["scenes"])
-objects_router = APIRouter(tags=["objects"], prefix="/scenes/{scene_id}/objects")
-lights_router = APIRouter(tags=["lights"], prefix="/scenes/{scene_id}/lights/manual")
-parts_router = APIRouter(prefix="/scenes/{scene_id}")
+scenes_router = api_router(tags=["scenes"])
+objects_router = api_router("/scenes/{scene_id}/objects", tags=["objects"])
+lights_router = api_router("/scenes/{scene_id}/lights/manual", tags=["lights"])
+parts_router = api_router("/scenes/{scene_id}")
 ROUTERS = (scenes_router, objects_router, lights_router, parts_router)
 
 SceneId = Annotated[str, Path(description="The scene's `id`.", examples=["4f0c2a9be1d37785"])]

@@ -2,16 +2,17 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Response
+from fastapi import Path, Response
 from pydantic import BaseModel, Field
 
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.models import AssetAnswer
 from deltalight.services.api.problems import responses
 from deltalight.services.api.routes.assets import KEPT_ANSWERS, announced
 from deltalight.services.storage.shelf import SHELF
 
-router = APIRouter(tags=["assets"], prefix="/shelf")
+router = api_router("/shelf", tags=["assets"])
 ROUTERS = (router,)
 
 

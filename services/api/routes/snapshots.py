@@ -5,7 +5,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any, get_args
 
 import numpy as np
-from fastapi import APIRouter, Body, Path, Response
+from fastapi import Body, Path, Response
 from jaxtyping import UInt8
 from pydantic import Field, StrictBool, model_validator
 
@@ -14,6 +14,7 @@ from deltalight.protocol.message_fields import Name
 from deltalight.protocol.methods import Method
 from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.protocol.scene_output import Output
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.problems import ProblemError, responses, unavailable
@@ -24,7 +25,7 @@ from deltalight.services.api.snapshot_store import ID, SnapshotFacts, SnapshotPi
 from deltalight.services.before_after import before_after_gif, write_before_after_video
 from deltalight.services.storage.faults import NotFoundError
 
-router = APIRouter(tags=["snapshots"], prefix="/snapshots")
+router = api_router("/snapshots", tags=["snapshots"])
 ROUTERS = (router,)
 VIEWS: tuple[str, ...] = ("camera", *get_args(Output.model_fields["view"].annotation))
 BEFORE_AFTER = ("camera", "composite")

@@ -2,12 +2,13 @@
 
 from typing import Literal
 
-from fastapi import APIRouter, Response
+from fastapi import Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
 from deltalight import __version__
 from deltalight.protocol.messages import CameraEntry, CameraStatus
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.camera_finder import CamerasAnswer
 from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.live_frame import LiveFrame
@@ -21,8 +22,8 @@ from deltalight.services.api.streams import Report
 
 READY_PICTURE_S = 10.0  # five pictures of a slow renderer
 
-state_router = APIRouter(tags=["state"])
-nodes_router = APIRouter(tags=["nodes"])
+state_router = api_router(tags=["state"])
+nodes_router = api_router(tags=["nodes"])
 ROUTERS = (state_router, nodes_router)
 
 

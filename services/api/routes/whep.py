@@ -2,16 +2,17 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import Path, Request, Response
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Shared
 from deltalight.services.api.credentials import principal_of
 from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.routes.live import WantedCamera, WantedView
 from deltalight.services.api.whep import WatchedView, Watcher
 
-router = APIRouter(tags=["live"])
+router = api_router(tags=["live"])
 ROUTERS = (router,)
 
 SDP_TYPE = "application/sdp"
