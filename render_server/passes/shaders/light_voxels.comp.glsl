@@ -149,7 +149,7 @@ void add(uint voxel, vec3 n, float area, float opaque, vec3 radiance) {
     for (int axis = 0; axis < 3; ++axis) {
         float facing = abs(n[axis]) * scale;
         int k = 2 * axis + (n[axis] > 0.0 ? 1 : 0);   // the direction along the axis that the surface faces
-        if (facing <= 0.0) continue;
+        if (!(facing > 0.0)) continue;   // nor where it is no number
 #ifdef REAL_DELTA
         int at = slot * 18 + k * 3;
         for (int j = 0; j < 3; ++j) atomicAdd(delta_sums[at + j], fixed_point(radiance[j] * facing));
