@@ -93,6 +93,7 @@ class Program:
         self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
         self.compute = cast("moderngl.ComputeShader", program)  # if it is one that is dispatched
         self.users: set[int] = set()  # ids of the kernels that have not been released
+        self.has_switches = bool(declared.switches)
         self._samplers: list[Slot] = []
         self._images: list[Slot] = []
         self._arrays: list[Slot] = []  # storage buffers that a shader takes as images
@@ -115,6 +116,7 @@ class Program:
         self._resources = values_of([slot.name for slot, _ in bound])
         self._calls = BindingCalls([partial(binder, slot) for slot, binder in bound])
         self._values = values_of([slot.name for slot in self._uniforms])
+        self._switch_values = values_of(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:
         slot = Slot(name, member, getattr(member, "gl_type", 0))
@@ -155,13 +157,30 @@ class Program:
                 self._shown[slot.name].bind(slot.place, self._buffer(slot, known[slot.name]))
         except KeyError:
             slots = self._samplers, self._images, self._storage, self._blocks, self._arrays, self._uniforms
-            _require(self.label, {slot.name for each in slots for slot in each}, known)
+            self._require({slot.name for each in slots for slot in each}, known)
             raise
         for call in self._calls.of(resources):
             call()
         for slot, value in zip(self._uniforms, values, strict=True):
             if type(value) not in CONSTANT or slot.last != value:
                 self._write(slot, value)
+
+    def _require(self, names: Set[str], known: Bindings) -> None:
+        if not names <= known.keys():
+            missing = min(names - known.keys())
+            raise BindingError(f"Kernel {self.label} needs `{missing}`, which it was not given.")
+
+    def switched_on(self, known: Bindings) -> tuple[str, ...]:
+        """Returns the names of the defines that bindings turn on.
+
+        Raises:
+            BindingError: one is missing.
+        """
+        try:
+            return tuple(compress(self._declared.switches, self._switch_values(known)))
+        except KeyError:
+            self._require(frozenset(self._declared.switches), known)
+            raise
 
     def _nearest(self, name: str) -> str:
         close = get_close_matches(name, self._declared.names, 1)
@@ -262,6 +281,11 @@ class Program:
             ) from error
         slot.last = data
 
+    @property
+    def local_size(self) -> tuple[int, int, int]:
+        """Invocations of a workgroup."""
+        return self._declared.local_size
+
     def resources(self) -> dict[str, list[str]]:
         """Names of the active samplers, images, storage blocks and uniform blocks."""
         return {
@@ -290,21 +314,14 @@ class Program:
 class Shader(ABC):
     """The programs of one shader: with each set of its switches (`#pragma switch NAME`) that bindings turn on.
 
-    Those of a shader with switches are compiled when first run: what a scene lacks costs nothing.
+    All but the one without any are compiled when first run: what a scene lacks costs nothing.
     """
 
     def __init__(self, gpu: GpuContext, name: str | Path, defines: Mapping[str, float | str]) -> None:
         self._gpu, self._name, self._defines = gpu, name, defines
-        declared = declarations(self._source(defines))
-        self.label, self.local_size = label_of(name, defines), declared.local_size
-        self._switches, self._switch_values = declared.switches, values_of(declared.switches)
-        self._programs: dict[tuple[str, ...], Program] = {}
-        if not self._switches:
-            self._program(())
-
-    @abstractmethod
-    def _source(self, defines: Mapping[str, float | str]) -> str:
-        """Returns all text of the shader with these defines."""
+        self._plain = self._compiled(defines)
+        self._switched: dict[tuple[str, ...], Program] = {}
+        self.label, self.local_size = self._plain.label, self._plain.local_size
 
     @abstractmethod
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
@@ -328,27 +345,22 @@ class Shader(ABC):
         return program, known
 
     def _chosen(self, known: Bindings) -> Program:
-        if not self._switches:
-            return self._programs[()]
-        try:
-            on = tuple(compress(self._switches, self._switch_values(known)))
-        except KeyError:
-            _require(self.label, frozenset(self._switches), known)
-            raise
-        return self._program(on)
-
-    def _program(self, on: tuple[str, ...]) -> Program:
-        if on not in self._programs:
-            self._programs[on] = self._compiled({**self._defines, **dict.fromkeys(on, 1)})
-        return self._programs[on]
+        if not self._plain.has_switches:
+            return self._plain
+        on = self._plain.switched_on(known)
+        if not on:
+            return self._plain
+        if on not in self._switched:
+            self._switched[on] = self._compiled({**self._defines, **dict.fromkeys(on, 1)})
+        return self._switched[on]
 
     def resources(self) -> dict[str, list[str]]:
-        """Returns the names of the bindings without any switch, by kind."""
-        return self._program(()).resources()
+        """Returns the names of the plain program's bindings, by kind."""
+        return self._plain.resources()
 
     def release(self) -> None:
         """Leaves the programs to other kernels of the same source."""
-        for each in self._programs.values():
+        for each in (self._plain, *self._switched.values()):
             self._gpu.programs.give_back(self, each)
 
 
@@ -363,17 +375,16 @@ class Kernel(Shader):
         super().__init__(gpu, name, defines)
 
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
-        source, label = self._source(defines), label_of(self._name, defines)
-        self._tell_compiled(label, {"comp": shader_source(SHADERS / f"{self._name}.comp.glsl", defines)})
+        path, label = SHADERS / f"{self._name}.comp.glsl", label_of(self._name, defines)
+        source = shader_source(path, {**self._gpu.defines, **defines})
+        self._tell_compiled(label, {"comp": shader_source(path, defines)})
+        if self._gpu.is_software:
+            source = with_images(source, self._gpu.most_images)
 
         def link() -> Program:
             return Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))
 
         return self._shared(source, link=link)
-
-    def _source(self, defines: Mapping[str, float | str]) -> str:
-        source = shader_source(SHADERS / f"{self._name}.comp.glsl", {**self._gpu.defines, **defines})
-        return with_images(source, self._gpu.most_images) if self._gpu.is_software else source
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
         """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
@@ -411,21 +422,17 @@ class RasterKernel(Shader):
         super().__init__(gpu, name, defines)
 
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
-        vertex, fragment = self._stages(defines)
+        vertex, fragment = (
+            shader_source(SHADERS / f"{self._name}.{stage}.glsl", defines) for stage in ("vert", "frag")
+        )
         label = label_of(self._name, defines)
         self._gpu.compiled(label, {"vert": vertex, "frag": fragment})
 
         def link() -> Program:
             program = self._gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
-            return Program(self._gpu, label, program, declarations(self._source(defines)))
+            return Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
 
         return self._shared(vertex, fragment, link=link)
-
-    def _stages(self, defines: Mapping[str, float | str]) -> list[str]:
-        return [shader_source(SHADERS / f"{self._name}.{stage}.glsl", defines) for stage in ("vert", "frag")]
-
-    def _source(self, defines: Mapping[str, float | str]) -> str:
-        return "\n".join(self._stages(defines))
 
     def draw(
         self,
@@ -459,12 +466,6 @@ class RasterKernel(Shader):
 def _attachments(target: moderngl.Framebuffer) -> dict[str, object]:
     items = enumerate([*target.color_attachments, target.depth_attachment])
     return {f"attachment {number}": item for number, item in items}
-
-
-def _require(label: str, names: Set[str], known: Bindings) -> None:
-    if not names <= known.keys():
-        missing = min(names - known.keys())
-        raise BindingError(f"Kernel {label} needs `{missing}`, which it was not given.")
 
 
 def merged(own: Bindings, shared: Sequence[Bindings]) -> dict[str, Binding]:

@@ -91,12 +91,10 @@ class _DrawnKernel(Shader):
         super().__init__(gpu, name, defines)
 
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
-        source, label = self._source(defines), label_of(self._name, defines)
-        self._tell_compiled(label, {"comp": shader_source(SHADERS / f"{self._name}.comp.glsl", defines)})
+        path, label = SHADERS / f"{self._name}.comp.glsl", label_of(self._name, defines)
+        self._tell_compiled(label, {"comp": shader_source(path, defines)})
+        source = shader_source(path, {**self._gpu.defines, **defines})
         return self._shared("drawn", source, link=partial(_Drawn, self._gpu, label, source))
-
-    def _source(self, defines: Mapping[str, float | str]) -> str:
-        return shader_source(SHADERS / f"{self._name}.comp.glsl", {**self._gpu.defines, **defines})
 
     def draw(self, rectangle: Box, /, *shared: Bindings, **own: Binding) -> None:
         """Draws a rectangle of the outputs."""
