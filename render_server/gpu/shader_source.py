@@ -24,6 +24,7 @@ _VALUE = re.compile(r"^const bool (\w+) = switched;$", re.MULTILINE)
 _DECLARES = re.compile("uniform|buffer|local_size")
 _WORD = re.compile(r"\b[A-Za-z_]\w*")
 _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
+_CONDITION = re.compile(r"^\s*#\s*(ifdef|ifndef|if|elif|else|endif)\b\s*(.*?)\s*(?://.*)?$")
 _DIRECTIVE = re.compile(
     r"^[ \t]*#[ \t]*(define|ifdef|ifndef|if|elif|else|endif)\b[ \t]*(\w*)(?:[ \t]+(.*))?.*$", re.MULTILINE
 )
@@ -50,6 +51,9 @@ def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = 
     """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines.
 
     A process reads each shader once (`expanded`).
+
+    Raises:
+        ValueError: a file is included again where its text, which is under a condition, may be missing.
     """
     given = tuple((name, str(value)) for name, value in (defines or {}).items())
     return _assembled(*expanded(path), given)
@@ -58,10 +62,10 @@ def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = 
 @lru_cache(maxsize=512)  # every shader of the project: renderers are made again and again
 def expanded(path: Path) -> tuple[str, str]:
     """Returns the text of a shader with its includes, and a table of their files."""
-    files: dict[Path, int] = {}
-    body = _expand(path, files)
+    files: dict[Path, frozenset[str]] = {}
+    body = _expand(path, files, frozenset())
     return body, "\n".join(
-        f"// file {index}: {file.parent.name}/{file.name}" for file, index in files.items()
+        f"// file {index}: {file.parent.name}/{file.name}" for index, file in enumerate(files)
     )
 
 
@@ -75,34 +79,65 @@ def _assembled(body: str, table: str, defines: tuple[tuple[str, str], ...]) -> s
     return "\n".join([*head, table, body, ""])  # NVIDIA refuses a `#line` that no line break follows
 
 
-def _expand(path: Path, seen: dict[Path, int]) -> str:
-    """Returns the source of `path`, with every include that was not yet `seen` replaced by its text."""
-    number = seen[path] = len(seen)
+def _expand(path: Path, seen: dict[Path, frozenset[str]], around: frozenset[str]) -> str:
+    """Returns the source of `path`, which stands under conditions, with the text of every include not yet `seen`.
+
+    `seen` holds under which conditions each file's text stands. Conditions are compared as they are written.
+    """
+    number, seen[path] = len(seen), around
     lines = [f"#line 1 {number}"]
-    for before, target, next_line in _split(path.read_text()):
+    for before, target, own, next_line in _split(path.read_text()):
         lines += before
         if target is not None and target not in seen:
-            lines.append(_expand(target, seen))
+            lines.append(_expand(target, seen, around | own))
+        elif target is not None and not seen[target] <= around | own:
+            missing = " and ".join(f"`{condition}`" for condition in sorted(seen[target] - around - own))
+            raise ValueError(
+                f"{path.name} includes {target.name}, whose text stands under {missing} only; "
+                "include it before that condition."
+            )
         if next_line:
             lines.append(f"#line {next_line} {number}")
     return "\n".join(lines)
 
 
 @lru_cache(maxsize=512)  # every file of the project: renderers are made again and again
-def _split(text: str) -> list[tuple[list[str], Path | None, int]]:
-    """Splits a file at includes and constants: lines before, what is included, number of the next line, if any."""
-    parts: list[tuple[list[str], Path | None, int]] = []
+def _split(text: str) -> list[tuple[list[str], Path | None, frozenset[str], int]]:
+    """Splits a file at includes and constants.
+
+    Of each part: the lines before, what is included, under which conditions of the file, and the number of the next
+    line, if any.
+    """
+    parts: list[tuple[list[str], Path | None, frozenset[str], int]] = []
     before: list[str] = []
+    conditions: list[str] = []
     for index, line in enumerate(text.splitlines(), start=1):
         match, constant = INCLUDE.match(line), _CONSTANT.match(line)
+        _follow_conditions(line, conditions)
         if constant:
             before += [constant[0], f"const bool {constant[1]} = switched;"]
         if not (match or constant):
             before.append(line)
         else:
-            parts.append((before, SHADERS / match[1] if match else None, index + 1))
+            parts.append((before, SHADERS / match[1] if match else None, frozenset(conditions), index + 1))
             before = []
-    return [*parts, (before, None, 0)]
+    return [*parts, (before, None, frozenset(), 0)]
+
+
+def _follow_conditions(line: str, conditions: list[str]) -> None:
+    """Enters, switches or leaves a condition where a line says so."""
+    found = _CONDITION.match(line)
+    if found is None:
+        return
+    kind, condition = found[1], " ".join(found[2].split())
+    otherwise = "" if kind in ("ifdef", "ifndef", "if") else conditions.pop()
+    if kind == "ifdef":
+        conditions.append(condition)
+    elif kind in ("ifndef", "if"):
+        conditions.append(f"!{condition}" if kind == "ifndef" else f"({condition})")
+    elif kind in ("elif", "else"):
+        negated = otherwise[1:] if otherwise.startswith("!") else f"!{otherwise}"
+        conditions.append(negated if kind == "else" else f"{negated} && ({condition})")
 
 
 @lru_cache(

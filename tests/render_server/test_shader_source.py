@@ -1,8 +1,16 @@
 """What a shader's text declares, once its branches are resolved."""
 
+import re
+from pathlib import Path
+
 import pytest
 
-from deltalight.render_server.gpu.shader_source import declarations, expand_macros, preprocessed
+from deltalight.render_server.gpu.shader_source import (
+    declarations,
+    expand_macros,
+    preprocessed,
+    shader_source,
+)
 
 
 def test_declarations_are_those_that_the_defines_leave() -> None:
@@ -80,3 +88,49 @@ def test_a_workgroup_size_that_hangs_on_an_uncomputed_condition_is_refused() -> 
     ).local_size == (1, 4, 1)
     with pytest.raises(ValueError, match="several workgroup sizes"):
         declarations("#define A\n" + source)
+
+
+def _including(folder: Path, text: str) -> Path:
+    """A shader of that text, in which <name> stands for the include of a file that declares `name`."""
+    for name in ("one", "two"):
+        (folder / f"{name}.glsl").write_text(f"int {name};")
+    (folder / "both.glsl").write_text(
+        "\n".join(f'#include "{folder / name}.glsl"' for name in ("one", "two"))
+    )
+    path = folder / "main.glsl"
+    path.write_text(re.sub(r"<(\w+)>", lambda found: f'#include "{folder / found[1]}.glsl"', text))
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#ifdef A\n<one>\n#endif\n<one>",
+        "#ifdef A\n<both>\n#endif\n<two>",
+        "#ifdef A\n<one>\n#else\n<one>\n#endif",
+        "#ifndef A\n<one>\n#endif\n#ifdef A\n<one>\n#endif",
+        "#ifdef A\n#ifdef B\n<one>\n#endif\n<one>\n#endif",
+        "#if A == 1\n<one>\n#elif A == 2\n<one>\n#endif",
+        "#if A == 1\n#elif A == 2\n<one>\n#else\n<one>\n#endif",
+    ],
+)
+def test_a_file_whose_text_a_condition_may_leave_out_is_not_included_again(tmp_path: Path, text: str) -> None:
+    """Where the first include is left out, what stands there would be missing below."""
+    with pytest.raises(
+        ValueError, match=r"whose text stands under .* only; include it before that condition"
+    ):
+        shader_source(_including(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<one>\n#ifdef A\n<one>\n#endif",
+        "#ifdef A\n<one>\n#ifdef B\n<one>\n#endif\n#endif",
+        "#ifdef A\n<both>\n#endif\n# ifdef  A  // again\n<two>\n#endif",
+        "#ifdef A\n#else\n<one>\n#endif\n#ifndef A\n<one>\n#endif",
+        "#ifndef A\n#else\n<one>\n#endif\n#ifdef A\n<one>\n#endif",
+    ],
+)
+def test_a_file_is_included_once_where_its_text_is_there_again(tmp_path: Path, text: str) -> None:
+    assert shader_source(_including(tmp_path, text)).count("int one;") == 1

@@ -45,7 +45,8 @@ void gather_layer(ivec2 tile, int layer) {
     for (int i = 0; i < ROWS; ++i) if (held[i].needed) store(sums[i], first + ivec2(0, i * GROUP_ROWS), layer);
 }
 
+// One call in a loop: drivers compile every call anew.
 void main() {
-    gather_layer(ivec2(gl_WorkGroupID.xy), REAL_LAYER);
-    gather_layer(ivec2(gl_WorkGroupID.xy), OBJECT_LAYER);
+    int layer = REAL_LAYER;
+    do gather_layer(ivec2(gl_WorkGroupID.xy), layer); while ((layer += OBJECT_LAYER - REAL_LAYER) <= OBJECT_LAYER);
 }

@@ -69,9 +69,12 @@ uniform sampler2D change_ratio;
 bool near_change(ivec2 texel) {
     ivec2 last = textureSize(change_ratio, 0) - 1;
     float near = 0.0;
-    for (int j = -FILL_RADIUS; j <= FILL_RADIUS; ++j)
-        for (int i = -FILL_RADIUS; i <= FILL_RADIUS; ++i)
-            near = max(near, texelFetch(change_ratio, clamp(texel + ivec2(i, j), ivec2(0), last), 0).a);
+    // A driver does not know how long such loops are: it would unroll them, and compile each turn anew.
+    ivec2 low = max(texel - FILL_RADIUS, ivec2(0)), high = min(texel + FILL_RADIUS, last), at = low;
+    do {
+        at.x = low.x;
+        do near = max(near, texelFetch(change_ratio, at, 0).a); while (++at.x <= high.x);
+    } while (++at.y <= high.y);
     return near > 1.5;
 }
 #endif

@@ -146,9 +146,10 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
 void add(uint voxel, vec3 n, float area, float opaque, vec3 radiance) {
     int slot = int(grid[voxel]) - 1;
     float scale = area / (voxel_edge * voxel_edge);
-    for (int k = 0; k < 6; ++k) {
-        float facing = max(0.0, -dot(n, axis_direction(k))) * scale;
-        if (facing <= 0.0) continue;
+    for (int axis = 0; axis < 3; ++axis) {
+        float facing = abs(n[axis]) * scale;
+        int k = 2 * axis + (n[axis] > 0.0 ? 1 : 0);   // the direction along the axis that the surface faces
+        if (!(facing > 0.0)) continue;   // nor where it is no number
 #ifdef REAL_DELTA
         int at = slot * 18 + k * 3;
         for (int j = 0; j < 3; ++j) atomicAdd(delta_sums[at + j], fixed_point(radiance[j] * facing));

@@ -44,13 +44,11 @@ void gather(ivec2 texel) {
     enter_volume(position);
     vec3 q = volume_coordinate(position);
     start_on(normal.xyz, is_two_sided(int(normal.w)));
-    vec3 e_mu, e_rho;
-    diffuse(q, normal.xyz, WHOLE, true, e_mu, e_rho);
     vec3 d = reflect(normalize(position - m.point), normal.xyz);
-    float half_angle = specular_half_angle(materials[int(normal.w)].dielectric.a);
-    March seen = march(q, d, 2.0 * tan(half_angle), true);
-    imageStore(irradiance_out, texel, vec4(e_rho, open_fraction(volume_coordinate(m.point) + OWN * m.normal, q)));
-    imageStore(specular_out, texel, vec4(seen.c_rho + seen.t_rho * environment(d, half_angle), 1.0));
+    Lobe lobe = lobe_along(d, specular_half_angle(materials[int(normal.w)].dielectric.a), vec3(1.0));
+    Gathered found = gather_cones(q, normal.xyz, WHOLE, true, 0, 1, lobe, lobe);
+    imageStore(irradiance_out, texel, vec4(found.e_rho, open_fraction(volume_coordinate(m.point) + OWN * m.normal, q)));
+    imageStore(specular_out, texel, vec4(found.lobe_rho, 1.0));
 }
 
 void main() {

@@ -4,6 +4,7 @@
 #define ENDS_NEAR
 #define VOXELS
 #include "common/brdf.glsl"
+#include "common/octahedral.glsl"
 #include "common/look.glsl"
 #include "common/ray_mesh.glsl"
 #include "common/diffuse_cones.glsl"

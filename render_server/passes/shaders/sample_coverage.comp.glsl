@@ -54,7 +54,7 @@ void copy_surface(ivec2 pixel, ivec2 raster, vec4 position) {
 #endif
 }
 
-const ivec2 NEIGHBOURS[8] = ivec2[](ivec2(-1), ivec2(0, -1), ivec2(1, -1), ivec2(-1, 0), ivec2(1, 0), ivec2(-1, 1), ivec2(0, 1), ivec2(1));
+const uint NEIGHBOURS = 0x757u;   // bits of the places around the middle one of 3 x 3, in rows of four
 
 // Whether a neighbour's first sample shows what this one's shows: nothing, or the same surface, on the same side of the real one.
 bool shows_the_same(ivec2 beside, float real, vec4 position, vec3 normal) {
@@ -73,8 +73,13 @@ bool is_even(ivec2 pixel, vec4 position, vec3 normal) {
     return false;
 #else
     float real = texelFetch(real_surface_position, pixel, 0).w;
-    bool even = true;
-    for (int i = 0; i < 8; ++i) even = shows_the_same(pixel + NEIGHBOURS[i], real, position, normal) && even;
+    bool even;
+    uint left = NEIGHBOURS;
+    do {   // a loop that drivers do not unroll
+        int i = findLSB(left);
+        left &= left - 1u;
+        even = shows_the_same(pixel + ivec2(i & 3, i >> 2) - 1, real, position, normal);
+    } while (left != 0u && even);
     return even;
 #endif
 }

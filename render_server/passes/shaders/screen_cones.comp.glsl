@@ -1,7 +1,6 @@
 // Reflections of the visible real scene in smooth virtual surfaces, by cones across the picture ([D] 4.4.2): the
 // picture's radiance there, times the objects' change of its light. What a cone does not find in the picture it looks
-// up in voxels (VOXELS), or that fraction of the lobe is left to other passes. (What is included within a condition, as look.glsl does, is
-// not again.)
+// up in voxels (VOXELS), or that fraction of the lobe is left to other passes.
 #include "common/brdf.glsl"
 #include "common/octahedral.glsl"
 #define TWO_SIDED_STARTS

@@ -37,15 +37,6 @@ bool is_stale(ivec2 texel) { return (texelFetch(stale_texels, texel, 0).r & 2u) 
 bool is_stale(ivec2 texel) { return true; }
 #endif
 
-// Mean radiance of a cone without (mu) and with the objects (rho).
-struct SpecularCone { vec3 mu; vec3 rho; };
-
-SpecularCone specular_cone(vec3 q, vec3 direction, float half_angle) {
-    March m = march(q, direction, 2.0 * tan(half_angle), false);
-    vec3 beyond = environment(direction, half_angle);
-    return SpecularCone(m.c_mu + m.t_mu * beyond, m.c_rho + m.t_rho * beyond);
-}
-
 #ifndef REAL
 #pragma switch MEASURED
 #ifdef MEASURED
@@ -62,7 +53,8 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
     for (int k = 0; k < int(measured_base(row).a); ++k) {
         vec3 reflected = lobe_albedo_of(row, k, dot(s.normal, v));
         float half_angle = lobe_widths(row, k).y;
-        sum += reflected * specular_cone(q, d, half_angle).rho;
+        March m = march(q, d, 2.0 * tan(half_angle), true);
+        sum += reflected * (m.c_rho + m.t_rho * environment(d, half_angle));
         total += reflected;
     }
     return sum / max(total, vec3(1e-6));
@@ -73,62 +65,56 @@ vec3 measured_specular(SurfacePoint s, vec3 q, int row) {
 #define COATED
 #include "common/shown_coating.glsl"
 
-// A cone for the base's lobe and one for the coat's, weighted by what they reflect.
-vec3 coated_specular(ivec2 texel, SurfacePoint s, vec3 q) {
+// The base's lobe and the coat's, weighted by what they reflect; how many there are.
+int coated_lobes(ivec2 texel, SurfacePoint s, out Lobe base, out Lobe coat) {
     ivec2 raster = raster_texel(texelFetch(sample_pixels, texel, 0).zw);
     Material m = coated_material(raster);
-    vec3 v = normalize(camera_position - s.position), coat = coat_fraction(reflected_towards(m, s.normal, v)), sum = vec3(0.0);
-    int k = 0, lobes = m.over.coat > 0.0 ? 2 : 1;
-    do {
-        vec3 d = reflect(-v, k == 0 ? s.normal : coat_normal(m.over, s.normal));
-        float half_angle = specular_half_angle(k == 0 ? m.roughness : m.over.roughness);
-        sum += (k == 0 ? 1.0 - coat : coat) * specular_cone(q, d, half_angle).rho;
-    } while (++k < lobes);
-    return sum;
+    vec3 v = normalize(camera_position - s.position), fraction = coat_fraction(reflected_towards(m, s.normal, v));
+    base = lobe_along(reflect(-v, s.normal), specular_half_angle(m.roughness), 1.0 - fraction);
+    coat = lobe_along(reflect(-v, coat_normal(m.over, s.normal)), specular_half_angle(m.over.roughness), fraction);
+    return m.over.coat > 0.0 ? 2 : 1;
 }
 #endif
 #endif
 
-// The specular lobe at a texel by one cone, or one for each of the material's lobes; black without a lobe.
-SpecularCone specular_lobe(ivec2 texel, SurfacePoint s, vec3 q) {
-    SpecularCone lobe = SpecularCone(vec3(0.0), vec3(0.0));
-    bool reflects = s.roughness >= 0.0;
-#ifdef MEASURED
-    int row = measured_row(texel);
-    if (row >= 0) {
-        lobe.rho = measured_specular(s, q, row);
-        reflects = false;
-    }
-#endif
+// The lobes of the surface at a texel, if it reflects; how many there are.
+int lobes_at(ivec2 texel, SurfacePoint s, out Lobe base, out Lobe coat) {
 #ifdef COATED
-    if (reflects) lobe.rho = coated_specular(texel, s, q);
+    int lobes = coated_lobes(texel, s, base, coat);
 #else
-    if (reflects) {
-        vec3 mirrored = reflect(-normalize(camera_position - s.position), s.normal);
-        lobe = specular_cone(q, mirrored, specular_half_angle(s.roughness));
-    }
+    vec3 mirrored = reflect(-normalize(camera_position - s.position), s.normal);
+    base = coat = lobe_along(mirrored, specular_half_angle(s.roughness), vec3(1.0));
+    int lobes = 1;
 #endif
-    return lobe;
+    return s.roughness >= 0.0 ? lobes : 0;
 }
 
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     enter_volume(s.position);
-    vec3 q = volume_coordinate(s.position), e_mu, e_rho;
+    vec3 q = volume_coordinate(s.position);
+    Lobe base, coat;
+    int lobes = lobes_at(texel, s, base, coat);
 #ifdef REAL
-    diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
-    e_rho = with_further_bounces(e_mu, e_rho, q, s.normal);
-    SpecularCone specular = specular_lobe(texel, s, q);
-    imageStore(irradiance_mu, texel, vec4(e_mu, 1.0));
-    imageStore(irradiance_rho, texel, vec4(e_rho, volume_fade(q)));
-    imageStore(specular_mu, texel, vec4(specular.mu, 1.0));
+    Gathered found = gather_cones(q, s.normal, cones_of(texel), false, 0, lobes, base, coat);
+    found.e_rho = with_further_bounces(found.e_mu, found.e_rho, q, s.normal);
+    imageStore(irradiance_mu, texel, vec4(found.e_mu, 1.0));
+    imageStore(irradiance_rho, texel, vec4(found.e_rho, volume_fade(q)));
+    imageStore(specular_mu, texel, vec4(found.lobe_mu, 1.0));
 #else
     start_on(s.normal, s.two_sided);
-    if (is_stale(texel)) diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
-    SpecularCone specular = specular_lobe(texel, s, q);
-    if (is_stale(texel)) imageStore(irradiance_rho, texel, vec4(e_rho, 1.0));
+    bool stale = is_stale(texel);
+#ifdef MEASURED
+    int row = measured_row(texel);
+    if (row >= 0) lobes = 0;
 #endif
-    imageStore(specular_rho, texel, vec4(specular.rho, 1.0));
+    Gathered found = gather_cones(q, s.normal, cones_of(texel), true, stale ? 0 : cone_count, lobes, base, coat);
+#ifdef MEASURED
+    if (row >= 0) found.lobe_rho = measured_specular(s, q, row);
+#endif
+    if (stale) imageStore(irradiance_rho, texel, vec4(found.e_rho, 1.0));
+#endif
+    imageStore(specular_rho, texel, vec4(found.lobe_rho, 1.0));
 }
 
 // The texels that low_res_grid or stale_texels listed.

@@ -19,20 +19,24 @@ const vec3 EVERYWHERE = vec3(1.0, 0.0, 1e3), NOWHERE = vec3(1.0, 0.0, -1e3);   /
 const float PARALLEL = 1e-6;                   // sine: over a voxel's edge, less than what is measured
 const float LEAST_AREA = 1e-7;                 // of a part: below, rounding
 
-// Where both lines cross. Each of them is cut at this very point, so that the outline stays closed under rounding.
-vec2 crossing(vec3 one, vec3 other) { return cross(one, other).xy / cross(one, other).z; }
+// Of two lines. `precise`: that of the lines in turn differs by its sign alone. So each is cut at the very point xy / z where both
+// cross, and the outline stays closed under rounding.
+vec3 crossed(vec3 one, vec3 other) {
+    precise vec3 product = one.yzx * other.zxy - one.zxy * other.yzx;
+    return product;
+}
 
 // Cuts the stretch `kept` of line i (running along `along` from `base`) by half plane j (Cyrus & Beck 1978). Of two lines that
 // coincide, the first counts.
 void cut(inout vec2 kept, vec3 line, vec3 other, bool first, vec2 base, vec2 along) {
-    float turn = cross(line, other).z;
-    if (abs(turn) < PARALLEL) {
+    vec3 product = crossed(line, other);
+    if (abs(product.z) < PARALLEL) {
         float gap = dot(line.xy, other.xy) > 0.0 ? other.z - line.z : other.z + line.z;
         if (gap < 0.0 || (gap == 0.0 && !first && dot(line.xy, other.xy) > 0.0)) kept.y = kept.x;
         return;
     }
-    float at = dot((first ? crossing(line, other) : crossing(other, line)) - base, along);
-    if (turn < 0.0) kept.x = max(kept.x, at);
+    float at = dot(product.xy / product.z - base, along);
+    if (product.z < 0.0) kept.x = max(kept.x, at);
     else kept.y = min(kept.y, at);
 }
 
@@ -67,9 +71,13 @@ vec4 centroid_area(vec3 a, vec3 b, vec3 c, vec3 n, bvec3 within) {
     face_lines(lines, 7, height, within[w]);
     vec3 sum = vec3(0.0);
     for (int i = 0; i < LINES; ++i) {
-        vec2 along = vec2(lines[i].y, -lines[i].x), base = -lines[i].z * lines[i].xy, kept = vec2(-1e4, 1e4);
-        for (int j = 0; j < LINES; ++j)
-            if (j != i) cut(kept, lines[i], lines[j], i < j, base, along);
+        vec3 line = lines[0];
+        vec2 along = vec2(line.y, -line.x), base = -line.z * line.xy, kept = vec2(-1e4, 1e4);
+        for (int j = 1; j < LINES; ++j) {
+            cut(kept, line, lines[j], i + j < LINES, base, along);
+            lines[j - 1] = lines[j];   // the next line comes to the front: a number that changes would make drivers unroll both loops
+        }
+        lines[LINES - 1] = line;
         if (kept.x >= kept.y) continue;
         vec2 p = base + kept.x * along, q = base + kept.y * along;
         float part = 0.5 * (p.x * q.y - p.y * q.x);
@@ -90,7 +98,8 @@ void allocate_slot(uint voxel) {
     uint slot = atomicAdd(slot_count, 1u);
     touched[slot] = voxel;
     atomicExchange(grid[voxel], slot + 1u);   // others compare and swap it
-    for (int i = 0; i < SUMS_PER_SLOT; ++i) sums[int(slot) * SUMS_PER_SLOT + i] = 0;
+    int at = int(slot) * SUMS_PER_SLOT, end = at + SUMS_PER_SLOT;
+    do sums[at] = 0; while (++at < end);
 }
 
 vec2 uv_at(Piece t, vec3 p, vec3 a, vec3 b, vec3 c, vec3 n) {
@@ -119,13 +128,12 @@ void clip_to_voxel(Pair pair) {
     vec3 a = volume_coordinate(t.a.place), b = volume_coordinate(t.b.place), c = volume_coordinate(t.c.place);
     vec3 n = cross(b - a, c - a);
     bvec3 within = equal(ivec3(floor(min(a, min(b, c)))), ivec3(floor(max(a, max(b, c)))));
-    if (all(within)) {   // most triangles of a depth mesh
-        emit(t, material, vec4((a + b + c) / 3.0, 0.5 * length(n)), voxel, a, b, c, n);
-        return;
+    vec4 part = vec4((a + b + c) / 3.0, 0.5 * length(n));
+    if (!all(within)) {   // few triangles of a depth mesh
+        vec3 corner = vec3(voxel);
+        part = centroid_area(a - corner, b - corner, c - corner, n, within) + vec4(corner, 0.0);
     }
-    vec3 corner = vec3(voxel);
-    vec4 part = centroid_area(a - corner, b - corner, c - corner, n, within);
-    emit(t, material, vec4(part.xyz + corner, part.w), voxel, a, b, c, n);
+    emit(t, material, part, voxel, a, b, c, n);
 }
 
 void main() {

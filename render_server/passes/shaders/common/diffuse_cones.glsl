@@ -75,28 +75,48 @@ vec3 diffuse_change(vec3 q, vec3 n, ConeSet set) {
 float near_coverage;   // of `diffuse`: fraction of the hemisphere, by cosine, where surfaces of the volume are
 #endif
 
-// Irradiance without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not occlude
-// their own surface. `only_rho` skips mu.
-void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
-    float ratio = cone_ratio();
-    float half_angle = atan(0.5 * ratio);
+// A cone of what a surface reflects, and its weight.
+struct Lobe { vec3 axis; float half_angle; float ratio; vec3 weight; };
+
+Lobe lobe_along(vec3 axis, float half_angle, vec3 weight) { return Lobe(axis, half_angle, 2.0 * tan(half_angle), weight); }
+
+// Light without and with the objects: irradiance, and the lobes' weighted mean radiance.
+struct Gathered { vec3 e_mu; vec3 e_rho; vec3 lobe_mu; vec3 lobe_rho; };
+
+// By the diffuse cones from number `first` on, and by as many `lobes`, from `q` (voxels) on a surface about n: one-sided voxels do not
+// occlude their own surface. `only_rho` skips mu. One loop for all cones: drivers compile every call of a march anew.
+Gathered gather_cones(vec3 q, vec3 n, ConeSet set, bool only_rho, int first, int lobes, Lobe base, Lobe coat) {
+    float ratio = set.width * cone_ratio(), half_angle = atan(0.5 * cone_ratio());
     mat3 basis = basis_around(n);
-    e_mu = vec3(0.0);
-    e_rho = vec3(0.0);
+    Gathered sum = Gathered(vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
 #ifdef KEEPS_COVERAGE
     near_coverage = 0.0;
 #endif
-    int k = 0;
-    do {   // a loop that tests at its end: march.glsl
-        vec3 d = basis * cone_direction(k, set);
-        March m = march(q, d, set.width * ratio, only_rho);
-        vec3 r = environment(d, half_angle);
-        e_mu += m.c_mu + m.t_mu * r;
-        e_rho += m.c_rho + m.t_rho * r;
+    int k = first, end = cone_count + lobes;
+    if (k < end) do {   // a loop that tests at its end: march.glsl
+        bool is_lobe = lobes > 0 && k >= cone_count;
+        Lobe lobe = k == cone_count ? base : coat;
+        vec3 d = is_lobe ? lobe.axis : basis * cone_direction(k, set);
+        March m = march(q, d, is_lobe ? lobe.ratio : ratio, only_rho);
+        vec3 r = environment(d, is_lobe ? lobe.half_angle : half_angle);
+        vec3 mu = m.c_mu + m.t_mu * r, rho = m.c_rho + m.t_rho * r;
+        sum.e_mu += is_lobe ? vec3(0.0) : mu;
+        sum.e_rho += is_lobe ? vec3(0.0) : rho;
+        sum.lobe_mu += is_lobe ? lobe.weight * mu : vec3(0.0);
+        sum.lobe_rho += is_lobe ? lobe.weight * rho : vec3(0.0);
 #ifdef KEEPS_COVERAGE
-        near_coverage += near_blocked / float(cone_count);
+        near_coverage += is_lobe ? 0.0 : near_blocked / float(cone_count);
 #endif
-    } while (++k < cone_count);
-    e_mu *= PI / float(cone_count);
-    e_rho *= PI / float(cone_count);
+    } while (++k < end);
+    sum.e_mu *= PI / float(cone_count);
+    sum.e_rho *= PI / float(cone_count);
+    return sum;
+}
+
+// Irradiance alone.
+void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
+    Lobe none = Lobe(n, 0.0, 0.0, vec3(0.0));
+    Gathered found = gather_cones(q, n, set, only_rho, 0, 0, none, none);
+    e_mu = found.e_mu;
+    e_rho = found.e_rho;
 }

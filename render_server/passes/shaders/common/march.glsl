@@ -33,7 +33,7 @@ const float WALL = 0.5;
 struct March { vec3 c_mu; float t_mu; vec3 c_rho; float t_rho; };
 
 #ifdef KEEPS_COVERAGE
-float near_blocked;   // of the last march, the fraction of the cone that ended in the volume where it began
+float near_blocked;   // of the last march (of rho), the fraction of the cone that ended in the volume where it began
 #endif
 
 struct Crossed { vec3 c; float coverage; };   // radiance gathered, coverage met so far
@@ -253,6 +253,18 @@ void march_far(vec3 q, vec3 d, float before, float end, float ratio, inout Cross
     } while (sum.coverage < WALL && find_far(w, at, before, end, ratio));
 }
 
+// Goes on through the coarse scene where a march from q (voxels of the volume) along d has left the volume after a distance t, `skip`
+// (voxels of the coarse scene) farther on.
+void march_beyond(vec3 q, vec3 d, float t, float skip, float ratio, inout Crossed sum) {
+    if (far_size > 0 && sum.coverage < WALL) {
+        vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
+        march_far(leave + skip * d, d, t * voxel_edge / far_edge + skip, ENDLESS, ratio, sum);
+    }
+}
+
+// A surface that starts a march outside of the volume must not hit its own coarse voxels.
+float own_skip(float t) { return t > 0.0 ? 0.0 : 1.5; }
+
 #ifdef SEVERAL_VOLUMES
 // One march from q (voxels) along d, continued through other volumes and, between and behind them, the coarse scene.
 Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
@@ -269,8 +281,7 @@ Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differ
 #ifdef KEEPS_COVERAGE
         if (start == 0.0) near_blocked = blocked_fraction(sum.coverage);
 #endif
-        float skip = t > 0.0 ? 0.0 : 1.5;   // as below
-        float next = t > 0.0 ? enter_next(from, d, t, crossed) : ENDLESS;
+        float skip = own_skip(t), next = t > 0.0 ? enter_next(from, d, t, crossed) : ENDLESS;
         vec3 leave = (from + t * d - far_origin) / far_edge + skip * d;
         if (far_size > 0 && sum.coverage < WALL) march_far(leave, d, t / far_edge + skip, (next - t) / far_edge, ratio, sum);
         if (next == ENDLESS) break;
@@ -279,30 +290,50 @@ Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differ
     volume = home;
     return sum;
 }
+
+// What both marches meet; mu's is rho's where the way does not differ.
+void march_both(vec3 q, vec3 d, float ratio, bool only_rho, out Crossed mu, out Crossed rho) {
+    bool differs;
+    mu = rho = march_one(mipmap_rho, q, d, ratio, differs);
+    if (differs && !only_rho) mu = march_one(mipmap_mu, q, d, ratio, differs);
+}
 #else
 // One march from q (voxels) along d, continued into the coarse scene.
 Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
     Crossed sum = Crossed(vec3(0.0), 0.0);
     differs = false;
     float t = march_near(mipmap, q, d, 0.0, ratio, sum, differs);
-#ifdef KEEPS_COVERAGE
-    near_blocked = blocked_fraction(sum.coverage);
-#endif
-    if (far_size > 0 && sum.coverage < WALL) {
-        vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
-        // A surface that starts the march outside of the volume must not hit its own coarse voxels.
-        float skip = t > 0.0 ? 0.0 : 1.5;
-        march_far(leave + skip * d, d, t * voxel_edge / far_edge + skip, ENDLESS, ratio, sum);
-    }
+    march_beyond(q, d, t, own_skip(t), ratio, sum);
     return sum;
+}
+
+// What both marches meet; mu's is rho's where the way does not differ. Beyond the volume both run the same code, in turn: drivers
+// compile every call anew.
+void march_both(vec3 q, vec3 d, float ratio, bool only_rho, out Crossed mu, out Crossed rho) {
+    bool differs = false, ignored = false;
+    rho = mu = Crossed(vec3(0.0), 0.0);
+    float t_rho = march_near(mipmap_rho, q, d, 0.0, ratio, rho, differs), t_mu = t_rho;
+#ifdef KEEPS_COVERAGE
+    near_blocked = blocked_fraction(rho.coverage);
+#endif
+    differs = differs && !only_rho;
+    if (differs) t_mu = march_near(mipmap_mu, q, d, 0.0, ratio, mu, ignored);
+    bool is_mu = false, goes_on;
+    do {
+        Crossed sum = is_mu ? mu : rho;
+        float t = is_mu ? t_mu : t_rho;
+        march_beyond(q, d, t, own_skip(t), ratio, sum);
+        if (is_mu || !differs) mu = sum;
+        if (!is_mu) rho = sum;
+        goes_on = differs && !is_mu;
+        is_mu = true;
+    } while (goes_on);
 }
 #endif
 
 // Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is that of rho.
 March march(vec3 q, vec3 d, float ratio, bool only_rho) {
-    bool differs;
-    Crossed rho = march_one(mipmap_rho, q, d, ratio, differs);
-    Crossed mu = rho;
-    if (differs && !only_rho) mu = march_one(mipmap_mu, q, d, ratio, differs);
+    Crossed mu, rho;
+    march_both(q, d, ratio, only_rho, mu, rho);
     return March(mu.c, 1.0 - blocked_fraction(mu.coverage), rho.c, 1.0 - blocked_fraction(rho.coverage));
 }

@@ -17,8 +17,7 @@ const float KERNEL[ALONG + 1] = float[](0.375, 0.25, 0.0625);
 const float KERNEL_NOISE = 0.2734375;   // sum of the kernel's squares
 
 // 1 a real surface in front of depth z, 2 one behind it, 0 unknown.
-int class_of(ivec2 at, float z, ivec2 size) {
-    if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, size))) return 0;
+int class_of(ivec2 at, float z) {
     if (texelFetch(real_surface_position, at, 0).w <= 0.0) return 0;
     return in_front(at, z) > 0.0 ? 2 : 1;
 }
@@ -30,10 +29,11 @@ uint narrowed(uint row) { return row & (row << 1) & (row >> 1) & (row << 2) & (r
 // i - SIGHT - REACH.
 uvec2 classes_of_row(ivec2 first, float z, ivec2 size) {
     uvec2 row = uvec2(0u);
-    for (int i = 0; i < SPAN; ++i) {
-        int c = class_of(first + ivec2(i, 0), z, size);
+    int i = max(-first.x, 0), end = first.y >= 0 && first.y < size.y ? min(SPAN, size.x - first.x) : 0;
+    if (i < end) do {   // what is in the picture
+        int c = class_of(first + ivec2(i, 0), z);
         row |= uvec2(c == 1, c == 2) << uint(i);
-    }
+    } while (++i < end);
     return uvec2(narrowed(row.x), narrowed(row.y));
 }
 

@@ -125,9 +125,3 @@ bool near_volume(vec3 p, float margin) {
     return inside_cube(p - volume_origin + margin, float(volume_size) * voxel_edge + 2.0 * margin);
 }
 #endif
-
-vec3 axis_direction(int k) {
-    vec3 d = vec3(0.0);
-    d[k >> 1] = (k & 1) == 0 ? 1.0 : -1.0;
-    return d;
-}
