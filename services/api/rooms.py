@@ -87,8 +87,10 @@ class Rooms:
             self._rooms = {ONLY_ROOM: self._builder.single()}
         else:
             self.directory = DirectoryClient(settings.rooms, keys)
-            self._rooms = self._found(self.directory.rooms())
+            found = self.directory.rooms()
+            self._rooms = self._found(found)
             self.follower = RoomFollower(self.directory, self._follow, self._announce)
+            self.follower.newest = found  # until it has asked, too
         contexts = [room.context for room in self._rooms.values()]
         for context in contexts:
             context.others.extend(other for other in contexts if other is not context)

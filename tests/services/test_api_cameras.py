@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import websockets
@@ -41,6 +42,11 @@ def api(running: CameraApi) -> Iterator[CameraApi]:
 
 def statuses(api: CameraApi) -> dict[str, str]:
     return {each["name"]: each["status"] for each in api.client.get("/state").json()["cameras"]}
+
+
+def state_of_right(api: CameraApi) -> dict[str, Any]:
+    right: dict[str, Any] = api.client.get("/state").json()["cameras"][1]
+    return right
 
 
 def next_of(socket: ClientConnection, node: str) -> LiveHeader:
@@ -81,7 +87,8 @@ def test_each_camera_has_its_picture_and_the_first_is_the_default(api: CameraApi
     with api.client.stream("GET", "/live.mjpg", params={"camera": "right"}) as answer:
         part = next(answer.iter_bytes())
     assert grey(part[part.index(b"\xff\xd8") :].rstrip(b"\r\n")) == SHADES["right"]
-    right = api.client.get("/state").json()["cameras"][1]
+    wait_for(lambda: state_of_right(api)["frames_per_s"] is not None)  # since the second picture
+    right = state_of_right(api)
     assert (right["name"], right["status"]) == ("right", "live")
     assert right["frame_id"] > 0
     assert right["last_frame_s"] < 10

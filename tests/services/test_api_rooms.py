@@ -16,6 +16,7 @@ from websockets.sync.client import connect
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services import ports
+from deltalight.services.rooms import follower as follower_module
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.follower import RoomFollower
 from deltalight.services.rooms.keeper import RoomKeeper
@@ -81,6 +82,16 @@ def test_rooms_are_listed_with_scene_method_and_why_they_wait(house: House) -> N
     assert "all 2 slots are in use" in attic["why"]
     assert [slot["room"] for slot in answer["slots"]] == ["hall", "door"]
     assert answer["can_move"]
+
+
+def test_rooms_are_there_from_the_first_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(follower_module, "POLL_INTERVAL_S", 3600.0)
+    keeper, directory = (
+        RoomKeeper(plans(tmp_path, "hall"), StandInPlacer()),
+        ports.endpoint(ports.private_ports(1)[0]),
+    )
+    with closing(DirectoryServer(directory, keeper)), running_api(tmp_path / "data", rooms=directory) as api:
+        assert api.client.get("/rooms/hall").json()["name"] == "hall"
 
 
 def test_every_route_is_for_the_first_room_or_for_the_one_in_its_address(house: House) -> None:
