@@ -12,14 +12,14 @@ from difflib import get_close_matches
 from functools import partial
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final, Protocol, cast
+from typing import Any, Protocol, cast
 
 import moderngl
 import numpy as np
 
 from deltalight.render_server.gpu.buffer_images import BUFFER_IMAGES, BufferImage
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.program_slots import BindingCalls, Slot, Value, values_of
+from deltalight.render_server.gpu.program_slots import IMAGES, SAMPLERS, BindingCalls, Slot, Value, values_of
 from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
 from deltalight.render_server.gpu.texel_images import with_images
 from deltalight.render_server.gpu.textures import image_format, release_all, texels_of
@@ -34,23 +34,6 @@ CONSTANT = frozenset({float, int, bool, tuple})  # those of them that nobody cha
 Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
 Bindings = Mapping[str, Binding]
 """GLSL names and what is bound to them; None stands for nothing: a texture without texels, an empty buffer."""
-
-SAMPLERS: Final = {  # of textures, and what their texels are read as: float, signed or unsigned
-    0x8B5E: (moderngl.Texture, "f"),  # sampler2D
-    0x8DCA: (moderngl.Texture, "i"),  # isampler2D
-    0x8DD2: (moderngl.Texture, "u"),  # usampler2D
-    0x8B5F: (moderngl.Texture3D, "f"),  # sampler3D
-    0x8DC1: (moderngl.TextureArray, "f"),  # sampler2DArray
-    0x8DD3: (moderngl.Texture3D, "u"),  # usampler3D
-}
-IMAGES: Final = {
-    0x904D: moderngl.Texture,  # image2D
-    0x9058: moderngl.Texture,  # iimage2D
-    0x9063: moderngl.Texture,  # uimage2D
-    0x904E: moderngl.Texture3D,  # image3D
-    0x9064: moderngl.Texture3D,  # uimage3D
-    0x9053: moderngl.TextureArray,  # image2DArray
-}
 
 
 class BindingError(RuntimeError):
@@ -116,9 +99,7 @@ class Program:
         self._resources = values_of([slot.name for slot, _ in bound])
         self._calls = BindingCalls([partial(binder, slot) for slot, binder in bound])
         self._values = values_of([slot.name for slot in self._uniforms])
-        self._held: tuple[Any, ...] | None = (
-            None  # values of the uniforms, if nobody can change them in place
-        )
+        self._held: tuple[Any, ...] | None = None  # values of uniforms, if nobody can change them in place
         self._switch_values = values_of(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:

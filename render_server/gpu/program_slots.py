@@ -3,13 +3,32 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any
+from typing import Any, Final
 
+import moderngl
 import numpy as np
 
 SETS_KEPT = 32  # sets of resources whose calls a program keeps: some for each camera of a room
 Value = float | int | bool | Sequence[float] | Sequence[Sequence[float]] | np.ndarray[Any, Any]
 Calls = Sequence[Callable[[], None]]
+
+# The `kind` of slots, by OpenGL's number.
+SAMPLERS: Final = {  # of textures, and what their texels are read as: float, signed or unsigned
+    0x8B5E: (moderngl.Texture, "f"),  # sampler2D
+    0x8DCA: (moderngl.Texture, "i"),  # isampler2D
+    0x8DD2: (moderngl.Texture, "u"),  # usampler2D
+    0x8B5F: (moderngl.Texture3D, "f"),  # sampler3D
+    0x8DC1: (moderngl.TextureArray, "f"),  # sampler2DArray
+    0x8DD3: (moderngl.Texture3D, "u"),  # usampler3D
+}
+IMAGES: Final = {
+    0x904D: moderngl.Texture,  # image2D
+    0x9058: moderngl.Texture,  # iimage2D
+    0x9063: moderngl.Texture,  # uimage2D
+    0x904E: moderngl.Texture3D,  # image3D
+    0x9064: moderngl.Texture3D,  # uimage3D
+    0x9053: moderngl.TextureArray,  # image2DArray
+}
 
 
 @dataclass(eq=False, slots=True)

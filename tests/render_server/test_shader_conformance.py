@@ -17,7 +17,7 @@ from deltalight.benchmarks.gpu_check.child import take_step
 from deltalight.benchmarks.gpu_check.record import Findings, State
 from deltalight.benchmarks.speed.instruments import ReadBacks
 from deltalight.render_server.gpu.context import NEEDED, GpuContext
-from deltalight.render_server.gpu.kernel import IMAGES, SAMPLERS
+from deltalight.render_server.gpu.program_slots import IMAGES, SAMPLERS
 from deltalight.render_server.gpu.shader_source import SHADERS, VERSION
 from tests.render_server import shader_variants
 
