@@ -35,7 +35,7 @@ from tests.render_server.scenes import (
     with_neighbours,
 )
 
-pytestmark = [pytest.mark.slow(seconds=35), pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=22), pytest.mark.usefixtures("clean_gl")]
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed", allow_module_level=True)
 WIDTH, HEIGHT, FOCAL = 160, 120, 210.0
