@@ -32,6 +32,9 @@ from deltalight.render_server.passes.shadow_maps import (
 
 LIGHT_BYTES = 160  # of a std430 Light (shaders/common/light_shapes.glsl)
 TEXEL_BYTES, LIGHT_TEXELS, VIEW_TEXELS = 16, 10, 7  # of a Light and a LightView (shaders/common/)
+ROWS_STEP = 3
+"""Of records. Mesa's llvmpipe compiles all kernels that read lights anew where the height of a texture becomes a
+power of two, or is no longer one, as with a lamp more; no multiple of this is one."""
 BRIGHTEST = float(np.finfo(np.float16).max)
 GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up has to fit, too
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
@@ -53,22 +56,29 @@ class LightingBlock(Block):
 
 
 class _Rows:
-    """Records in a texture, a row each; one of zeros if there are none."""
+    """Records in a texture, a row each, with rows of zeros that make it a multiple of ROWS_STEP high."""
 
     def __init__(self, gpu: GpuContext, texels: int) -> None:
-        self._gpu, self._row_bytes = gpu, TEXEL_BYTES * texels
-        self._data = bytes(self._row_bytes)
-        self.texture = texture_2d(gpu, (texels, 1), 4, "u4", data=self._data)
+        self._gpu, self._texels = gpu, texels
+        self._data = self._padded(b"")
+        self.texture = self._made()
 
     def write(self, records: bytes) -> None:
-        """Replaces the records, if they are others: in a new texture if their number has changed."""
-        before, self._data = self._data, records or bytes(self._row_bytes)
+        """Replaces the records, if they are others: in a new texture if these rows do not hold them."""
+        before, self._data = self._data, self._padded(records)
         if len(before) != len(self._data):
             self.texture.release()
-            size = self._row_bytes // TEXEL_BYTES, len(self._data) // self._row_bytes
-            self.texture = texture_2d(self._gpu, size, 4, "u4", data=self._data)
+            self.texture = self._made()
         elif before != self._data:
             self.texture.write(self._data)
+
+    def _padded(self, records: bytes) -> bytes:
+        step_bytes = ROWS_STEP * self._texels * TEXEL_BYTES
+        return records.ljust(max(1, -(-len(records) // step_bytes)) * step_bytes, b"\0")
+
+    def _made(self) -> moderngl.Texture:
+        size = self._texels, len(self._data) // (self._texels * TEXEL_BYTES)
+        return texture_2d(self._gpu, size, 4, "u4", data=self._data)
 
     def release(self) -> None:
         """Frees the texture."""

@@ -36,6 +36,8 @@ BVH_ROW_BYTES = 1024 * TEXEL_BYTES
 WORN = 1.5
 
 BASE_MAPS, ALL_MAPS = 5, 13  # of a material, as materials.glsl has them
+LEAST_EDGE = 2
+"""Of an array of maps, texels: one without mip levels makes Mesa's llvmpipe compile all kernels with maps anew."""
 
 NO_CUTOUTS: Bindings = {"CUTOUTS": False}
 NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
@@ -368,7 +370,7 @@ class MapArray:
     """Textures of one kind as layers of one array, with mip levels; each texture once.
 
     All layers have the size of the largest texture, a power of 2, less if they would take too much
-    (`map_edge`).
+    (`map_edge`), but at least LEAST_EDGE: without textures, too.
     """
 
     def __init__(self, gpu: GpuContext, maps: Sequence[TextureMap], dtype: str) -> None:
@@ -379,7 +381,7 @@ class MapArray:
             raise DeltalightError(
                 f"the objects have {len(unique)} textures of one kind, and this GPU takes {limit}: use fewer."
             )
-        size = map_edge(list(unique.values()), 4 * int(dtype[1]))
+        size = max(map_edge(list(unique.values()), 4 * int(dtype[1])), LEAST_EDGE)
         self.texture = gpu.ctx.texture_array((size, size, max(len(unique), 1)), 4, dtype=dtype)
         for layer, each in enumerate(unique.values()):
             data = resampled(each, size)

@@ -14,6 +14,7 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.lights.light_models import RectangleLight, SpotLight
 from deltalight.render_server.lights.lights import build_lights
+from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.shadow_maps import light_views, pack_view
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
@@ -283,6 +284,22 @@ def test_views_fit_the_cone_and_the_rectangles_side() -> None:
     assert len(views) == 5
     assert all(view.front is not None and view.front[2] == 1 for view in views)
     assert light_views(upward, far_points, far_points) == []
+
+
+def test_rows_of_lights_come_and_go_and_are_never_a_power_of_two(gpu: GpuContext) -> None:
+    """Else llvmpipe would compile all kernels that read lights anew with a lamp more. Rows beyond them are 0."""
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    place, down = np.array((0, 0, 3), np.float32), np.array((0, 0, -1), np.float32)
+    lamp = SpotLight(place, down, np.ones(3, np.float32), 0.0, 1.0, 0.2)
+    buffers = LightBuffers(gpu, 8, 1)
+    for count in (0, 1, 2, 3, 4, 9, 8, 1, 0):
+        buffers.place([lamp] * count, points, points, points)
+        for name, records in (("light_rows", count), ("light_view_rows", 2 * count)):
+            texture: Any = buffers.bindings[name]
+            assert texture.height & (texture.height - 1), (name, count)
+            rows = np.frombuffer(texture.read(), np.uint32).reshape(texture.height, -1)
+            assert rows.any(axis=1).tolist() == [True] * records + [False] * (len(rows) - records)
+    buffers.release()
 
 
 def test_documents_lights_keep_their_numbers() -> None:

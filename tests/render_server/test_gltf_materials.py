@@ -10,6 +10,9 @@ import pytest
 
 from deltalight.benchmarks.gltf_plate import Plate, even
 from deltalight.protocol.frames import decode_lut
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.mesh_buffers import MapArray
+from deltalight.render_server.scene.texture_maps import TextureMap
 from tests.render_server.gltf_plates import CENTRE, INSIDE, LEFT, RIGHT, plate, seen_from_above
 from tests.render_server.scenes import (
     HEIGHT,
@@ -49,6 +52,19 @@ def draw(objects: ObjectsRenderer, tmp_path: Path) -> Draw:
         return objects.linear(unlit(stage.document([asset], lights or [])), seen_from_above())
 
     return drawn
+
+
+@pytest.mark.parametrize("codes", [None, (10, 20, 30)], ids=["none", "one texel"])
+def test_arrays_of_maps_have_mip_levels_whatever_they_hold(
+    gpu: GpuContext, codes: tuple[int, ...] | None
+) -> None:
+    """Else llvmpipe would compile all kernels with maps anew for the first model whose maps are of both kinds."""
+    maps = [] if codes is None else [TextureMap(even(*codes, size=1))]
+    array = MapArray(gpu, maps, "f1")
+    assert array.texture.width == array.texture.height == 2
+    held = np.frombuffer(array.texture.read(), np.uint8).reshape(-1, 4)
+    array.release()
+    assert codes is None or (held == (*codes, 255)).all()
 
 
 def glowing(codes: np.ndarray, sampler: dict[str, Any] | None = None, **options: Any) -> Plate:  # noqa: ANN401

@@ -35,10 +35,10 @@ from tests.render_server.scenes import (
     with_neighbours,
 )
 
-pytestmark = [pytest.mark.slow(seconds=35), pytest.mark.usefixtures("clean_gl")]
+pytestmark = [pytest.mark.slow(seconds=22), pytest.mark.usefixtures("clean_gl")]
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed", allow_module_level=True)
-WIDTH, HEIGHT, FOCAL = 320, 240, 420.0
+WIDTH, HEIGHT, FOCAL = 160, 120, 210.0
 SHADINGS: dict[str, dict[str, Any]] = {
     "image_based": {"name": "image_based"},
     "9 coefficients": {"name": "precomputed"},
