@@ -12,7 +12,7 @@ from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.ros_bag_names import refuse_bag
 from deltalight.protocol.scene import SceneDocument
 
-RECORDING_SUFFIXES = (".mcap", ".mcap.active")
+RECORDING_SUFFIXES = (".mcap", ".mcap.active")  # or in capitals, as other systems may name files
 
 
 class Source(Protocol):
@@ -57,6 +57,11 @@ class Source(Protocol):
     def __iter__(self) -> Iterator[SensorFrame]: ...
 
 
+def is_recording_name(name: str) -> bool:
+    """Whether a file is called as recordings are."""
+    return name.lower().endswith(RECORDING_SUFFIXES)
+
+
 def open_source(path: Path, board: BoardSpec | None = None) -> Source:
     """Open a dataset folder or a recording (`.mcap`, or one still named `.mcap.active`).
 
@@ -73,7 +78,7 @@ def open_source(path: Path, board: BoardSpec | None = None) -> Source:
     if not path.exists():
         raise DeltalightError(f"{path} does not exist; give a dataset folder or an .mcap recording.")
     refuse_bag(path)
-    if not path.name.endswith(RECORDING_SUFFIXES):
+    if not is_recording_name(path.name):
         raise DeltalightError(f"{path} is neither a folder nor an .mcap recording; give one of these.")
     from deltalight.protocol.recording_reader import RecordingReader
 

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing, write_png
-from deltalight.services.files import make_output_folder
+from deltalight.services.files import make_output_folder, require_output_folder
 
 if TYPE_CHECKING:
     from deltalight.protocol.camera_model import CameraModel
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def result_path(folder: Path, name: str, *, force: bool) -> Path:
-    """Return the path of a new file in `folder`/calibration; call it before any work is done.
+    """Return the path of a new file in `folder`/calibration, checked before any work is done.
 
     Raises:
         DeltalightError: the file exists and `force` is not given, or the folder cannot be written.
@@ -31,12 +31,13 @@ def result_path(folder: Path, name: str, *, force: bool) -> Path:
     path = folder / "calibration" / name
     if path.exists() and not force:
         raise DeltalightError(f"{path} already exists; overwrite it with --force or name another --out.")
-    make_output_folder(path.parent)
+    require_output_folder(path.parent)
     return path
 
 
 def write_result(path: Path, save: Callable[[Path], None]) -> None:
-    """Let `save` write a temporary file, then move it into place."""
+    """Let `save` write a temporary file, then move it into place; make its folder if missing."""
+    make_output_folder(path.parent)
     with replacing(path) as temporary:
         save(temporary)
 
@@ -98,6 +99,7 @@ def save_pictures(result: "LensResult", stem: Path) -> list[str]:
         "coverage": draw_coverage(result.brightest, result.fit, result.coverage),
         "residuals": draw_misses(result.brightest, result.fit),
     }
+    make_output_folder(stem.parent)
     paths = [stem.with_name(f"{stem.name}_{name}.png") for name in pictures]
     for path, picture in zip(paths, pictures.values(), strict=True):
         write_png(path, picture)

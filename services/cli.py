@@ -1,16 +1,18 @@
 """The `deltalight` command: registers the commands and reports faults by sentences and exit codes.
 
 Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 75 the GPU was reset,
-130 Ctrl-C, 143 SIGTERM.
+130 Ctrl-C, 141 nobody reads the output any more (`| head`), 143 SIGTERM.
 """
 
 import errno
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Annotated, Any
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -55,6 +57,7 @@ LIVE_COMMANDS = frozenset(
 )  # they do the same for each frame, or fork who does
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 FULL_DISK = frozenset({errno.ENOSPC, errno.EDQUOT})
+UNREAD_OUTPUT = 128 + signal.SIGPIPE  # as of programs that the signal ends, which Python ignores
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
 
 
@@ -140,7 +143,18 @@ def main() -> None:
     while code is None:
         with suppress(InForkedChild):  # this process is the child, with a command line of its own
             code = _run_as_process()
-    sys.exit(code)
+    sys.exit(_with_output_flushed(code))
+
+
+def _with_output_flushed(code: int) -> int:
+    """Write what standard output still holds, which Python would do with a traceback, and return the exit code."""
+    try:
+        if sys.stdout is not None:  # it may be closed
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD_OUTPUT
+    return code
 
 
 def _run_as_process() -> int:
@@ -169,9 +183,12 @@ def run(arguments: list[str]) -> int:
     """
     words = [argument for argument in arguments if argument != DEBUG_FLAG]
     try:
-        get_command(app)(words, prog_name="deltalight")  # calling `app` would replace sys.excepthook
+        command = get_command(app)  # calling `app` would replace sys.excepthook
+        _refuse_empty_paths(command)
+        command(words, prog_name="deltalight")
     except SystemExit as stop:
-        return int(stop.code or 0)
+        # Typer turns a broken pipe into code 1.
+        return UNREAD_OUTPUT if isinstance(stop.__context__, BrokenPipeError) else int(stop.code or 0)
     except Terminated:
         return 128 + signal.SIGTERM
     except KeyboardInterrupt:
@@ -181,6 +198,23 @@ def run(arguments: list[str]) -> int:
             raise
         return _report(fault)
     return 0
+
+
+def _refuse_empty_paths(command: Any) -> None:  # noqa: ANN401 - a command of click's, as above
+    """Let no option or argument take "" for a path: it would be the current folder (`--out "$UNSET"`)."""
+    hints = get_type_hints(command.callback) if command.callback else {}
+    for parameter in command.params:
+        hint = hints.get(parameter.name)
+        if Path in (hint, *get_args(hint)):
+            parameter.process_value = partial(_path, parameter, parameter.process_value)
+    for below in getattr(command, "commands", {}).values():
+        _refuse_empty_paths(below)
+
+
+def _path(parameter: Any, process: Callable[[Any, Any], Any], context: Any, value: object) -> Any:  # noqa: ANN401
+    if value == "":
+        raise typer.BadParameter("the path is empty; write one ('.' is this folder).", context, parameter)
+    return process(context, value)
 
 
 def _report(fault: Exception) -> int:

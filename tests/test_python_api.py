@@ -205,6 +205,9 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         ),
         "cannot be read|does not exist|no such": lambda: dl.open(tmp_path / "none.mcap"),
         "`pose.translation_m` is wrong: must be a list": lambda: scene.add(cube, at=5),  # type: ignore[arg-type]
+        "scene document is needed and `dict` was given; make one with `deltalight.protocol.scene.parse_scene`": (
+            lambda: dl.Scene({"name": "desk"})  # type: ignore[arg-type]
+        ),
         "is a folder; name a mesh file": lambda: scene.add(tmp_path),
         "cup.glb does not exist; correct": lambda: scene.change("knot", asset="cup.glb"),
         "has its own calibration": lambda: dl.open(RECORDING, calibration=tmp_path),

@@ -7,7 +7,7 @@ from deltalight.protocol.dataset_fisheye import load_fisheye_calibration
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml
-from deltalight.protocol.source import RECORDING_SUFFIXES, open_source
+from deltalight.protocol.source import is_recording_name, open_source
 from deltalight.sensor_node.cameras.base import Camera
 from deltalight.sensor_node.cameras.driver import CameraRequest
 from deltalight.sensor_node.cameras.drivers import SYNTHETIC, driver_plugins, load_driver
@@ -52,7 +52,7 @@ def open_camera(
     if is_live(source):
         return _open_live(source, settings, board, calibrated=calibrated, depth=depth)
     path = Path(source)
-    if not path.exists() and not source.endswith(RECORDING_SUFFIXES) and len(path.parts) < 2:
+    if not path.exists() and not is_recording_name(source) and len(path.parts) < 2:
         raise _unknown(source)
     return ReplayCamera(open_source(path, board), realtime=settings.realtime, loop=settings.loop)
 

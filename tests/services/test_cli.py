@@ -163,6 +163,34 @@ def test_wrong_use_ends_with_2_and_names_what_is_wrong(
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("render", "take", "--out", ""), "--out"),
+        (("render", "take", "-o", ""), "--out"),
+        (("render", "take", "--out=out", "--scene="), "--scene"),
+        (("recordings", "info", ""), "file"),
+    ],
+)
+def test_an_empty_path_is_not_the_current_folder(cli: RunCli, words: tuple[str, ...], named: str) -> None:
+    done = cli(*words)
+    said = " ".join(done.stderr.replace("│", " ").split())
+    assert (done.returncode, f"invalid value for '{named}" in said.lower()) == (2, True), said
+    assert "the path is empty" in said
+
+
+@pytest.mark.parametrize("command", [("config",), ("schema",), ("--help",)])
+def test_output_that_nobody_reads_ends_a_command_quietly(command: tuple[str, ...]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    program = [sys.executable, "-m", "deltalight.services", *command]
+    with os.fdopen(writer, "wb") as unread:
+        done = subprocess.run(
+            program, cwd=ROOT, stdout=unread, stderr=subprocess.PIPE, text=True, timeout=60, check=False
+        )
+    assert (done.returncode, done.stderr) == (141, "")
+
+
 def test_a_wrong_choice_is_told_in_plain_words(cli: RunCli) -> None:
     done = cli("recordings", "export", "take.mcap", "--format", "fbx", "-o", "out")
     said = " ".join(done.stderr.replace("│", " ").split())
