@@ -45,7 +45,7 @@ from deltalight.services.commands.server import server
 from deltalight.services.commands.stream import stream
 from deltalight.services.commands.up import up
 from deltalight.services.commands.virtual_camera import virtual_camera
-from deltalight.services.open_files import allow_many_connections
+from deltalight.services.open_files import allow_many_connections, open_standard_streams
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.process import InForkedChild
 from deltalight.services.signals import Terminated, raise_signals
@@ -149,8 +149,7 @@ def main() -> None:
 def _with_output_flushed(code: int) -> int:
     """Write what standard output still holds, which Python would do with a traceback, and return the exit code."""
     try:
-        if sys.stdout is not None:  # it may be closed
-            sys.stdout.flush()
+        sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD_OUTPUT
@@ -159,6 +158,7 @@ def _with_output_flushed(code: int) -> int:
 
 def _run_as_process() -> int:
     raise_signals()
+    open_standard_streams()
     end_with_supervisor()
     allow_many_connections()
     limit_blas_threads(sys.argv[1:])

@@ -191,6 +191,15 @@ def test_output_that_nobody_reads_ends_a_command_quietly(command: tuple[str, ...
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_closed_streams_end_no_command(tmp_path: Path, closed: tuple[int, ...]) -> None:
+    redirects = " ".join(f"{number}>&-" for number in closed)
+    command = f'"{sys.executable}" -m deltalight.services board --out "{tmp_path}/board.pdf" {redirects}'
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, timeout=60, check=False, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+
+
 def test_a_wrong_choice_is_told_in_plain_words(cli: RunCli) -> None:
     done = cli("recordings", "export", "take.mcap", "--format", "fbx", "-o", "out")
     said = " ".join(done.stderr.replace("│", " ").split())
