@@ -60,7 +60,8 @@ class Watch:
             )
             return collect_views(series, target, enough=enough, tell=self._tell_live)
         columns = (TextColumn("looking for the target"), BarColumn(), MofNCompleteColumn())
-        with Progress(*columns, console=self.console, transient=True) as progress:
+        hidden = not self.console.is_terminal  # it would leave an empty line in a file
+        with Progress(*columns, console=self.console, transient=True, disable=hidden) as progress:
             task = progress.add_task("pictures", total=self.total)
             return collect_views(series, target, enough=enough, tell=lambda *_: progress.advance(task))
 
