@@ -20,7 +20,7 @@ from typer.main import get_command
 
 from deltalight import __version__
 from deltalight.benchmarks.cli import bench, gpu_check
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, unreachable
 from deltalight.services.commands.api import api
 from deltalight.services.commands.backup import backup, restore
 from deltalight.services.commands.board import board
@@ -56,6 +56,7 @@ LIVE_COMMANDS = frozenset(
     {"node", "server", "api", "demo", "up"}
 )  # they do the same for each frame, or fork who does
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+REFUSED_PATH = frozenset({errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP})
 FULL_DISK = frozenset({errno.ENOSPC, errno.EDQUOT})
 UNREAD_OUTPUT = 128 + signal.SIGPIPE  # as of programs that the signal ends, which Python ignores
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
@@ -222,6 +223,8 @@ def _report(fault: Exception) -> int:
         fault = DeltalightError(
             f"the output cannot be written ({fault.strerror}); free some space, and run it again."
         )
+    if isinstance(fault, OSError) and fault.errno in REFUSED_PATH and fault.filename is not None:
+        fault = unreachable(Path(os.fsdecode(fault.filename)), fault.strerror)
     if isinstance(fault, DeltalightError):
         print(f"deltalight: {' '.join(str(fault).split())}", file=sys.stderr)
         return fault.exit_code

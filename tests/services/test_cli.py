@@ -19,6 +19,7 @@ from deltalight.services import doctor, ports
 from deltalight.services.api.serve import listening
 from deltalight.services.cli import BLAS_THREADS, app, limit_blas_threads, run
 from deltalight.services.commands.examples import EXAMPLES
+from deltalight.services.demo import RECORDING
 from tests.services.conftest import ROOT, RunCli
 
 COMMANDS = {
@@ -189,6 +190,31 @@ def test_output_that_nobody_reads_ends_a_command_quietly(command: tuple[str, ...
             program, cwd=ROOT, stdout=unread, stderr=subprocess.PIPE, text=True, timeout=60, check=False
         )
     assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("render", "{name}", "--out", "out"),
+        ("render", RECORDING, "--frames", "0:1", "--out", "{name}.mp4"),
+        ("node", "--source", "{name}"),
+        ("recordings", "export", RECORDING, "--out", "{name}"),
+        ("recordings", "import", "{name}", "--out", "a.mcap"),
+        ("calibrate", "camera", "{name}", "--out", "out"),
+        ("board", "--out", "{name}.pdf"),
+        ("graph", "--svg", "{name}.svg"),
+    ],
+)
+def test_a_path_that_the_system_refuses_is_a_sentence(
+    cli: RunCli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    """As it refuses those below a folder that may not be entered, which a test that root runs cannot have."""
+    monkeypatch.chdir(tmp_path)
+    done = cli(*(str(word).format(name="x" * 300) for word in words))
+    assert done.returncode == 2
+    assert "(File name too long)" in done.stderr
+    assert "internal error" not in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
