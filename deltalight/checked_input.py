@@ -94,7 +94,7 @@ def _require_response(response: object) -> None:
     if response is None:
         return
     _require_array(response, "response", np.floating, (256, 3))
-    if not np.isfinite(response).all():
+    if not np.isfinite(np.asarray(response)).all():
         raise DeltalightError("The frame's response holds values that are not finite; give linear light.")
 
 
