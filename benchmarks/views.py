@@ -194,7 +194,9 @@ def _timed(run: Callable[[], object]) -> tuple[float, float]:
 
 def run_views(job: ViewsJob, *, out: Path | None, as_json: bool) -> None:
     """Measure, write the report to `out` if given, and print it."""
-    with Progress(console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
+    console = Console(stderr=True)
+    hidden = not console.is_terminal
+    with Progress(console=console, transient=True, refresh_per_second=1, disable=hidden) as progress:
         report = measure_views(job, progress)
     put_report(
         report.model_dump_json(indent=2), lambda: Console().print(_table(report)), out=out, as_json=as_json

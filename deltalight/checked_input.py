@@ -2,7 +2,7 @@
 
 import math
 import operator
-from typing import SupportsIndex
+from typing import SupportsFloat, SupportsIndex
 
 import numpy as np
 
@@ -78,13 +78,24 @@ def _require_frame(frame: object) -> ViewFrame:
         )
     size = _size(frame.camera, "camera")
     _require_array(frame.color, "color", np.uint8, (*size, 3))
-    if frame.response is not None:
-        _require_array(frame.response, "response", np.floating, (256, 3))
-    if not (math.isfinite(frame.exposure_scale) and frame.exposure_scale > 0):
+    _require_response(frame.response)
+    scale = float(frame.exposure_scale) if isinstance(frame.exposure_scale, SupportsFloat) else math.nan
+    if not 0 < scale < math.inf:
         raise DeltalightError(f"The frame's exposure_scale is {frame.exposure_scale}; give a number above 0.")
+    for name in ("frame_id", "timestamp_ns"):
+        if not isinstance(number := getattr(frame, name), SupportsIndex):
+            raise DeltalightError(f"The frame's {name} is {number!r}; give a whole number.")
     _require_depth(frame.depth)
     _require_pose(frame.pose)
     return frame
+
+
+def _require_response(response: object) -> None:
+    if response is None:
+        return
+    _require_array(response, "response", np.floating, (256, 3))
+    if not np.isfinite(np.asarray(response)).all():
+        raise DeltalightError("The frame's response holds values that are not finite; give linear light.")
 
 
 def _require_depth(depth: object) -> None:

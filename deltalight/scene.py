@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float
 
+from deltalight.protocol.array_checks import kind_of
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing
@@ -25,7 +26,17 @@ class Scene:
     """
 
     def __init__(self, document: SceneDocument | None = None) -> None:
-        self.document = document or SceneDocument()
+        """Takes a document, such as one of `parse_scene`; None: an empty one.
+
+        Raises:
+            DeltalightError: it is something else.
+        """
+        self.document = SceneDocument() if document is None else document
+        if not isinstance(self.document, SceneDocument):
+            raise DeltalightError(
+                f"A scene document is needed and {kind_of(document)} was given; make one with"
+                " `deltalight.protocol.scene.parse_scene`, or load a file with `Scene.load`."
+            )
 
     def __repr__(self) -> str:
         return f"<Scene with {', '.join(self._names()) or 'no objects'}>"

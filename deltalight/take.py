@@ -140,4 +140,6 @@ def open_take(source: str | Path | Camera, *, calibration: str | Path | None = N
     if isinstance(source, str) and (live or source == SYNTHETIC):
         settings = validate(CameraSettings, {"calibration": calibration}, "the camera's settings")
         return LiveTake(open_camera(source, settings), newest=live)
+    if source == "":
+        raise DeltalightError("the path is empty; name a dataset folder, an .mcap recording or a camera.")
     return Take(open_source(Path(source)))

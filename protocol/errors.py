@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from pathlib import Path
 from typing import ClassVar
 
 
@@ -16,6 +17,11 @@ class DeltalightError(Exception):
     def _render_traceback_(self) -> list[str]:
         """Returns the lines that IPython shows in place of a traceback."""
         return [str(self)]
+
+
+def unreachable(path: Path, reason: str | None) -> DeltalightError:
+    """Return the fault that the system does not let a path be used, to be raised."""
+    return DeltalightError(f"'{path}' cannot be reached ({reason}); correct the path, or its permissions.")
 
 
 def install_command(*requirements: str) -> str:

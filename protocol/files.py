@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, unreachable
 
 ACTIVE_SUFFIX = ".active"  # of a recording that is not finished
 PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
@@ -24,6 +24,18 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def exists(path: Path) -> bool:
+    """Whether there is such a file or folder.
+
+    Raises:
+        DeltalightError: the system does not say: a folder above may not be entered, or the name is too long.
+    """
+    try:
+        return path.exists()
+    except OSError as fault:
+        raise unreachable(path, fault.strerror) from fault
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; move it into place at the end, remove it on an error.
@@ -33,6 +45,8 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         DeltalightError: the file cannot be written (disk full, no permission).
     """
+    if not path.name:
+        raise unwritable(path, "it names no file")
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary

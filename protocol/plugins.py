@@ -1,7 +1,7 @@
 """Plugins: what installed packages bring through entry points (docs/plugins.md)."""
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
@@ -68,6 +68,11 @@ class Plugin:
             f"The plugin `{point.name}` of package {self.package} (entry point {point.value} in {point.group}) "
             f"cannot be used ({said}); fix or uninstall the package."
         )
+
+
+def blamed(plugin: Plugin | None) -> AbstractContextManager[None]:
+    """`Plugin.blamed` of a plugin, if what runs is one's."""
+    return nullcontext() if plugin is None else plugin.blamed()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ def refuse_bag(path: Path) -> None:
     Raises:
         DeltalightError: it is one, by its name.
     """
-    if path.suffix == BAG_SUFFIX:
+    if path.suffix.lower() == BAG_SUFFIX:
         raise DeltalightError(
             f"{path} is a ROS bag; make a recording of it with `deltalight recordings import`."
         )

@@ -8,11 +8,12 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import exists
 from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.ros_bag_names import refuse_bag
 from deltalight.protocol.scene import SceneDocument
 
-RECORDING_SUFFIXES = (".mcap", ".mcap.active")
+RECORDING_SUFFIXES = (".mcap", ".mcap.active")  # or in capitals, as other systems may name files
 
 
 class Source(Protocol):
@@ -57,6 +58,11 @@ class Source(Protocol):
     def __iter__(self) -> Iterator[SensorFrame]: ...
 
 
+def is_recording_name(name: str) -> bool:
+    """Whether a file is called as recordings are."""
+    return name.lower().endswith(RECORDING_SUFFIXES)
+
+
 def open_source(path: Path, board: BoardSpec | None = None) -> Source:
     """Open a dataset folder or a recording (`.mcap`, or one still named `.mcap.active`).
 
@@ -65,15 +71,15 @@ def open_source(path: Path, board: BoardSpec | None = None) -> Source:
     Raises:
         DeltalightError: there is no such source, or it cannot be read.
     """
+    if not exists(path):
+        raise DeltalightError(f"{path} does not exist; give a dataset folder or an .mcap recording.")
     # Imported here because both readers are heavy and few callers need both.
     if path.is_dir():
         from deltalight.protocol.dataset import open_dataset
 
         return open_dataset(path, board)
-    if not path.exists():
-        raise DeltalightError(f"{path} does not exist; give a dataset folder or an .mcap recording.")
     refuse_bag(path)
-    if not path.name.endswith(RECORDING_SUFFIXES):
+    if not is_recording_name(path.name):
         raise DeltalightError(f"{path} is neither a folder nor an .mcap recording; give one of these.")
     from deltalight.protocol.recording_reader import RecordingReader
 

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
-from deltalight.protocol.plugins import Plugin
+from deltalight.protocol.plugins import Plugin, blamed
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Dispatch, watched
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
@@ -26,6 +26,7 @@ from deltalight.render_server.stages import (
     complete_clocks,
     in_order,
     needed_for,
+    require_kinds,
 )
 
 __all__ = ["Graph", "GraphError", "Resource", "Stage"]
@@ -287,7 +288,8 @@ class Graph:
         """Returns the stages in topological order; declaration order breaks ties."""
         if self._order is None:
             for stage, names in self._named.items():
-                stage.inputs = tuple(self._read(stage, name) for name in names)
+                with blamed(stage.plugin):
+                    stage.inputs = tuple(self._read(stage, name) for name in names)
             self._order = in_order(self._stages)
             complete_clocks(self._order)
             read = {item for stage in self._order for item in stage.inputs}
@@ -335,10 +337,12 @@ class Graph:
         try:
             with self._around(stage, dispatches):
                 found = stage.call()
+                results = (found,) if len(stage.outputs) == 1 else _several(stage, found)
+                if stage.plugin is not None:
+                    require_kinds(stage, results)
         except Exception as error:
             error.add_note(f"Stage `{stage.name}` raised it.")
             raise
-        results = (found,) if len(stage.outputs) == 1 else _several(stage, found)
         if dispatches:
             self._require_declared(stage, results, dispatches)
         return results

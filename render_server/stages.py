@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
+from deltalight.protocol.array_checks import kind_of
 from deltalight.protocol.plugins import Plugin
 from deltalight.render_server.graph_report import Clock
 from deltalight.render_server.lag import Lag
@@ -21,13 +22,15 @@ class Resource(Generic[T]):
     """A named texture, buffer or plain value, and its `version`, which counts its changes; 0: never written.
 
     `clocks` are what makes it change: its own if it is a source, else those of all that its stage reads (known once
-    the graph has run or reported).
+    the graph has run or reported). `kind` is the type that a plugin's stage must return for it (as `isinstance`
+    takes it), if it is checked.
     """
 
     name: str
     clocks: frozenset[Clock]
     stage: "Stage | None" = None
     version: int = 0
+    kind: Any = None
     _value: T | None = field(default=None, repr=False)
 
     @property
@@ -82,6 +85,18 @@ class Stage:
     def call(self) -> Any:  # noqa: ANN401 (as its function returns)
         """Calls the function with the values of the inputs, which have all been written."""
         return self.function(*[item._value for item in self.inputs])
+
+
+def require_kinds(stage: Stage, values: Sequence[Any]) -> None:
+    """Checks what a plugin's stage returned for its outputs, before a stage of others fails with it.
+
+    Raises:
+        TypeError: a value is of another type than its resource must be.
+    """
+    for output, value in zip(stage.outputs, values, strict=True):
+        if output.kind is not None and not isinstance(value, output.kind):
+            wanted = getattr(output.kind, "__name__", output.kind)
+            raise TypeError(f"it returned {kind_of(value)} for `{output.name}`, which must be `{wanted}`")
 
 
 def in_order(stages: Iterable[Stage]) -> list[Stage]:

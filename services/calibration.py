@@ -11,7 +11,7 @@ from rich.table import Table
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing, write_png
-from deltalight.services.files import make_output_folder
+from deltalight.services.files import make_output_folder, require_output_folder
 
 if TYPE_CHECKING:
     from deltalight.protocol.camera_model import CameraModel
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def result_path(folder: Path, name: str, *, force: bool) -> Path:
-    """Return the path of a new file in `folder`/calibration; call it before any work is done.
+    """Return the path of a new file in `folder`/calibration, checked before any work is done.
 
     Raises:
         DeltalightError: the file exists and `force` is not given, or the folder cannot be written.
@@ -31,12 +31,13 @@ def result_path(folder: Path, name: str, *, force: bool) -> Path:
     path = folder / "calibration" / name
     if path.exists() and not force:
         raise DeltalightError(f"{path} already exists; overwrite it with --force or name another --out.")
-    make_output_folder(path.parent)
+    require_output_folder(path.parent)
     return path
 
 
 def write_result(path: Path, save: Callable[[Path], None]) -> None:
-    """Let `save` write a temporary file, then move it into place."""
+    """Let `save` write a temporary file, then move it into place; make its folder if missing."""
+    make_output_folder(path.parent)
     with replacing(path) as temporary:
         save(temporary)
 
@@ -59,7 +60,8 @@ class Watch:
             )
             return collect_views(series, target, enough=enough, tell=self._tell_live)
         columns = (TextColumn("looking for the target"), BarColumn(), MofNCompleteColumn())
-        with Progress(*columns, console=self.console, transient=True) as progress:
+        hidden = not self.console.is_terminal  # it would leave an empty line in a file
+        with Progress(*columns, console=self.console, transient=True, disable=hidden) as progress:
             task = progress.add_task("pictures", total=self.total)
             return collect_views(series, target, enough=enough, tell=lambda *_: progress.advance(task))
 
@@ -98,6 +100,7 @@ def save_pictures(result: "LensResult", stem: Path) -> list[str]:
         "coverage": draw_coverage(result.brightest, result.fit, result.coverage),
         "residuals": draw_misses(result.brightest, result.fit),
     }
+    make_output_folder(stem.parent)
     paths = [stem.with_name(f"{stem.name}_{name}.png") for name in pictures]
     for path, picture in zip(paths, pictures.values(), strict=True):
         write_png(path, picture)

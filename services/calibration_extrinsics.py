@@ -100,4 +100,7 @@ def _depth_from_rgb(source: Source, board: BoardSpec) -> tuple[Float64[np.ndarra
 def _watched(source: Source) -> Iterator[SensorFrame]:
     """Yield the frames of a source, with a progress bar on stderr."""
     console = Console(stderr=True)
-    yield from track(source, "looking for the board", len(source), console=console, transient=True)
+    hidden = not console.is_terminal  # it would leave an empty line in a file
+    yield from track(
+        source, "looking for the board", len(source), console=console, transient=True, disable=hidden
+    )

@@ -12,7 +12,6 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.source import open_source
 from deltalight.services.calibration import result_path, write_result
 from deltalight.services.calibration_extrinsics import board_of
-from deltalight.services.files import make_output_folder
 
 
 def find_response(source: Path, eye: Literal["rgb", "fisheye"], out: Path, *, force: bool) -> dict[str, Any]:
@@ -29,7 +28,6 @@ def find_response(source: Path, eye: Literal["rgb", "fisheye"], out: Path, *, fo
     if eye == "fisheye":
         _write_into_fisheye(path, response.table)
     else:
-        make_output_folder(out)
         write_result(path, lambda aside: np.savetxt(aside, response.table, fmt="%.9g"))
     return {
         "pictures": response.pictures,

@@ -1,16 +1,18 @@
 """The `deltalight` command: registers the commands and reports faults by sentences and exit codes.
 
 Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 75 the GPU was reset,
-130 Ctrl-C, 143 SIGTERM.
+130 Ctrl-C, 141 nobody reads the output any more (`| head`), 143 SIGTERM.
 """
 
 import errno
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Annotated, Any
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -18,7 +20,7 @@ from typer.main import get_command
 
 from deltalight import __version__
 from deltalight.benchmarks.cli import bench, gpu_check
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, unreachable
 from deltalight.services.commands.api import api
 from deltalight.services.commands.backup import backup, restore
 from deltalight.services.commands.board import board
@@ -43,7 +45,7 @@ from deltalight.services.commands.server import server
 from deltalight.services.commands.stream import stream
 from deltalight.services.commands.up import up
 from deltalight.services.commands.virtual_camera import virtual_camera
-from deltalight.services.open_files import allow_many_connections
+from deltalight.services.open_files import allow_many_connections, open_standard_streams
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.process import InForkedChild
 from deltalight.services.signals import Terminated, raise_signals
@@ -54,7 +56,9 @@ LIVE_COMMANDS = frozenset(
     {"node", "server", "api", "demo", "up"}
 )  # they do the same for each frame, or fork who does
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+REFUSED_PATH = frozenset({errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP})
 FULL_DISK = frozenset({errno.ENOSPC, errno.EDQUOT})
+UNREAD_OUTPUT = 128 + signal.SIGPIPE  # as of programs that the signal ends, which Python ignores
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
 
 
@@ -140,11 +144,22 @@ def main() -> None:
     while code is None:
         with suppress(InForkedChild):  # this process is the child, with a command line of its own
             code = _run_as_process()
-    sys.exit(code)
+    sys.exit(_with_output_flushed(code))
+
+
+def _with_output_flushed(code: int) -> int:
+    """Write what standard output still holds, which Python would do with a traceback, and return the exit code."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD_OUTPUT
+    return code
 
 
 def _run_as_process() -> int:
     raise_signals()
+    open_standard_streams()
     end_with_supervisor()
     allow_many_connections()
     limit_blas_threads(sys.argv[1:])
@@ -169,9 +184,12 @@ def run(arguments: list[str]) -> int:
     """
     words = [argument for argument in arguments if argument != DEBUG_FLAG]
     try:
-        get_command(app)(words, prog_name="deltalight")  # calling `app` would replace sys.excepthook
+        command = get_command(app)  # calling `app` would replace sys.excepthook
+        _refuse_empty_paths(command)
+        command(words, prog_name="deltalight")
     except SystemExit as stop:
-        return int(stop.code or 0)
+        # Typer turns a broken pipe into code 1.
+        return UNREAD_OUTPUT if isinstance(stop.__context__, BrokenPipeError) else int(stop.code or 0)
     except Terminated:
         return 128 + signal.SIGTERM
     except KeyboardInterrupt:
@@ -183,11 +201,30 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
+def _refuse_empty_paths(command: Any) -> None:  # noqa: ANN401 - a command of click's, as above
+    """Let no option or argument take "" for a path: it would be the current folder (`--out "$UNSET"`)."""
+    hints = get_type_hints(command.callback) if command.callback else {}
+    for parameter in command.params:
+        hint = hints.get(parameter.name)
+        if Path in (hint, *get_args(hint)):
+            parameter.process_value = partial(_path, parameter, parameter.process_value)
+    for below in getattr(command, "commands", {}).values():
+        _refuse_empty_paths(below)
+
+
+def _path(parameter: Any, process: Callable[[Any, Any], Any], context: Any, value: object) -> Any:  # noqa: ANN401
+    if value == "":
+        raise typer.BadParameter("the path is empty; write one ('.' is this folder).", context, parameter)
+    return process(context, value)
+
+
 def _report(fault: Exception) -> int:
     if isinstance(fault, OSError) and fault.errno in FULL_DISK:  # that of standard output, say
         fault = DeltalightError(
             f"the output cannot be written ({fault.strerror}); free some space, and run it again."
         )
+    if isinstance(fault, OSError) and fault.errno in REFUSED_PATH and fault.filename is not None:
+        fault = unreachable(Path(os.fsdecode(fault.filename)), fault.strerror)
     if isinstance(fault, DeltalightError):
         print(f"deltalight: {' '.join(str(fault).split())}", file=sys.stderr)
         return fault.exit_code

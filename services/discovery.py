@@ -132,7 +132,7 @@ def choose(nodes: Sequence[FoundNode], name: str) -> FoundNode:
     if not nodes:
         raise DeltalightError(
             "no node announces itself on this network; check that it runs with an endpoint that other hosts can"
-            " reach, or name that endpoint with --subscribe."
+            " reach, or name that endpoint with --subscribe (`server` and `api` in place of `up`)."
         )
     if name == ONLY_NODE and len(nodes) == 1:
         return nodes[0]

@@ -32,6 +32,19 @@ def make_output_folder(folder: Path) -> Path:
     return folder
 
 
+def require_output_folder(folder: Path) -> None:
+    """Check a folder that is written after long work; one that was missing is missing afterwards, too.
+
+    Raises:
+        DeltalightError: it is a file, or cannot be created or written.
+    """
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    make_output_folder(folder)
+    with suppress(OSError):  # another process may have begun to use it
+        for each in missing:
+            each.rmdir()
+
+
 def require_output_file(path: Path) -> None:
     """Check a file that is written after long work, so that the work is not lost; create its folder if missing.
 

@@ -39,7 +39,7 @@ gc.disable()
 
 THREAD_COUNTS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 # OpenBLAS chooses its kernels by the processor's maker too, and they differ in the last bits of what they compute:
-# protected pictures were made with these. Whoever has loaded it already keeps what it chose.
+# protected pictures were made with these. It does so once, when NumPy is loaded (pyproject.toml, `addopts`).
 PROCESSOR = Path("/proc/cpuinfo")
 if "numpy" not in sys.modules and PROCESSOR.exists() and "avx512f" in PROCESSOR.read_text():
     os.environ["OPENBLAS_CORETYPE"] = "SkylakeX"

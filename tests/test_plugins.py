@@ -380,6 +380,15 @@ def test_a_method_that_cannot_declare_its_stages_is_named(
     choice = registry.choose_method(direct.settings(), software=True)
     with pytest.raises(DeltalightError, match=r"`direct` of package .* returns None, not Layers"):
         choice.declare(Graph(nothing), nothing, nothing)
+    loose = RelightingMethod(direct.settings, lambda *_: Layers(*[cast(Any, 3)] * 9))
+    monkeypatch.setattr(
+        registry,
+        "PLUGINS",
+        LoadedPlugins({"direct": InstalledMethod(direct.plugin, direct.settings, loose)}, {}),
+    )
+    choice = registry.choose_method(direct.settings(), software=True)
+    with pytest.raises(DeltalightError, match=r"`direct` of package .* its Layers is `int`, not a Resource"):
+        choice.declare(Graph(nothing), nothing, nothing)
     light = InstalledMethod(direct.plugin, direct.settings, DvctMethod)
     monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": light}, {}))
     with pytest.raises(DeltalightError, match="it names no RelightingMethod"):
@@ -413,3 +422,46 @@ def test_a_stage_that_fails_is_named_with_its_plugin(
     own.stage("fog", fail)
     with pytest.raises(ValueError, match="too thin"):
         own.run()
+
+
+Stages = Callable[[Graph], Layers]
+
+
+def wrong_value(graph: Graph) -> Layers:
+    made: Any = graph.stage("fog", dict)
+    return Layers(*[graph.source(str(number), "world") for number in range(8)], made)
+
+
+def wrong_count(graph: Graph) -> Layers:
+    made: Any = graph.stages("fog", dict, outputs=("fog near", "fog far"))[0]
+    return Layers(*[made] * 9)
+
+
+def unwritten_input(graph: Graph) -> Layers:
+    made: Any = graph.stage("fog", dict, "wind")
+    return Layers(*[made] * 9)
+
+
+@pytest.mark.parametrize(
+    ("declared", "said"),
+    [
+        (wrong_value, "stage `fog`, TypeError: it returned `dict` for `fog`, which must be `LightBuffers`"),
+        (wrong_count, "stage `fog`, GraphError: Stage `fog` returned 1 values for `fog near`, `fog far`"),
+        (unwritten_input, "GraphError: Stage `fog` reads `wind`, which no stage writes"),
+    ],
+)
+def test_a_stage_that_does_not_fit_is_named_with_its_plugin(
+    install: Install, monkeypatch: pytest.MonkeyPatch, declared: Stages, said: str
+) -> None:
+    del install
+    (direct,) = load_methods().values.values()
+    method = RelightingMethod(direct.settings, lambda graph, *_: declared(graph))
+    weak = InstalledMethod(direct.plugin, direct.settings, method)
+    monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": weak}, {}))
+    nothing = cast(Any, None)
+    graph = Graph(nothing)
+    registry.choose_method(direct.settings(), software=True).declare(graph, nothing, nothing)
+    with pytest.raises(DeltalightError) as caught:
+        graph.run()
+    assert "`direct` of package direct-light 1.0" in str(caught.value)
+    assert said in str(caught.value)

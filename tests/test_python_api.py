@@ -203,8 +203,14 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         "the nearest known key is `volume_size`": lambda: scene.document.replaced(
             method={"name": "dvct", "volume_siz": 32}
         ),
+        "the path is empty; name a dataset folder": lambda: dl.open(""),
+        "cannot be reached .File name too long": lambda: dl.open("x" * 5000),
+        "'/' cannot be written .it names no file": lambda: scene.save("/"),
         "cannot be read|does not exist|no such": lambda: dl.open(tmp_path / "none.mcap"),
         "`pose.translation_m` is wrong: must be a list": lambda: scene.add(cube, at=5),  # type: ignore[arg-type]
+        "scene document is needed and `dict` was given; make one with `deltalight.protocol.scene.parse_scene`": (
+            lambda: dl.Scene({"name": "desk"})  # type: ignore[arg-type]
+        ),
         "is a folder; name a mesh file": lambda: scene.add(tmp_path),
         "cup.glb does not exist; correct": lambda: scene.change("knot", asset="cup.glb"),
         "has its own calibration": lambda: dl.open(RECORDING, calibration=tmp_path),
@@ -260,6 +266,12 @@ def test_frames_of_a_programs_own_are_checked(take: dl.Take, scene: dl.Scene) ->
                 frame, depth=replace(depth, valid=depth.valid.astype(np.uint8))
             ),
             "exposure_scale is 0.0; give a number above 0": replace(frame, exposure_scale=0.0),
+            "exposure_scale is None; give a number above 0": replace(frame, exposure_scale=None),  # type: ignore[arg-type]
+            "timestamp_ns is None; give a whole number": replace(frame, timestamp_ns=None),  # type: ignore[arg-type]
+            "frame_id is 1.5; give a whole number": replace(frame, frame_id=1.5),  # type: ignore[arg-type]
+            "response holds values that are not finite": replace(
+                frame, response=np.full((256, 3), np.nan, np.float32)
+            ),
             "response must be an array of float32": replace(frame, response=np.zeros(256, np.float32)),
             "A frame is needed and `ndarray` was given": frame.color,
             "A frame is needed and None was given": None,

@@ -40,7 +40,7 @@ def run_quality(
     variants = _ablation(volume_size) if methods is None else parse_variants(methods)
     require_replaceable(out)
     console, kept = Console(stderr=True), KeptResults.beside(out)
-    with Progress(console=console, transient=True) as progress:
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         result = measure_quality(QualityJob(chosen, variants, size, spp, volume_size, device), progress, kept)
     write_report(result, out)
     kept.remove()

@@ -25,7 +25,7 @@ def run_real(data: Path, out: Path, *, device: int | None, as_json: bool) -> Non
             )
     make_output_folder(out)
     console = Console(stderr=True)
-    with Progress(console=console, transient=True) as progress:
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         of_cartons = cartons.measure_cartons(data / cartons.FOLDER, progress, device)
         of_bins = bins.measure_bins(data / bins.FOLDER, progress, device)
     write_report(out, of_cartons, of_bins)

@@ -112,5 +112,7 @@ def run_comparison(before: Path, after: Path, *, as_json: bool) -> None:
 @contextmanager
 def _progress() -> Iterator[Progress]:
     """Shows progress on stderr, seldom redrawn: that takes time from what is measured."""
-    with Progress(console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
+    console = Console(stderr=True)
+    hidden = not console.is_terminal
+    with Progress(console=console, transient=True, refresh_per_second=1, disable=hidden) as progress:
         yield progress

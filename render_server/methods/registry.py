@@ -1,19 +1,18 @@
 """Selects the relighting method, with its settings, for a scene document's `method`."""
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from deltalight.protocol.array_checks import kind_of
 from deltalight.protocol.methods import PLUGINS
-from deltalight.protocol.plugins import Plugin
+from deltalight.protocol.plugins import Plugin, blamed
 from deltalight.protocol.quality import Quality
 from deltalight.protocol.scene_method import DvctMethod, MethodSettings, NoneMethod
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.frame import FrameResources
-from deltalight.render_server.graph import Graph
+from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.aroof import AROOF
 from deltalight.render_server.methods.differential import DIFFERENTIAL
 from deltalight.render_server.methods.dvct import DVCT
@@ -27,7 +26,7 @@ from deltalight.render_server.methods.method import (
     Setup,
 )
 from deltalight.render_server.methods.precomputed_transfer import precomputed_radiance
-from deltalight.render_server.methods.surface_shading import Layers
+from deltalight.render_server.methods.surface_shading import Layers, layer_kinds
 from deltalight.render_server.precomputation.light_transfers import ObjectTransfers, require_rigid_transfer
 from deltalight.render_server.precomputation.occlusion_fields import OcclusionFields
 
@@ -93,10 +92,10 @@ class MethodChoice:
         Raises:
             DeltalightError: a plugin cannot, or declares something else.
         """
-        with _blamed(self.plugin), graph.of_plugin(self.plugin):
+        with blamed(self.plugin), graph.of_plugin(self.plugin):
             layers = self.method.declare(graph, resources, setup)
-        if self.plugin is not None and not isinstance(layers, Layers):
-            raise self.plugin.fault(f"its `declare` returns {kind_of(layers)}, not Layers")
+        if self.plugin is not None:
+            _require_layers(layers, self.plugin)
         return layers
 
     def shaded(
@@ -128,11 +127,28 @@ def choose_method(
         drawn = choose_method(DvctMethod(quality=document.quality), shading, software=software)
         return replace(drawn, relights_real=False)
     method, plugin = _registered(document)
-    with _blamed(plugin):
+    with blamed(plugin):
         resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)
         remark = None if method.state_memory is None else method.state_memory(document, resolved)
     asked = Shading() if shading is None else shading
     return MethodChoice(method, document, document.limited(), resolved, asked, remark, plugin=plugin)
+
+
+def _require_layers(layers: object, plugin: Plugin) -> None:
+    """Checks what a plugin declared, and has the graph check what its stages will return for it.
+
+    Raises:
+        DeltalightError: it is no `Layers`, or holds something else than resources.
+    """
+    if not isinstance(layers, Layers):
+        raise plugin.fault(f"its `declare` returns {kind_of(layers)}, not Layers")
+    for name, kind in layer_kinds().items():
+        resource = getattr(layers, name)
+        if resource is None and hasattr(Layers, name):  # what may be left out
+            continue
+        if not isinstance(resource, Resource):
+            raise plugin.fault(f"`{name}` of its Layers is {kind_of(resource)}, not a Resource")
+        resource.kind = kind
 
 
 class MethodChooser:
@@ -160,7 +176,3 @@ def _registered(settings: MethodSettings) -> tuple[RelightingMethod[Any], Plugin
     if not isinstance(installed.value, RelightingMethod):
         raise installed.plugin.fault("it names no RelightingMethod")
     return installed.value, installed.plugin
-
-
-def _blamed(plugin: Plugin | None) -> AbstractContextManager[None]:
-    return nullcontext() if plugin is None else plugin.blamed()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import moderngl
 
@@ -110,6 +110,17 @@ class Layers:
     direct_mu: Resource[DirectLight] | None = None
     cones_mu: Resource[ConeFields] | None = None
     transmit: Callable[[Resource[moderngl.Texture]], Resource[moderngl.Texture]] | None = None
+
+
+def layer_kinds() -> dict[str, Any]:
+    """Returns the type of each layer that is a resource, as `isinstance` takes it."""
+    kinds: dict[str, Any] = {}
+    for name, hint in get_type_hints(Layers).items():
+        for each in (hint, *get_args(hint)):
+            if get_origin(each) is Resource:
+                (kind,) = get_args(each)
+                kinds[name] = Callable if get_origin(kind) is Callable else kind
+    return kinds
 
 
 class SurfaceShading:

@@ -52,24 +52,18 @@ class Matting:
         if rectangle[2] <= 0 or rectangle[3] <= 0:
             return
         sight = SIGHT_PER_REACH * reach_px
-        if self._mean is not None:
-            met = self._rectangle_around(rectangle, sight)
-            scene = {**scene, "linear_picture": self._mean.add(scene["linear_picture"], met)}
+        scene = self._averaged(scene, self._rectangle_around(rectangle, sight))
         self._find_nearest(scene, rectangle, sight, -(-reach_px // BLOCK))
         own: Bindings = {"sample_coverage": sample_coverage, "antialiased": sample_coverage is not None}
         self._list_band(scene, own, rectangle)
         self._estimate_mattes(scene, own, sight)
-        self._fusion.run(
-            (self._threads,),
-            scene,
-            own,
-            rectangle=rectangle,
-            estimate=self._estimate,
-            contrast=self._contrast,
-            object_coverage=coverage.texture,
-            edge_correction=coverage.edge_correction,
-            Texels=self._band,
-        )
+        self._fuse(scene, own, rectangle, coverage)
+
+    def _averaged(self, scene: Bindings, met: Rectangle) -> Bindings:
+        """Returns the bindings with the mean over the last pictures, where there is one, in what rays meet."""
+        if self._mean is None:
+            return scene
+        return {**scene, "linear_picture": self._mean.add(scene["linear_picture"], met)}
 
     def _find_nearest(self, scene: Bindings, rectangle: Rectangle, sight: int, reach: int) -> None:
         """Keeps the least depth within `reach` blocks of each block that rays from the rectangle meet."""
@@ -105,6 +99,20 @@ class Matting:
             contrast_out=self._contrast,
             Texels=self._band,
             sight=float(sight),
+        )
+
+    def _fuse(self, scene: Bindings, own: Bindings, rectangle: Rectangle, coverage: ObjectCoverage) -> None:
+        """Averages the estimates of pixels that look alike, and corrects coverage and unmixing by them."""
+        self._fusion.run(
+            (self._threads,),
+            scene,
+            own,
+            rectangle=rectangle,
+            estimate=self._estimate,
+            contrast=self._contrast,
+            object_coverage=coverage.texture,
+            edge_correction=coverage.edge_correction,
+            Texels=self._band,
         )
 
     def _blocks_around(self, rectangle: Rectangle, margin: int) -> Rectangle:

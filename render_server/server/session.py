@@ -45,7 +45,7 @@ MAXIMUM_FAULTS_IN_A_ROW = 30
 LOG_INTERVAL_NS = 10**9
 SAME_LOG_INTERVAL_NS = 60 * 10**9  # of one sentence, whose fault may come and go
 WATCHED_NS = 60 * 10**9
-SOME_SHADERS = 60  # of a first picture; that of the demo has 57
+SOME_SHADERS = 60  # of a first picture, roughly; more are told as they are counted
 
 log = structlog.get_logger()
 

@@ -16,7 +16,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.protocol.ros_bag_names import refuse_bag
-from deltalight.protocol.source import RECORDING_SUFFIXES, open_source
+from deltalight.protocol.source import is_recording_name, open_source
 from deltalight.sensor_node.calibration.targets import Target
 from deltalight.sensor_node.calibration.views import Picture, ViewCollector
 
@@ -59,7 +59,7 @@ def open_series(source: str, eye: Eye) -> Series:
     path = Path(source)
     if any(sign in path.name for sign in "*?["):
         return _files(sorted(path.parent.glob(path.name), key=_natural), source, path.parent)
-    if source.endswith(RECORDING_SUFFIXES):
+    if is_recording_name(source):
         frames = open_source(path)
         film = _is_film(frames.timestamps_ns)
         return Series(_of_frames(iter(frames), eye), len(frames), film, board=frames.board)

@@ -15,7 +15,8 @@ ENVIRONMENT = {
     "DEPTHAI_INSTALL_SIGNAL_HANDLER": "0",
     "DEPTHAI_AUTOCALIBRATION": "OFF",
 }
-INSTALL_HINT = install_command("depthai>=3")  # by its own name, for clones too
+OLDEST = (3, 12)  # as the extra `oak` in pyproject.toml, which clones do not carry with them
+INSTALL_HINT = install_command(f"depthai>={'.'.join(map(str, OLDEST))}")  # by its own name, for clones too
 
 
 def sdk_version() -> str | None:
@@ -30,7 +31,7 @@ def load_depthai() -> Any:  # noqa: ANN401 - the SDK is optional, so its types a
     """Import the SDK; the user's own environment variables take precedence.
 
     Raises:
-        DeltalightError: it is not installed, or not version 3.
+        DeltalightError: it is not installed, or too old.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -38,6 +39,6 @@ def load_depthai() -> Any:  # noqa: ANN401 - the SDK is optional, so its types a
         import depthai
     except ImportError as error:
         raise DeltalightError(f"OAK cameras need depthai ({error}); run {INSTALL_HINT}.") from error
-    if int(depthai.__version__.split(".")[0]) < 3:
+    if tuple(int(part) for part in depthai.__version__.split(".")[:2]) < OLDEST:
         raise DeltalightError(f"depthai {depthai.__version__} is too old; run {INSTALL_HINT}.")
     return depthai

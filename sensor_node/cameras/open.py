@@ -6,8 +6,9 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.dataset_fisheye import load_fisheye_calibration
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import exists
 from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml
-from deltalight.protocol.source import RECORDING_SUFFIXES, open_source
+from deltalight.protocol.source import is_recording_name, open_source
 from deltalight.sensor_node.cameras.base import Camera
 from deltalight.sensor_node.cameras.driver import CameraRequest
 from deltalight.sensor_node.cameras.drivers import SYNTHETIC, driver_plugins, load_driver
@@ -51,8 +52,10 @@ def open_camera(
         return _synthetic(settings, board)
     if is_live(source):
         return _open_live(source, settings, board, calibrated=calibrated, depth=depth)
+    if not source:
+        raise DeltalightError("the path is empty; name a dataset folder, an .mcap recording or a camera.")
     path = Path(source)
-    if not path.exists() and not source.endswith(RECORDING_SUFFIXES) and len(path.parts) < 2:
+    if not exists(path) and not is_recording_name(source) and len(path.parts) < 2:
         raise _unknown(source)
     return ReplayCamera(open_source(path, board), realtime=settings.realtime, loop=settings.loop)
 

@@ -87,6 +87,7 @@ class AuthMiddleware:
                 return
             limit = _BodyLimit(self._body_limit(scope), receive)
             limit.check_announced(Headers(scope=scope))
+            _require_plain_body(Headers(scope=scope))
         except ProblemError as refusal:
             await self._problems.of_http(refusal)(scope, receive, send)
             return
@@ -193,6 +194,13 @@ class _BodyLimit:
     def _refusal(self) -> ProblemError:
         sentence = f"The body is larger than {self._limit_bytes >> 20} MB; send less."
         return ProblemError(413, "too-large", sentence, {"Connection": "close"})
+
+
+def _require_plain_body(headers: Mapping[str, str]) -> None:
+    coding = headers.get("content-encoding", "identity")
+    if coding.strip().lower() not in ("", "identity"):
+        sentence = f"The body is encoded ({coding:.20}); send it as it is, without Content-Encoding."
+        raise ProblemError(415, "content-encoding", sentence, {"Accept-Encoding": "identity"})
 
 
 def _takes_tickets(scope: Scope) -> bool:

@@ -34,9 +34,19 @@ class StoredFileResponse(FileResponse):
             await send(message)
 
         try:
-            await super().__call__(scope, receive, after_reading)
+            await super().__call__(_without_foreign_range(scope), receive, after_reading)
         except (RuntimeError, FileNotFoundError) as fault:  # the framework raises the former
             raise NotFoundError("the file was deleted meanwhile; list what there is.") from fault
+
+
+def _without_foreign_range(scope: Scope) -> Scope:
+    """Drop a range that does not count bytes, which is to be ignored (RFC 9110, 14.2)."""
+    headers = [
+        (name, value)
+        for name, value in scope["headers"]
+        if name != b"range" or value.strip().lower().startswith(b"bytes=")
+    ]
+    return {**scope, "headers": headers}
 
 
 def _no_range(refusal: Message) -> ProblemError:

@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 
 from deltalight.protocol.documents import wrong_in_words
 from deltalight.protocol.errors import DeltalightError
@@ -125,7 +126,9 @@ class Problems:
         """Register the handlers of all errors of the application."""
 
         @app.exception_handler(HTTPException)
-        async def _http(_request: Request, fault: HTTPException) -> JSONResponse:
+        async def _http(request: Request, fault: HTTPException) -> JSONResponse:
+            if fault.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+                fault.headers = {"Allow": _allowed(request)}
             return self.of_http(fault)
 
         @app.exception_handler(DeltalightError)
@@ -160,6 +163,13 @@ class Problems:
         first = fault.errors()[0]
         if first["type"] == "json_invalid":
             return self._not_json()
+        if first["type"] == "missing":
+            sentence = (
+                "The body is missing; send one, as JSON."
+                if first["loc"] == ("body",)
+                else f"`{_place(first['loc'])}` is missing; add it."
+            )
+            return self.response(422, "invalid", sentence)
         if isinstance(fault.body, bytes):  # as curl sends it without being told the type
             return self.response(
                 422, "invalid", "Send the body as JSON, with Content-Type: application/json."
@@ -187,6 +197,15 @@ def _described(what: str) -> dict[str, Any]:
     """Describe an error by a reference: FastAPI would make a validator of each `model` that is named here."""
     schema = {"$ref": f"#/components/schemas/{Problem.__name__}"}
     return {"description": what, "content": {MEDIA_TYPE: {"schema": schema}}}
+
+
+def _allowed(request: Request) -> str:
+    """Return the methods of all routes at an address; the framework names those of the first."""
+    routes = (
+        route for route in request.app.router.routes if route.matches(request.scope)[0] is Match.PARTIAL
+    )
+    methods = {method for route in routes for method in route.methods}
+    return ", ".join(sorted(methods | {"HEAD"} if "GET" in methods else methods))
 
 
 def _slug(status: int) -> str:

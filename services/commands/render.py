@@ -101,7 +101,9 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self.progress = Progress(*columns, console=Console(stderr=True, soft_wrap=True), transient=True)
+        console = Console(stderr=True, soft_wrap=True)
+        hidden = not console.is_terminal  # it would leave an empty line in a file
+        self.progress = Progress(*columns, console=console, transient=True, disable=hidden)
         self._task = self.progress.add_task("rendering", total=total)
         self._warn = warn
 

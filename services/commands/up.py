@@ -78,11 +78,7 @@ def up(
     on_cluster = placer is PlacerKind.RAY
     _require_fitting(rooms, ray_address, rooms_host, on_cluster=on_cluster)
     if rooms is not None:
-        if source is not None or node is not None or scene is not None or device is not None:
-            raise DeltalightError(
-                "the rooms file says which sources, scenes and devices there are; leave out --source, --node,"
-                " --scene and --device."
-            )
+        _require_none(source, node, scene, device)
         commands = HostCommands(config_file, "info", spares, allow_software)
         _run_rooms(
             rooms,
@@ -95,12 +91,7 @@ def up(
             ray_address=ray_address,
         )
         return
-    if node is None:
-        source = source or _configured_source(config_file)
-    elif source is not None:
-        raise DeltalightError(
-            "--source starts a node here and --node uses one elsewhere; give only one of them."
-        )
+    source = _source_of_node(source, node, config_file)
     folder = data_folder(data, config_file)
     with open_store(folder, config_file) as store:
         shown = scene_to_show(store, recording_of(source), scene)
@@ -154,6 +145,34 @@ def _require_fitting(
         )
     if on_cluster and rooms is None:
         raise DeltalightError("--placer ray runs the rooms of a rooms file; name one with --rooms.")
+
+
+def _require_none(*options: object) -> None:
+    """Check that options of a single room are not given with `--rooms`.
+
+    Raises:
+        DeltalightError: one is.
+    """
+    if any(option is not None for option in options):
+        raise DeltalightError(
+            "the rooms file says which sources, scenes and devices there are; leave out --source, --node,"
+            " --scene and --device."
+        )
+
+
+def _source_of_node(source: str | None, node: str | None, config_file: Path | None) -> str | None:
+    """Return the source of the node to start: given, or of the configuration; None where `node` is used.
+
+    Raises:
+        DeltalightError: both are given, or there is no source.
+    """
+    if node is None:
+        return source or _configured_source(config_file)
+    if source is not None:
+        raise DeltalightError(
+            "--source starts a node here and --node uses one elsewhere; give only one of them."
+        )
+    return None
 
 
 def _run_rooms(

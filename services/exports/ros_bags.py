@@ -8,7 +8,7 @@ pictures have topics below `/deltalight/` too, so that the bag has one colour ca
 import json
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -226,7 +226,7 @@ def _transform(bag: _Bag, time_ns: int, parent: str, child: str, matrix: Float64
 
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a ROS bag and not like a dataset folder."""
-    return path.suffix == BAG_SUFFIX or (path / BAG_METADATA).is_file()
+    return path.suffix.lower() == BAG_SUFFIX or (path / BAG_METADATA).is_file()
 
 
 def import_bag(path: Path, out: Path, track: Track) -> Copied:
@@ -431,12 +431,25 @@ def _opened(path: Path) -> "AnyReader":
     except ImportError as fault:
         raise DeltalightError(NO_ROSBAGS) from fault
     try:
-        # ROS 2 before 2023 stores no definitions of messages.
-        bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        bag.open()
+        with _named_for_rosbags(path) as named:
+            # ROS 2 before 2023 stores no definitions of messages.
+            bag = AnyReader([named], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            bag.open()
     except Exception as fault:  # a damaged bag can make the reader fail in any way
         raise DeltalightError(f"{path} cannot be read as a ROS bag ({fault}); record it again.") from fault
     return bag
+
+
+@contextmanager
+def _named_for_rosbags(path: Path) -> Iterator[Path]:
+    """Yield a path by which rosbags knows a ROS 1 bag while it opens it: it asks for `.bag` in small letters."""
+    if path.suffix == BAG_SUFFIX or path.suffix.lower() != BAG_SUFFIX:
+        yield path
+        return
+    with TemporaryDirectory(prefix="deltalight-") as folder:
+        link = Path(folder) / f"{path.stem}{BAG_SUFFIX}"
+        link.symlink_to(path.absolute())
+        yield link
 
 
 def _namespace(topic: str) -> str:

@@ -273,6 +273,9 @@ def test_what_is_no_source_is_told(tmp_path: Path) -> None:
     (tmp_path / "a.txt").touch()
     with pytest.raises(DeltalightError, match="neither a folder nor"):
         open_source(tmp_path / "a.txt")
+    (tmp_path / "A.MCAP").touch()
+    with pytest.raises(DeltalightError, match=r"A\.MCAP .*not an MCAP recording"):
+        open_source(tmp_path / "A.MCAP")
     (tmp_path / "a.bag").touch()
     with pytest.raises(DeltalightError, match=r"a\.bag is a ROS bag; .*`deltalight recordings import`"):
         open_source(tmp_path / "a.bag")

@@ -155,6 +155,12 @@ def parameters() -> list[Any]:
     return [pytest.param(case, id=str(case), marks=mark) for case, mark in zip(cases(), marks, strict=True)]
 
 
+def test_blas_has_the_kernels_of_the_record(gpu: GpuContext) -> None:
+    """Where the processor has them: NumPy must not be loaded before they are chosen."""
+    made, old = made_with(gpu), recorded(RECORD)["made_with"]
+    assert made["blas"] == (old["blas"] if "avx512f" in made["cpu"] else "")
+
+
 @pytest.mark.parametrize("case", parameters())
 def test_pictures_and_dispatches_are_the_recorded_ones(
     gpu: GpuContext, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: Case

@@ -1,16 +1,21 @@
 """Cameras found through the files that Linux describes them in, laid out here as a kernel would."""
 
 import os
+import sys
+import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from deltalight.protocol.errors import install_command
+from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.sensor_node.cameras import oak_discovery
 from deltalight.sensor_node.cameras.discovery import discover, list_cameras
 from deltalight.sensor_node.cameras.driver import FoundCamera
-from deltalight.sensor_node.cameras.oak_sdk import load_depthai, sdk_version
+from deltalight.sensor_node.cameras.oak_sdk import INSTALL_HINT, load_depthai, sdk_version
 from deltalight.sensor_node.cameras.rgbd import has_backend
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def add_video(root: Path, number: int, name: str, index: int = 0, capabilities: str | None = None) -> None:
@@ -79,7 +84,7 @@ def test_usb_devices_of_known_makers_are_named_with_what_they_need(tmp_path: Pat
     (tmp_path / "sys/bus/usb/devices/usb1").mkdir()
     found = {camera.source: camera for camera in discover(tmp_path).cameras}
     assert list(found) == ["oak", "orbbec:0", "orbbec:1", "openni2:0"]
-    assert found["oak"].hint == f"depthai is not installed: {install_command('depthai>=3')}"
+    assert found["oak"].hint == f"depthai is not installed: {INSTALL_HINT}"
     assert found["orbbec:1"].name == "Astra Mini"
     assert ("WITH_OPENNI2=ON" in found["openni2:0"].hint) is not has_backend("openni2")
 
@@ -88,12 +93,20 @@ def test_what_is_missing_is_said_for_each_kind(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(oak_discovery, "sdk_version", lambda: None)
     missing = {kind.kind: kind for kind in discover(tmp_path).missing}
     assert "does not list" in missing["uvc"].details
-    assert missing["oak"].hint == install_command("depthai>=3")
+    assert missing["oak"].hint == INSTALL_HINT
     (tmp_path / "sys/class").mkdir(parents=True)
     missing = {kind.kind: kind for kind in discover(tmp_path).missing}
     assert "no video device" in missing["uvc"].details
     add_video(tmp_path, 0, "HD Webcam")
     assert "uvc" not in {kind.kind for kind in discover(tmp_path).missing}
+
+
+def test_the_version_that_is_asked_for_is_that_of_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert install_command(*project["optional-dependencies"]["oak"]) == INSTALL_HINT
+    monkeypatch.setitem(sys.modules, "depthai", SimpleNamespace(__version__="3.9.1"))
+    with pytest.raises(DeltalightError, match=r"depthai 3\.9\.1 is too old; run "):
+        load_depthai()
 
 
 @pytest.mark.skipif(sdk_version() is None, reason="the OAK SDK is not installed")

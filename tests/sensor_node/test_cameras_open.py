@@ -54,6 +54,7 @@ def calibration(tmp_path: Path) -> Path:
         ("xq", "`uvc:0`"),
         ("nowhere/take", "does not exist"),
         ("take.mcap", "does not exist"),
+        ("TAKE.MCAP", "does not exist"),
         ("openni2:left", "number"),
     ],
 )

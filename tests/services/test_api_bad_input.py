@@ -4,6 +4,7 @@ What else is refused, and how, is in test_api_assets.py, test_api_scenes.py, tes
 test_gltf_zip.py.
 """
 
+import gzip
 import io
 import json
 import socket
@@ -380,3 +381,19 @@ def test_a_render_server_that_dies_holds_nobody_up(tmp_path: Path) -> None:
         server.close()
         assert "answer" in refused(api, lambda: api.client.post("/snapshots", json={}), 503, "render-server")
         assert api.client.get("/health").json()["render_server"] == "silent"
+
+
+@pytest.mark.parametrize("method", ["POST", "PATCH"])
+def test_an_encoded_body_is_called_so(api: RunningApi, method: str) -> None:
+    """Packed JSON is neither text nor JSON to a server that does not unpack it."""
+    headers = {**JSON, "Content-Encoding": "gzip"}
+    ask = partial(api.client.request, method, "/scenes", content=gzip.compress(b"{}"), headers=headers)
+    said = refused(api, ask, 415, "content-encoding")
+    assert said == "The body is encoded (gzip); send it as it is, without Content-Encoding."
+    assert ask().headers["accept-encoding"] == "identity"
+
+
+def test_what_is_missing_is_named(api: RunningApi) -> None:
+    assert "`query.name` is missing; add it." in refused(
+        api, lambda: api.client.post("/assets", content=b"x", headers=UPLOAD), 422, "invalid"
+    )

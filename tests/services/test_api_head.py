@@ -126,3 +126,22 @@ def test_head_is_measured_as_the_route(api: RunningApi) -> None:
 def test_a_web_process_without_jobs_answers_head(tmp_path: Path) -> None:
     with running_api(tmp_path, jobs=False) as other:
         assert other.client.head("/recordings").status_code == 200
+
+
+def test_what_an_address_does_not_support_is_answered_by_what_it_does(api: RunningApi) -> None:
+    (scene,) = (each["id"] for each in api.client.get("/scenes").json() if each["name"] == "kept")
+    for address, methods in (
+        ("/scenes", "GET, HEAD, POST"),
+        (f"/scenes/{scene}", "DELETE, GET, HEAD, PATCH, PUT"),
+        (f"/scenes/{scene}/undo", "POST"),
+    ):
+        for method in ("OPTIONS", "TRACE"):
+            answer = api.client.request(method, address)
+            assert (answer.status_code, answer.headers["allow"]) == (405, methods)
+
+
+def test_a_range_of_something_else_than_bytes_is_ignored(api: RunningApi) -> None:
+    whole = api.client.get("/recordings/take/content")
+    for unit in ("lines=1-2", "frames=0-"):
+        answer = api.client.get("/recordings/take/content", headers={"Range": unit})
+        assert (answer.status_code, answer.content) == (200, whole.content)

@@ -253,7 +253,7 @@ def test_parts_are_replaced_and_patched(
         ("PUT", "/method", "fast", 422, "the scene"),
         ("PUT", "/output", {"width": 1e300}, 422, "output.width"),
         ("POST", "/objects", {}, 422, "`objects[0].asset` is missing"),
-        ("POST", "/objects", None, 422, "`body` is wrong: field required"),
+        ("POST", "/objects", None, 422, "The body is missing; send one, as JSON."),
         ("PATCH", "/output", [], 422, "`body` is wrong: must be an object with keys and values"),
         ("POST", "/objects", 7, 422, "`objects[0]` is wrong"),
         ("GET", "/revisions?limit=0", None, 422, "limit"),

@@ -129,6 +129,16 @@ def test_wrong_use_ends_with_code_2_and_one_sentence(cli: RunCli, shots: Path, t
     assert "only 0 of 14 pictures" in sentence(wrong)
 
 
+def test_what_is_refused_leaves_no_folder(shots: Path, take: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    for out in (tmp_path / "new" / "out", tmp_path / "out"):
+        sentence(calibrate("camera", shots, "--out", out))
+        sentence(calibrate("camera", tmp_path / "nowhere", "--out", out, *TARGET))
+        sentence(calibrate("extrinsics", take, "--out", out, "--what", "rgb_from_fisheye"))
+        sentence(calibrate("photometric", take, "--out", out, "--card", "0,0,0,0"))
+    assert [path.name for path in tmp_path.rglob("*")] == ["out"]
+
+
 @pytest.fixture(scope="module")
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of the synthetic scene: one tilt, so its depth sensor cannot be placed."""

@@ -19,6 +19,7 @@ from deltalight.services import doctor, ports
 from deltalight.services.api.serve import listening
 from deltalight.services.cli import BLAS_THREADS, app, limit_blas_threads, run
 from deltalight.services.commands.examples import EXAMPLES
+from deltalight.services.demo import RECORDING
 from tests.services.conftest import ROOT, RunCli
 
 COMMANDS = {
@@ -161,6 +162,68 @@ def test_wrong_use_ends_with_2_and_names_what_is_wrong(
     assert done.returncode == 2
     assert named in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("render", "take", "--out", ""), "--out"),
+        (("render", "take", "-o", ""), "--out"),
+        (("render", "take", "--out=out", "--scene="), "--scene"),
+        (("recordings", "info", ""), "file"),
+    ],
+)
+def test_an_empty_path_is_not_the_current_folder(cli: RunCli, words: tuple[str, ...], named: str) -> None:
+    done = cli(*words)
+    said = " ".join(done.stderr.replace("│", " ").split())
+    assert (done.returncode, f"invalid value for '{named}" in said.lower()) == (2, True), said
+    assert "the path is empty" in said
+
+
+@pytest.mark.parametrize("command", [("config",), ("schema",), ("--help",)])
+def test_output_that_nobody_reads_ends_a_command_quietly(command: tuple[str, ...]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    program = [sys.executable, "-m", "deltalight.services", *command]
+    with os.fdopen(writer, "wb") as unread:
+        done = subprocess.run(
+            program, cwd=ROOT, stdout=unread, stderr=subprocess.PIPE, text=True, timeout=60, check=False
+        )
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("render", "{name}", "--out", "out"),
+        ("render", RECORDING, "--frames", "0:1", "--out", "{name}.mp4"),
+        ("node", "--source", "{name}"),
+        ("recordings", "export", RECORDING, "--out", "{name}"),
+        ("recordings", "import", "{name}", "--out", "a.mcap"),
+        ("calibrate", "camera", "{name}", "--out", "out"),
+        ("board", "--out", "{name}.pdf"),
+        ("graph", "--svg", "{name}.svg"),
+    ],
+)
+def test_a_path_that_the_system_refuses_is_a_sentence(
+    cli: RunCli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    """As it refuses those below a folder that may not be entered, which a test that root runs cannot have."""
+    monkeypatch.chdir(tmp_path)
+    done = cli(*(str(word).format(name="x" * 300) for word in words))
+    assert done.returncode == 2
+    assert "(File name too long)" in done.stderr
+    assert "internal error" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_closed_streams_end_no_command(tmp_path: Path, closed: tuple[int, ...]) -> None:
+    redirects = " ".join(f"{number}>&-" for number in closed)
+    command = f'"{sys.executable}" -m deltalight.services board --out "{tmp_path}/board.pdf" {redirects}'
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, timeout=60, check=False, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_a_wrong_choice_is_told_in_plain_words(cli: RunCli) -> None:

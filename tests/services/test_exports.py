@@ -18,10 +18,11 @@ from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz
 from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import parse_scene
+from deltalight.protocol.source import open_source
 from deltalight.services.exports import ExportFormat
 from deltalight.services.exports.colmap import camera_line
 from deltalight.services.exports.recording import export_as
-from deltalight.services.exports.ros_bags import import_bag
+from deltalight.services.exports.ros_bags import import_bag, is_bag
 from deltalight.services.exports.scene_glb import write_scene_glb
 from tests.protocol.fisheye_samples import assert_same_frames, linear
 from tests.services.conftest import RunCli
@@ -172,6 +173,16 @@ def test_exports_say_what_is_missing(recording: Path, tmp_path: Path, cli: RunCl
 def bag(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[ExportFormat, Path]:
     pytest.importorskip("rosbags")
     return request.param, tmp_path / ("bag.bag" if request.param is ExportFormat.ROS1 else "bag")
+
+
+def test_a_bag_in_capitals_is_one(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    export_as(ExportFormat.ROS1, recording, tmp_path / "desk.bag", None, quietly)
+    capitals = (tmp_path / "desk.bag").rename(tmp_path / "DESK.BAG")
+    assert is_bag(capitals)
+    assert import_bag(capitals, tmp_path / "after.mcap", quietly).frames == 2
+    with pytest.raises(DeltalightError, match=r"DESK\.BAG is a ROS bag; make a recording"):
+        open_source(capitals)
 
 
 @pytest.mark.parametrize("as_jpeg", [True, False])
