@@ -8,7 +8,7 @@ what the driver kept on disk.
 import traceback
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -109,7 +109,7 @@ def asked_variants(part: str) -> dict[str, str]:
     with opened_context() as gpu, TemporaryDirectory() as folder, suppress(Exception):
         gpu.compile_watchers.append(note)
         gpu.ctx.compute_shader = lambda source: UncompiledShader()  # type: ignore[method-assign] # noqa: ARG005
-        shader_parts()[part](gpu, Path(folder))
+        shader_parts()[part](replace(gpu, compiles_unrun=True), Path(folder))
     return found
 
 
@@ -149,7 +149,7 @@ def render_part(gpu: "GpuContext", part: str) -> RenderedPart:
     gpu.compile_watchers.append(note)
     try:
         with TemporaryDirectory() as folder:
-            shader_parts()[part](gpu, Path(folder))
+            shader_parts()[part](replace(gpu, compiles_unrun=True), Path(folder))
     except Exception as fault:  # moderngl raises its own Error, with the driver's words
         traceback.print_exc()
         return RenderedPart(part, labels, f"{', '.join([part, *labels[-1:]])}: {fault_sentence(fault)}")

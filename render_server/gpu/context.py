@@ -116,13 +116,15 @@ class GpuContext:
     watchers: list[Callable[[Any], None]] = field(default_factory=list)
     """Told of every run of a kernel (gpu/kernel.py)."""
     compile_watchers: list[CompileWatcher] = field(default_factory=list)
-    """Told of every program that a kernel asks for: its label and the text of each of its stages."""
+    """Told of every program that a kernel asks for, when it first runs: its label and the text of each stage."""
 
     programs: SharedPrograms = field(default_factory=SharedPrograms)
     reset_status: Callable[[], int] = lambda: 0
     """Asks the driver whether the context was lost (lost_context.py); 0 = it was not."""
     most_images: int = NEEDED["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]
     """Images of a kernel."""
+    compiles_unrun: bool = False
+    """Kernels compile their program without switches when they are made, for checks of shaders that run none."""
     errors: Counter[str] = field(default_factory=Counter)
     """Errors of OpenGL that `check` found, by name; each is a fault of this program or of the driver."""
 

@@ -1,4 +1,4 @@
-"""Kernels: compute and raster programs whose resources and uniforms are bound by their GLSL names.
+"""Kernels: programs whose resources and uniforms are bound by their GLSL names.
 
 Linking assigns units and binding points, so shaders state none, and every run passes all that the kernel
 needs.
@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from functools import partial
 from itertools import compress
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import moderngl
 import numpy as np
@@ -26,7 +26,6 @@ from deltalight.render_server.gpu.textures import image_format, release_all, tex
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 
 GL_INT = 0x1404
-CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
 Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
 PLAIN = (float, int, bool, tuple, list)  # values of uniforms that moderngl takes as they are
@@ -40,15 +39,8 @@ class BindingError(RuntimeError):
     """A name is undeclared or missing, or its value is of the wrong kind."""
 
 
-class Drawable(Protocol):
-    """Geometry that a raster kernel draws."""
-
-    @property
-    def triangle_count(self) -> int:
-        """How many triangles are drawn."""
-
-    def draw(self, program: moderngl.Program) -> None:
-        """Draws all triangles with `program`."""
+class ShaderError(RuntimeError):
+    """The driver refuses a shader."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +68,6 @@ class Program:
         self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
         self.compute = cast("moderngl.ComputeShader", program)  # if it is one that is dispatched
         self.users: set[int] = set()  # ids of the kernels that have not been released
-        self.has_switches = bool(declared.switches)
         self._samplers: list[Slot] = []
         self._images: list[Slot] = []
         self._arrays: list[Slot] = []  # storage buffers that a shader takes as images
@@ -100,7 +91,6 @@ class Program:
         self._calls = BindingCalls([partial(binder, slot) for slot, binder in bound])
         self._values = values_of([slot.name for slot in self._uniforms])
         self._held: tuple[Any, ...] | None = None  # values of uniforms, if nobody can change them in place
-        self._switch_values = values_of(declared.switches)
 
     def _adopt(self, name: str, member: object) -> None:
         slot = Slot(name, member, getattr(member, "gl_type", 0))
@@ -141,7 +131,7 @@ class Program:
                 self._shown[slot.name].bind(slot.place, self._buffer(slot, known[slot.name]))
         except KeyError:
             slots = self._samplers, self._images, self._storage, self._blocks, self._arrays, self._uniforms
-            self._require({slot.name for each in slots for slot in each}, known)
+            require_given({slot.name for each in slots for slot in each}, known, self.label)
             raise
         for call in self._calls.of(resources):
             call()
@@ -153,23 +143,6 @@ class Program:
                 if type(value) not in CONSTANT or slot.last != value:
                     self._write(slot, value)
             self._held = values if is_constant else None
-
-    def _require(self, names: Set[str], known: Bindings) -> None:
-        if not names <= known.keys():
-            missing = min(names - known.keys())
-            raise BindingError(f"Kernel {self.label} needs `{missing}`, which it was not given.")
-
-    def switched_on(self, known: Bindings) -> tuple[str, ...]:
-        """Returns the names of the defines that bindings turn on.
-
-        Raises:
-            BindingError: one is missing.
-        """
-        try:
-            return tuple(compress(self._declared.switches, self._switch_values(known)))
-        except KeyError:
-            self._require(frozenset(self._declared.switches), known)
-            raise
 
     def _nearest(self, name: str) -> str:
         close = get_close_matches(name, self._declared.names, 1)
@@ -303,14 +276,22 @@ class Program:
 class Shader(ABC):
     """The programs of one shader: with each set of its switches (`#pragma switch NAME`) that bindings turn on.
 
-    All but the one without any are compiled when first run: what a scene lacks costs nothing.
+    Each is compiled when first run: what a scene lacks costs nothing.
     """
 
     def __init__(self, gpu: GpuContext, name: str | Path, defines: Mapping[str, float | str]) -> None:
         self._gpu, self._name, self._defines = gpu, name, defines
-        self._plain = self._compiled(defines)
-        self._switched: dict[tuple[str, ...], Program] = {}
-        self.label, self.local_size = self._plain.label, self._plain.local_size
+        self.label = label_of(name, defines)
+        declared = declarations(self._text(defines))
+        self.local_size, self._switches = declared.local_size, declared.switches
+        self._switch_values = values_of(declared.switches)
+        self._programs: dict[tuple[str, ...], Program] = {}  # by the switches that are on
+        if gpu.compiles_unrun:
+            self._with(())
+
+    @abstractmethod
+    def _text(self, defines: Mapping[str, float | str]) -> str:
+        """Returns what the driver gets with these defines."""
 
     @abstractmethod
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
@@ -334,22 +315,38 @@ class Shader(ABC):
         return program, known
 
     def _chosen(self, known: Bindings) -> Program:
-        if not self._plain.has_switches:
-            return self._plain
-        on = self._plain.switched_on(known)
-        if not on:
-            return self._plain
-        if on not in self._switched:
-            self._switched[on] = self._compiled({**self._defines, **dict.fromkeys(on, 1)})
-        return self._switched[on]
+        on = self._switched_on(known) if self._switches else ()
+        return self._programs.get(on) or self._with(on)
+
+    def _switched_on(self, known: Bindings) -> tuple[str, ...]:
+        try:
+            return tuple(compress(self._switches, self._switch_values(known)))
+        except KeyError:
+            require_given(frozenset(self._switches), known, self.label)
+            raise
+
+    def _with(self, on: tuple[str, ...]) -> Program:
+        """Returns the program with these switches on; compiles it if it never ran.
+
+        Raises:
+            ShaderError: the driver refuses it.
+        """
+        if on not in self._programs:
+            defines = {**self._defines, **dict.fromkeys(on, 1)}
+            try:
+                self._programs[on] = self._compiled(defines)
+            except moderngl.Error as fault:
+                label = label_of(self._name, defines)
+                raise ShaderError(f"Kernel {label} does not compile: {fault}") from fault
+        return self._programs[on]
 
     def resources(self) -> dict[str, list[str]]:
-        """Returns the names of the plain program's bindings, by kind."""
-        return self._plain.resources()
+        """Returns the names of the bindings of the program without switches, by kind."""
+        return self._with(()).resources()
 
     def release(self) -> None:
         """Leaves the programs to other kernels of the same source."""
-        for each in (self._plain, *self._switched.values()):
+        for each in self._programs.values():
             self._gpu.programs.give_back(self, each)
 
 
@@ -363,12 +360,13 @@ class Kernel(Shader):
     def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
         super().__init__(gpu, name, defines)
 
+    def _text(self, defines: Mapping[str, float | str]) -> str:
+        source = shader_source(SHADERS / f"{self._name}.comp.glsl", {**self._gpu.defines, **defines})
+        return with_images(source, self._gpu.most_images) if self._gpu.is_software else source
+
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
-        path, label = SHADERS / f"{self._name}.comp.glsl", label_of(self._name, defines)
-        source = shader_source(path, {**self._gpu.defines, **defines})
-        self._tell_compiled(label, {"comp": shader_source(path, defines)})
-        if self._gpu.is_software:
-            source = with_images(source, self._gpu.most_images)
+        source, label = self._text(defines), label_of(self._name, defines)
+        self._tell_compiled(label, {"comp": shader_source(SHADERS / f"{self._name}.comp.glsl", defines)})
 
         def link() -> Program:
             return Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))
@@ -404,57 +402,15 @@ class Kernel(Shader):
             program.report((), partial(program.written, known))
 
 
-class RasterKernel(Shader):
-    """A vertex and a fragment shader of one name; draws with depth test into a framebuffer."""
+def require_given(names: Set[str], known: Bindings, label: str) -> None:
+    """Checks that the names that kernel `label` needs are bound.
 
-    def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
-        super().__init__(gpu, name, defines)
-
-    def _compiled(self, defines: Mapping[str, float | str]) -> Program:
-        vertex, fragment = (
-            shader_source(SHADERS / f"{self._name}.{stage}.glsl", defines) for stage in ("vert", "frag")
-        )
-        label = label_of(self._name, defines)
-        self._gpu.compiled(label, {"vert": vertex, "frag": fragment})
-
-        def link() -> Program:
-            program = self._gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
-            return Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
-
-        return self._shared(vertex, fragment, link=link)
-
-    def draw(
-        self,
-        target: moderngl.Framebuffer,
-        mesh: Drawable,
-        *shared: Bindings,
-        box: tuple[int, int, int, int] | None = None,
-        clips: bool = False,
-        **own: Binding,
-    ) -> None:
-        """Draws `mesh` into `target`, or into its `box` (x, y, width, height); `clips` heeds gl_ClipDistance[0].
-
-        Raises:
-            BindingError: as `Kernel.run`.
-        """
-        linked, _ = self._bound(own, shared)
-        target.use()
-        target.viewport = box or (0, 0, *target.size)
-        target.scissor = box  # type: ignore[assignment]  # None lifts it, which the stubs do not know
-        self._gpu.ctx.enable_only(moderngl.DEPTH_TEST)
-        if clips:
-            self._gpu.ctx.enable_direct(CLIP_DISTANCE0)
-        assert isinstance(linked.program, moderngl.Program)
-        mesh.draw(linked.program)
-        if clips:
-            self._gpu.ctx.disable_direct(CLIP_DISTANCE0)
-        target.scissor = None  # type: ignore[assignment]  # or it would cut what is cleared next
-        linked.report((mesh.triangle_count,), partial(_attachments, target))
-
-
-def _attachments(target: moderngl.Framebuffer) -> dict[str, object]:
-    items = enumerate([*target.color_attachments, target.depth_attachment])
-    return {f"attachment {number}": item for number, item in items}
+    Raises:
+        BindingError: one is missing.
+    """
+    if not names <= known.keys():
+        missing = min(names - known.keys())
+        raise BindingError(f"Kernel {label} needs `{missing}`, which it was not given.")
 
 
 def merged(own: Bindings, shared: Sequence[Bindings]) -> dict[str, Binding]:

@@ -70,9 +70,8 @@ def as_fragment_shader(source: str) -> str:
 class _Drawn(Program):
     """The program of a kernel that is drawn, and the triangle that covers the picture."""
 
-    def __init__(self, gpu: GpuContext, label: str, source: str) -> None:
-        self.outputs = outputs_of(source)
-        fragment = with_images(as_fragment_shader(source), gpu.most_images)
+    def __init__(self, gpu: GpuContext, label: str, fragment: str, outputs: Mapping[str, str]) -> None:
+        self.outputs = outputs
         program = gpu.ctx.program(vertex_shader=VERTEX_SHADER, fragment_shader=fragment)
         super().__init__(gpu, label, program, declarations(fragment))
         self.triangle = gpu.ctx.vertex_array(program, [])
@@ -90,11 +89,18 @@ class _DrawnKernel(Shader):
         self._targets: dict[tuple[moderngl.Texture, ...], moderngl.Framebuffer] = {}
         super().__init__(gpu, name, defines)
 
+    def _source(self, defines: Mapping[str, float | str]) -> str:
+        return shader_source(SHADERS / f"{self._name}.comp.glsl", defines)
+
+    def _text(self, defines: Mapping[str, float | str]) -> str:
+        fragment = as_fragment_shader(self._source({**self._gpu.defines, **defines}))
+        return with_images(fragment, self._gpu.most_images)
+
     def _compiled(self, defines: Mapping[str, float | str]) -> Program:
-        path, label = SHADERS / f"{self._name}.comp.glsl", label_of(self._name, defines)
-        self._tell_compiled(label, {"comp": shader_source(path, defines)})
-        source = shader_source(path, {**self._gpu.defines, **defines})
-        return self._shared("drawn", source, link=partial(_Drawn, self._gpu, label, source))
+        label, fragment = label_of(self._name, defines), self._text(defines)
+        self._tell_compiled(label, {"comp": self._source(defines)})
+        outputs = outputs_of(self._source({**self._gpu.defines, **defines}))
+        return self._shared("drawn", fragment, link=partial(_Drawn, self._gpu, label, fragment, outputs))
 
     def draw(self, rectangle: Box, /, *shared: Bindings, **own: Binding) -> None:
         """Draws a rectangle of the outputs."""

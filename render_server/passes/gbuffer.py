@@ -3,7 +3,8 @@
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Drawable, RasterKernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.raster_kernel import Drawable, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.view import CameraView, Rectangle
 

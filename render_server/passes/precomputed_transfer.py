@@ -5,7 +5,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.raster_kernel import RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.scene.precomputed_transfer import ObjectTransfer
 from deltalight.render_server.view import CameraView

@@ -13,7 +13,8 @@ from jaxtyping import Float64
 from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.raster_kernel import RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.lights.light_models import DirectionalLight, Lamp, Light
 from deltalight.render_server.lights.mirror_lights import MirrorLight

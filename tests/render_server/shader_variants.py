@@ -17,7 +17,8 @@ from deltalight.benchmarks.gltf_plate import Plate, even
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.raster_kernel import RasterKernel
 from deltalight.render_server.passes.caustics import TILE
 from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.cones import reuse_define

@@ -27,7 +27,7 @@ from deltalight.render_server.gpu.context import (
     is_software_renderer,
     limits_of,
 )
-from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.kernel import Kernel, ShaderError
 from deltalight.render_server.gpu.textures import AsyncReadback, gpu_objects, sizes_bytes, texture_2d
 from deltalight.render_server.methods.differential import SolutionVoxels
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels
@@ -97,8 +97,8 @@ def test_compiler_errors_name_the_line_in_its_own_file(gpu: GpuContext, shaders:
     (shaders / "part.glsl").write_text(f"float one;\nfloat two;\n{in_part}\n")
     main = 'layout(local_size_x = 1) in;\n#include "part.glsl"\nvoid main() {\n' + in_main + "\n}"
     (shaders / "main.comp.glsl").write_text(main)
-    with pytest.raises(moderngl.Error) as caught:
-        Kernel(gpu, shaders / "main")
+    with pytest.raises(ShaderError, match="Kernel main does not compile: ") as caught:
+        Kernel(gpu, shaders / "main").run((1,))
     line = {"main": 4, "part": 3}[broken]
     assert re.search(rf"^\d+(:{line}\(|\({line}\) :)", str(caught.value), re.MULTILINE), (
         "Mesa's way, NVIDIA's way"

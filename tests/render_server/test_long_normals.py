@@ -12,7 +12,7 @@ import pytest
 
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu import kernel as kernel_module
-from deltalight.render_server.gpu import picture_kernel
+from deltalight.render_server.gpu import picture_kernel, raster_kernel
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.shader_source import shader_source
 from tests.render_server.scenes import (
@@ -119,7 +119,7 @@ def test_a_picture_with_long_normals_is_the_same_but_for_their_length(
             text = text.replace(old, new)
         return text
 
-    for module in (kernel_module, picture_kernel):
+    for module in (kernel_module, picture_kernel, raster_kernel):
         monkeypatch.setattr(module, "shader_source", lengthened)
     found = composite(gpu, document(Stage(tmp_path)), view).astype(int)
     assert changed == set(LENGTHENED)

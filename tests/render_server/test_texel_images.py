@@ -162,7 +162,7 @@ def test_programs_free_the_textures_through_which_they_read_buffers(
     monkeypatch.setattr(context_module, "SPARE_PROGRAMS", 0)
     kernel = make("layout(std430) readonly buffer Reals { float reals[]; };", "values[0] = reals[0];")
     kernel.run((1,), Out=None, Reals=None)
-    assert kernel._plain._shown["Reals"]._name
+    assert kernel._programs[()]._shown["Reals"]._name
     held = count_gl_objects()["Texture"]
     kernel.release()
     assert count_gl_objects()["Texture"] == held - 1
