@@ -54,6 +54,7 @@ from deltalight.render_server.passes.lpv_lighting import (
     LpvSources,
     query_bindings,
 )
+from deltalight.render_server.passes.lpv_small import HalfSteps, SmallVolume
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import MOST_VOLUMES, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand, VoxelStore
@@ -74,10 +75,19 @@ class Propagated:
         self._propagate = LpvPropagate(gpu)
         self._in_place = self._propagate.is_in_place(cells, steps)
         self._half_step = self._in_place and self._propagate.starts_with_half_step
+        self._small = SmallVolume(gpu) if SmallVolume.serves(gpu, cells, in_place=self._in_place) else None
 
-    def run(self, through: moderngl.Texture3D | None, *injected: moderngl.Buffer) -> LightVolume:
+    def run(
+        self,
+        through: moderngl.Texture3D | None,
+        injected: moderngl.Buffer,
+        more: moderngl.Buffer | None = None,
+    ) -> LightVolume:
         """Propagates the light of one or two injected sums, added up; without `through` nothing blocks it."""
-        self._start.run(self.light, self._medium(through), *injected, half_step=self._half_step)
+        if self._small is not None:
+            self._small.start(self.light, self._half_steps(self._small, self._steps, through), injected, more)
+            return self.light
+        self._start.run(self.light, self._medium(through), injected, more, half_step=self._half_step)
         return self._go(self._steps, through)
 
     def run_change(
@@ -88,6 +98,10 @@ class Propagated:
         through: moderngl.Texture3D | None,
     ) -> LightVolume:
         """Propagates what objects change of the light `before`."""
+        if self._small is not None:
+            half_steps = self._half_steps(self._small, self._steps, through)
+            self._small.start_change(self.light, half_steps, before, change, through_real)
+            return self.light
         self._start_change.run(
             self.light,
             before,
@@ -99,9 +113,21 @@ class Propagated:
         )
         return self._go(self._steps, through)
 
+    @property
+    def _further(self) -> int:
+        """Steps of a bounce."""
+        return math.ceil(STEPS_OF_A_BOUNCE * self._steps)
+
     def go_on(self, through: moderngl.Texture3D | None) -> LightVolume:
         """Propagates on by STEPS_OF_A_BOUNCE."""
-        return self._go(math.ceil(STEPS_OF_A_BOUNCE * self._steps), through)
+        return self._go(self._further, through)
+
+    def half_steps_of_a_bounce(self, through: moderngl.Texture3D | None) -> HalfSteps | None:
+        """What `go_on` would do, for whoever adds the bounce; None: that is another dispatch."""
+        return None if self._small is None else self._half_steps(self._small, self._further, through)
+
+    def _half_steps(self, small: SmallVolume, count: int, through: moderngl.Texture3D | None) -> HalfSteps:
+        return HalfSteps(small, self._medium(through), count)
 
     def _go(self, steps: int, through: moderngl.Texture3D | None) -> LightVolume:
         self._propagate.run(self.light, self._medium(through), steps, in_place=self._in_place)
@@ -164,18 +190,20 @@ class DifferenceVolumes:
             self._bounced, self._before = self._before, self._bounced
             clear_buffer(self._gpu, self._bounced)
             self._bounce.run(self._bounced, surfels, (mu, rho), own)
-            self._add_to(rho, number, is_last=number == last)
-            self._rho.go_on(through)
+            then = self._rho.half_steps_of_a_bounce(through)
+            self._add_to(rho, number, is_last=number == last, then=then)
+            if then is None:
+                self._rho.go_on(through)
         return rho, self._bounced if last > 0 else None
 
-    def _add_to(self, rho: LightVolume, number: int, *, is_last: bool) -> None:
+    def _add_to(self, rho: LightVolume, number: int, *, is_last: bool, then: HalfSteps | None) -> None:
         """Adds the sums of that bounce, counted from 1."""
         if number == 1:
-            self._add.run_first(rho, self._bounced, self._before)
+            self._add.run_first(rho, self._bounced, self._before, then=then)
             return
         if number == 2:
             self._add.measure(self._before, self._bounced)
-        self._add.run(rho, self._bounced, self._before, is_last=is_last)
+        self._add.run(rho, self._bounced, self._before, is_last=is_last, then=then)
 
     def release(self) -> None:
         """Frees the GL objects."""
