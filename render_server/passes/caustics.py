@@ -121,10 +121,13 @@ class Caustics:
         self._count = gpu.ctx.buffer(reserve=4)
         self._beams: moderngl.Texture | None = None
         self._places: moderngl.Texture | None = None
-        self._end = Kernel(gpu, "caustic_ends")
+        self._end = Kernel(gpu, "caustic_ends") if gpu.is_software else None
+        self._unended: dict[str, Binding] | None = None
         self._empties = not (reuses or gpu.is_software)  # the sums, by the way; in software that is a memset
         own = {"CLEARS": 1} if self._empties else reuse_define(reuses)
         self._find_bounds = Kernel(gpu, "caustic_bounds", **own)
+        # One dispatch on a GPU; in software each workgroup would pay for entering the longer kernel.
+        self._end_in_bounds = None if gpu.is_software else Kernel(gpu, "caustic_bounds", ENDS=1, **own)
         self._tiles = tuple(-(-edge // TILE) for edge in grid.size)
         self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
         self._tile_beams = gpu.ctx.buffer(reserve=4)
@@ -143,17 +146,18 @@ class Caustics:
         return {"CausticSums": self._sums}
 
     def end_beams(self, sent: CausticBeams, scene: Bindings, reach_m: float) -> None:
-        """Ends beams where they meet something within `reach_m`, of the real scene what the `scene`'s camera sees."""
+        """Ends beams where they meet something within `reach_m`, of the real scene what the `scene`'s camera sees.
+
+        On a GPU, `run` does so, if nobody has before.
+        """
         self._make_room(sent.most)
         self._gpu.clear_start(self._count, 4)
-        self._end.run(
-            (list_threads(self._gpu, sent.most),),
-            sent.bindings,
-            scene,
-            BeamCount=self._count,
-            beam_texels=self._beams,
-            reach=reach_m,
-        )
+        unended = {**scene, **sent.bindings, "reach": reach_m}
+        if self._end is None:
+            self._unended = unended
+        else:
+            threads = (list_threads(self._gpu, sent.most),)
+            self._end.run(threads, unended, BeamCount=self._count, beam_texels=self._beams)
 
     def _make_room(self, beams: int) -> None:
         rows = -(-beams // BEAMS_A_ROW)
@@ -196,9 +200,7 @@ class Caustics:
             "tile_balls": self._balls,
             "TileBeams": self._tile_beams,
         }
-        self._find_bounds.run(
-            (self._bound_threads(),), own, shared, self._grid.bindings, scene, **self._last_bindings()
-        )
+        self._find_places(own, shared, self._grid.bindings, scene)
         walkers = list_threads(self._gpu, most)
         if self._add_narrow is None:
             rows = -(-self._threads // walkers)  # of workgroups that add narrow beams
@@ -207,6 +209,13 @@ class Caustics:
             self._find_tiles.run((walkers, down), own, shared, scene)
             self._add_narrow.run((self._threads,), own, shared, scene)
         self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
+
+    def _find_places(self, *shared: Bindings) -> None:
+        """Finds the beams' places, of those that have not ended yet their ends, too."""
+        kernel, unended, self._unended = self._find_bounds, self._unended, None
+        if unended is not None and self._end_in_bounds is not None:
+            kernel = self._end_in_bounds
+        kernel.run((self._bound_threads(),), *shared, unended or {}, **self._last_bindings())
 
     def _bound_threads(self) -> int:
         """Returns those of all tiles of both layers, of texels if the last frame's are reused, and of beams."""
@@ -227,6 +236,7 @@ class Caustics:
             self._places,
             self._end,
             self._find_bounds,
+            self._end_in_bounds,
             self._balls,
             self._tile_beams,
             self._find_tiles,
