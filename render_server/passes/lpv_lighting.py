@@ -245,18 +245,28 @@ class LpvSources:
 
 
 class LpvQuery:
-    """Reads irradiance from light volumes on the reduced grid, into the fields that other methods trace by cones."""
+    """Reads irradiance from light volumes on the reduced grid, into the fields that other methods trace by cones.
+
+    Of both geometries in one dispatch on a GPU; in software every workgroup would pay for entering the longer kernel.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._both = None if gpu.is_software else Kernel(gpu, "lpv_query", BOTH=1)
         self._real = Kernel(gpu, "lpv_query", REAL=1)
         self._change = Kernel(gpu, "lpv_query", REAL=1, CHANGE=1)
         self._virtual = Kernel(gpu, "lpv_query")
 
-    def read_real(
+    def read(
         self, fields: ConeFields, grid: LowResGrid, mu: PropagatedLight, rho: PropagatedLight, scene: Bindings
     ) -> None:
-        """Writes E_mu and E_rho of real surfaces."""
-        self._run_real(self._real, fields, grid, light_volume_bindings(mu, rho), scene)
+        """Writes E_mu and E_rho of real surfaces, and what `read_virtual` does."""
+        volumes = light_volume_bindings(mu, rho)
+        if self._both is None:
+            self._run_real(self._real, fields, grid, volumes, scene)
+            self.read_virtual(fields, grid, rho, scene)
+        else:
+            images = {**_real_images(fields), **_object_images(fields)}
+            self._both.run((*grid.size, 2), images, grid.bindings, volumes, scene)
 
     def read_change(
         self,
@@ -274,34 +284,31 @@ class LpvQuery:
     def _run_real(
         self, kernel: Kernel, fields: ConeFields, grid: LowResGrid, volumes: Bindings, scene: Bindings
     ) -> None:
-        kernel.run(
-            grid.size,
-            grid.bindings,
-            volumes,
-            scene,
-            irradiance_mu=fields.mu,
-            irradiance_rho=fields.rho,
-            specular_mu=fields.specular_mu,
-            specular_rho=fields.specular_rho,
-        )
+        kernel.run(grid.size, _real_images(fields), grid.bindings, volumes, scene)
 
     def read_virtual(
         self, fields: ConeFields, grid: LowResGrid, rho: PropagatedLight, scene: Bindings
     ) -> None:
         """Writes the irradiance of virtual surfaces, and the radiance that a mirror there would show."""
-        self._virtual.run(
-            grid.size,
-            grid.bindings,
-            light_volume_bindings(rho, rho),
-            scene,
-            irradiance_rho=fields.virtual,
-            specular_rho=fields.virtual_specular,
-        )
+        volumes = light_volume_bindings(rho, rho)
+        self._virtual.run(grid.size, _object_images(fields), grid.bindings, volumes, scene)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for kernel in (self._real, self._change, self._virtual):
-            kernel.release()
+        release_all(self._both, self._real, self._change, self._virtual)
+
+
+def _real_images(fields: ConeFields) -> dict[str, Binding]:
+    return {
+        "irradiance_mu": fields.mu,
+        "irradiance_rho": fields.rho,
+        "specular_mu": fields.specular_mu,
+        "specular_rho": fields.specular_rho,
+    }
+
+
+def _object_images(fields: ConeFields) -> dict[str, Binding]:
+    return {"object_irradiance": fields.virtual, "object_specular": fields.virtual_specular}
 
 
 def query_bindings(settings: DlpvMethod) -> dict[str, Binding]:
@@ -338,8 +345,7 @@ class LpvFields:
     ) -> ConeFields:
         """Reads the irradiance at real surfaces and at the objects."""
         own = {**scene, **self._bindings, "light_sources": sources}
-        self._query.read_real(self._fields, grid, mu, rho, own)
-        self._query.read_virtual(self._fields, grid, rho, own)
+        self._query.read(self._fields, grid, mu, rho, own)
         return self._fields
 
     def read_printed(  # noqa: PLR0917 (a stage, which the graph gives its inputs in order)

@@ -183,7 +183,9 @@ class LightVoxels:
         On a GPU, also marks the voxels in the occupancy, which already holds the real ones.
         """
         more = ["MARKS"] * self._marks(occupied)
-        self._run("VIRTUAL", store, groups, scene, *more, gathered=gathered, from_mu=from_mu, occupied=occupied)
+        self._run(
+            "VIRTUAL", store, groups, scene, *more, gathered=gathered, from_mu=from_mu, occupied=occupied
+        )
 
     def light_solution(
         self,

@@ -405,7 +405,7 @@ class FilterVoxels:
 
 
 class FillMipmap:
-    """Fills mipmaps from the sums of lit voxels; on a GPU in one dispatch, for `LightVoxels` marks their occupancy."""
+    """Fills mipmaps from the sums of lit voxels; on a GPU in one dispatch: `LightVoxels` marks occupancy."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
