@@ -20,7 +20,6 @@ from deltalight.render_server.frame import (
     declare_frame,
     join_measurements,
 )
-from deltalight.render_server.gpu.clearing import clear_used_up
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu.textures import read_texture
@@ -240,7 +239,6 @@ class FrameGraph:
     def upload(self, frame: ViewFrame) -> None:
         """Begins a frame by uploading its picture."""
         if self is self._all[0]:
-            clear_used_up(self.graph.gpu)
             self.graph.begin_frame()
         self.buffers.image.upload(frame)
         self.resources.image.write(self.buffers.image)
@@ -382,7 +380,7 @@ class FrameGraph:
         reuses_ratio = options is not None and options.reuses_ratio and not is_specular
         is_at_rest = others == self._others and not self.graph.is_lagging
         if not image.is_linear and not (reuses_ratio and is_at_rest):
-            image.linearize()
+            image.linearize(begins_frame=True)
             self._linear.write(image)
         self._others = others
 

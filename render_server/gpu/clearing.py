@@ -55,7 +55,7 @@ def clear_for_later(gpu: GpuContext, *starts: Start) -> None:
 
 
 def clear_ahead(gpu: GpuContext, *starts: Start) -> None:
-    """Lets buffers whose contents have been used up be cleared when the next frame begins, all in one dispatch.
+    """Lets buffers whose contents have been used up be cleared when the next frame begins, by its first kernel.
 
     Whoever fills one next calls `clear_buffers` all the same.
     """
@@ -69,29 +69,39 @@ def note_cleared(gpu: GpuContext, *starts: Start) -> None:
         gpu.cleared_ahead.update(starts)
 
 
-def clear_used_up(gpu: GpuContext) -> None:
-    """Clears what `clear_ahead` was told of."""
+def take_used_up(gpu: GpuContext) -> dict[str, Binding]:
+    """Returns what a frame's first kernel clears by the way (shaders/common/cleared_starts.glsl).
+
+    That is what `clear_ahead` was told of; more than eight buffers take dispatches of their own.
+    """
     starts = [
         (buffer, size)
         for buffer, size in gpu.used_up.items()
         if not isinstance(buffer.mglo, moderngl.InvalidObject)
     ]
     gpu.used_up.clear()
-    for first in range(0, len(starts), len(CLEARED)):
+    for first in range(len(CLEARED), len(starts), len(CLEARED)):
         _clear(gpu, starts[first : first + len(CLEARED)])
     gpu.cleared_ahead.update(starts)
+    return cleared_starts(starts[: len(CLEARED)])
+
+
+def cleared_starts(starts: Sequence[Start] = ()) -> dict[str, Binding]:
+    """Returns the bindings of shaders/common/cleared_starts.glsl for up to eight buffers."""
+    words = [size // WORD_BYTES for _, size in starts]
+    counts = (*words, *[0] * len(CLEARED))[: len(CLEARED)]
+    return {
+        **NOTHING,
+        **dict(zip(CLEARED, (buffer for buffer, _ in starts), strict=False)),
+        "word_counts": counts[:4],
+        "more_word_counts": counts[4:],
+    }
 
 
 def _clear(gpu: GpuContext, starts: Sequence[Start]) -> None:
     kernel = common_kernel(gpu, "clear_buffer")
-    words = [size // WORD_BYTES for _, size in starts]
-    threads = min(max(words), CLEARING_GROUPS * kernel.local_size[0])
-    bound: dict[str, Binding] = {
-        **NOTHING,
-        **dict(zip(CLEARED, (buffer for buffer, _ in starts), strict=False)),
-    }
-    counts = (*words, *[0] * len(CLEARED))[: len(CLEARED)]
-    kernel.run((threads,), bound, word_counts=counts[:4], more_word_counts=counts[4:])
+    words = max(size // WORD_BYTES for _, size in starts)
+    kernel.run((min(words, CLEARING_GROUPS * kernel.local_size[0]),), cleared_starts(starts))
 
 
 def clear_volume(gpu: GpuContext, texture: moderngl.Texture3D) -> None:

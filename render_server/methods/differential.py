@@ -134,7 +134,8 @@ class SolutionVoxels(DirectionalVoxels):
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         real, objects, light = self.real, self.objects, self._light
         light.light_solution(real.store, scene, real.groups, with_objects=True, gathered=gathered)
-        light.light_virtual(objects.store, scene, objects.groups, gathered=gathered)
+        occupied = None if gathered else self._begin_rho()
+        light.light_virtual(objects.store, scene, objects.groups, gathered=gathered, occupied=occupied)
         clear_buffer(self._gpu, real.store.delta_sums)
         if gathered:
             self._fill_rho()

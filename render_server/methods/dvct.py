@@ -35,7 +35,13 @@ from deltalight.render_server.methods.voxel_sets import (
     voxel_placements,
 )
 from deltalight.render_server.methods.voxel_volumes import DeltaVoxels, delta_voxel_stages, placed_volume
-from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones
+from deltalight.render_server.passes.cones import (
+    ConeFields,
+    FilterBothCones,
+    LowResGrid,
+    TraceRealCones,
+    TraceVirtualCones,
+)
 from deltalight.render_server.passes.distant import DistantChange
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.mesh_buffers import ObjectBvh
@@ -46,7 +52,11 @@ from deltalight.render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memo
 
 
 class ExactCones:
-    """Marches every cone through mu and rho at once."""
+    """Marches every cone through mu and rho at once.
+
+    On a GPU, what is traced at real surfaces is filtered together with what is at the objects; in software, every
+    workgroup would pay for entering the longer kernel.
+    """
 
     def __init__(
         self, gpu: GpuContext, settings: DvctMethod, voxels: DeltaVoxels, fields: ConeFields
@@ -55,6 +65,7 @@ class ExactCones:
         self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
         self._real = TraceRealCones(gpu, size, defines, reuses=reuses)
         self._virtual = TraceVirtualCones(gpu, size, defines, reuses=reuses)
+        self._filter_both = None if gpu.is_software else FilterBothCones(gpu, reuses=reuses)
         if reuses:
             fields.keep_irradiance(gpu)
 
@@ -64,8 +75,8 @@ class ExactCones:
 
     def trace_real(self, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
         """Traces the cones at real surfaces: E_mu, E_rho, and the specular cones."""
-        voxels = self._voxels
-        self._real.run(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
+        voxels, run = self._voxels, self._real.run if self._filter_both is None else self._real.trace
+        run(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return self._fields
 
     def refract(
@@ -90,13 +101,17 @@ class ExactCones:
         self, fields: ConeFields, scene: Bindings, grid: LowResGrid, marching: Bindings
     ) -> ConeFields:
         """Traces the cones at the objects: E_rho and the specular cone."""
-        voxels = self._voxels
-        self._virtual.run(fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
+        voxels, both = self._voxels, {**scene, **marching}
+        if self._filter_both is None:
+            self._virtual.run(fields, grid, voxels.mu, voxels.rho, both)
+        else:
+            self._virtual.trace(fields, grid, voxels.mu, voxels.rho, both)
+            self._filter_both.run(fields, grid, (self._real, self._virtual), both)
         return fields
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._real, self._virtual)
+        release_all(self._real, self._virtual, self._filter_both)
 
 
 class UnchangedCones:

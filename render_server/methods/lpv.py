@@ -1,6 +1,5 @@
 """Delta light propagation volumes ([P2], docs/method.md 5)."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +18,7 @@ from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages, object_extent
 from deltalight.render_server.methods.lpv_cells import cell_stages, release_held
 from deltalight.render_server.methods.lpv_memory import PrintedSizes, affordable_count, state_memory
+from deltalight.render_server.methods.lpv_propagated import Propagated
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from deltalight.render_server.methods.per_volume import ForEachVolume, PerVolume, volume_pool
 from deltalight.render_server.methods.surface_shading import (
@@ -35,16 +35,10 @@ from deltalight.render_server.passes.lpv import (
     LightVolume,
     LpvBoxFilter,
     LpvJoin,
-    LpvPropagate,
     LpvShow,
-    LpvStart,
-    LpvStartChange,
     PropagatedLight,
     cells_of,
     injected_sums,
-    lobe_weights,
-    medium_bindings,
-    moment_weights,
 )
 from deltalight.render_server.passes.lpv_lighting import (
     LpvAddBounce,
@@ -54,65 +48,10 @@ from deltalight.render_server.passes.lpv_lighting import (
     LpvSources,
     query_bindings,
 )
+from deltalight.render_server.passes.lpv_small import HalfSteps
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import MOST_VOLUMES, PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand, VoxelStore
-
-STEPS_OF_A_BOUNCE = 1 / 4
-"""Fraction of the steps: V_rho starts with the light of V_mu, and each bounce goes on where the one before ended."""
-
-
-class Propagated:
-    """A light volume and its steps."""
-
-    def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: int, steps: int) -> None:
-        has_moments = settings.resolved_propagation == "moments"
-        self._weights, self._steps = moment_weights(cells) if has_moments else lobe_weights(), steps
-        self.light = LightVolume(gpu, cells)
-        self._start = LpvStart(gpu)
-        self._start_change = LpvStartChange(gpu)
-        self._propagate = LpvPropagate(gpu)
-        self._in_place = self._propagate.is_in_place(cells, steps)
-        self._half_step = self._in_place and self._propagate.starts_with_half_step
-
-    def run(self, through: moderngl.Texture3D | None, *injected: moderngl.Buffer) -> LightVolume:
-        """Propagates the light of one or two injected sums, added up; without `through` nothing blocks it."""
-        self._start.run(self.light, self._medium(through), *injected, half_step=self._half_step)
-        return self._go(self._steps, through)
-
-    def run_change(
-        self,
-        before: LightVolume,
-        change: moderngl.Buffer,
-        through_real: moderngl.Texture3D | None,
-        through: moderngl.Texture3D | None,
-    ) -> LightVolume:
-        """Propagates what objects change of the light `before`."""
-        self._start_change.run(
-            self.light,
-            before,
-            change,
-            self._medium(through),
-            through_real,
-            in_place=self._in_place,
-            half_step=self._half_step,
-        )
-        return self._go(self._steps, through)
-
-    def go_on(self, through: moderngl.Texture3D | None) -> LightVolume:
-        """Propagates on by STEPS_OF_A_BOUNCE."""
-        return self._go(math.ceil(STEPS_OF_A_BOUNCE * self._steps), through)
-
-    def _go(self, steps: int, through: moderngl.Texture3D | None) -> LightVolume:
-        self._propagate.run(self.light, self._medium(through), steps, in_place=self._in_place)
-        return self.light
-
-    def _medium(self, through: moderngl.Texture3D | None) -> Bindings:
-        return medium_bindings(self.light.cells, self._weights, through)
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_held(self)
 
 
 class DifferenceVolumes:
@@ -164,18 +103,20 @@ class DifferenceVolumes:
             self._bounced, self._before = self._before, self._bounced
             clear_buffer(self._gpu, self._bounced)
             self._bounce.run(self._bounced, surfels, (mu, rho), own)
-            self._add_to(rho, number, is_last=number == last)
-            self._rho.go_on(through)
+            then = self._rho.half_steps_of_a_bounce(through)
+            self._add_to(rho, number, is_last=number == last, then=then)
+            if then is None:
+                self._rho.go_on(through)
         return rho, self._bounced if last > 0 else None
 
-    def _add_to(self, rho: LightVolume, number: int, *, is_last: bool) -> None:
+    def _add_to(self, rho: LightVolume, number: int, *, is_last: bool, then: HalfSteps | None) -> None:
         """Adds the sums of that bounce, counted from 1."""
         if number == 1:
-            self._add.run_first(rho, self._bounced, self._before)
+            self._add.run_first(rho, self._bounced, self._before, then=then)
             return
         if number == 2:
             self._add.measure(self._before, self._bounced)
-        self._add.run(rho, self._bounced, self._before, is_last=is_last)
+        self._add.run(rho, self._bounced, self._before, is_last=is_last, then=then)
 
     def release(self) -> None:
         """Frees the GL objects."""

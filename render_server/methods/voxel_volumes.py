@@ -145,8 +145,11 @@ class DirectionalVoxels:
         if self._fill.fill_rho(self.rho, *sets, self.real.volume, is_last=is_last):
             self.objects.is_lit = False
 
+    def _begin_rho(self) -> moderngl.Buffer:
+        return self._fill.begin_rho(self.rho, self.mu)
+
     def _fill_first_rho(self) -> None:
-        self._fill.fill_first_rho(self.rho, self.real.store, self.objects.store, self.real.volume, self.mu)
+        self._fill.fill_first_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
 
     def _find_tail(self, scene: Bindings) -> None:
         """Finds what bounces change beyond those that were gathered."""
@@ -184,10 +187,13 @@ class DirectionalVoxels:
 
 @dataclass(frozen=True, eq=False)
 class LitVoxels:
-    """Voxels of both geometries with the light of rho, the bounds of what objects change, and the bounces' tail."""
+    """Voxels of both geometries with the light of rho, which of its cells are `occupied`, the bounds of what objects
+    change, and the bounces' tail.
+    """
 
     real: VoxelSet
     objects: VoxelSet
+    occupied: moderngl.Buffer
     support: moderngl.Buffer
     tail: BounceTail
 
@@ -274,16 +280,17 @@ class DeltaVoxels(DirectionalVoxels):
             self._light_by_mu(scene)
         else:
             self._light_rho(scene, gathered=False)
-        return LitVoxels(real, voxels, self._light.support, self._tail)
+        return LitVoxels(real, voxels, self.rho.occupied, self._light.support, self._tail)
 
     def _light_by_mu(self, scene: Bindings) -> None:
         real, objects, light = self.real, self.objects, self._light
         self._gather.gather(objects.store, objects.groups, self.mu, {**scene, **self.march_bindings(1)})
-        light.light_virtual(objects.store, scene, objects.groups, from_mu=True)
+        light.light_virtual(objects.store, scene, objects.groups, from_mu=True, occupied=self._begin_rho())
         light.light_real_delta(real.store, scene, real.groups, from_mu=True)
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
-        self._light.light_virtual(self.objects.store, scene, self.objects.groups, gathered=gathered)
+        objects, occupied = self.objects, None if gathered else self._begin_rho()
+        self._light.light_virtual(objects.store, scene, objects.groups, gathered=gathered, occupied=occupied)
         self._light.light_real_delta(self.real.store, scene, self.real.groups, gathered=gathered)
 
     def filter_joint(self, lit: LitVoxels) -> tuple[VoxelMipmap, LitVoxels]:

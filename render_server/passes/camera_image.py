@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.render_server.gpu.clearing import cleared_starts, take_used_up
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Binding
+from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.picture_kernel import PictureKernel
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 
@@ -31,7 +32,8 @@ class CameraImage:
         self.exposure_scale = 1.0
         self.codes = gpu.ctx.buffer(reserve=4 * size[0] * size[1], dynamic=True)  # as textures take them
         self.is_linear = False  # whether `linear` shows the picture that was uploaded last
-        self._linearize = PictureKernel(gpu, "linearize")
+        self._gpu = gpu
+        self._linearize = PictureKernel(gpu, "linearize", **({} if gpu.is_software else {"CLEARS": 1}))
         self._rays_of: object = None
         self._response_of: object = None
 
@@ -50,13 +52,23 @@ class CameraImage:
             self.rays.write(np.ascontiguousarray(frame.camera.rays(), np.float32).tobytes(), alignment=1)
             self._rays_of = frame.camera
 
-    def linearize(self) -> None:
-        """Computes the linear radiance of the picture that was uploaded last, once."""
+    def linearize(self, *, begins_frame: bool = False) -> None:
+        """Computes the linear radiance of the picture that was uploaded last, once.
+
+        `begins_frame`: on a GPU, also clears what the frames before have used up (`clear_ahead`).
+        """
         if self.is_linear:
             return
         self.is_linear, self._has_levels = True, False
+        cleared: Bindings = {}
+        if not self._gpu.is_software:
+            cleared = take_used_up(self._gpu) if begins_frame else cleared_starts()
         self._linearize.run(
-            (0, 0, *self.size), picture=self.code, code_radiance=self.code_radiance, linear_out=self.linear
+            (0, 0, *self.size),
+            cleared,
+            picture=self.code,
+            code_radiance=self.code_radiance,
+            linear_out=self.linear,
         )
 
     def _write_response(self, decode: Float32[np.ndarray, "256 3"], exposure_scale: float) -> None:

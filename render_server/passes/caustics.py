@@ -28,6 +28,7 @@ BEAMS_A_ROW, BEAM_TEXELS, PLACE_TEXELS = 256, 4, 2  # of the images that hold th
 TILE = 8  # texels an edge (shaders/common/beam_tiles.glsl)
 WORD_BITS = 32
 HEADER_BYTES = 16
+SEEN = "Camera", "real_surface_position", "real_surface_normal"  # where beams end
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
 
@@ -122,9 +123,13 @@ class Caustics:
         self._beams: moderngl.Texture | None = None
         self._places: moderngl.Texture | None = None
         self._end = Kernel(gpu, "caustic_ends")
+        self._unended: dict[str, Binding] = {}  # what ends beams that were sent and have not ended
+        self._unended_threads = 0
         self._empties = not (reuses or gpu.is_software)  # the sums, by the way; in software that is a memset
         own = {"CLEARS": 1} if self._empties else reuse_define(reuses)
         self._find_bounds = Kernel(gpu, "caustic_bounds", **own)
+        # One dispatch on a GPU; in software each workgroup would pay for entering the longer kernel.
+        self._end_in_bounds = None if gpu.is_software else Kernel(gpu, "caustic_bounds", ENDS=1, **own)
         self._tiles = tuple(-(-edge // TILE) for edge in grid.size)
         self._balls = texture_2d(gpu, (self._tiles[0], 2 * self._tiles[1]), 4, "f4")
         self._tile_beams = gpu.ctx.buffer(reserve=4)
@@ -143,17 +148,22 @@ class Caustics:
         return {"CausticSums": self._sums}
 
     def end_beams(self, sent: CausticBeams, scene: Bindings, reach_m: float) -> None:
-        """Ends beams where they meet something within `reach_m`, of the real scene what the `scene`'s camera sees."""
+        """Ends beams where they meet something within `reach_m`, of the real scene what the `scene`'s camera sees.
+
+        On a GPU, `run` does so.
+        """
         self._make_room(sent.most)
         self._gpu.clear_start(self._count, 4)
-        self._end.run(
-            (list_threads(self._gpu, sent.most),),
-            sent.bindings,
-            scene,
-            BeamCount=self._count,
-            beam_texels=self._beams,
-            reach=reach_m,
-        )
+        self._unended = {**scene, **sent.bindings, "reach": reach_m}
+        self._unended_threads = list_threads(self._gpu, sent.most)
+        if self._gpu.is_software:
+            self._end_apart()
+
+    def _end_apart(self) -> None:
+        """Ends the beams by a kernel of its own."""
+        own: Bindings = {"BeamCount": self._count, "beam_texels": self._beams}
+        self._end.run((self._unended_threads,), self._unended, own)
+        self._unended = {}
 
     def _make_room(self, beams: int) -> None:
         rows = -(-beams // BEAMS_A_ROW)
@@ -196,9 +206,7 @@ class Caustics:
             "tile_balls": self._balls,
             "TileBeams": self._tile_beams,
         }
-        self._find_bounds.run(
-            (self._bound_threads(),), own, shared, self._grid.bindings, scene, **self._last_bindings()
-        )
+        self._find_places(scene, own, shared, self._grid.bindings)
         walkers = list_threads(self._gpu, most)
         if self._add_narrow is None:
             rows = -(-self._threads // walkers)  # of workgroups that add narrow beams
@@ -207,6 +215,15 @@ class Caustics:
             self._find_tiles.run((walkers, down), own, shared, scene)
             self._add_narrow.run((self._threads,), own, shared, scene)
         self._gather.run((TILE * across, self._gather.local_size[1] * down), own, shared, scene)
+
+    def _find_places(self, scene: Bindings, *shared: Bindings) -> None:
+        """Finds the beams' places; and their ends, unless they have ended, or must in what another frame saw."""
+        kernel, unended = self._find_bounds, self._unended
+        if unended and self._end_in_bounds is not None and all(unended[name] is scene[name] for name in SEEN):
+            kernel, self._unended = self._end_in_bounds, {}
+        elif unended:
+            self._end_apart()
+        kernel.run((self._bound_threads(),), *shared, scene, unended, **self._last_bindings())
 
     def _bound_threads(self) -> int:
         """Returns those of all tiles of both layers, of texels if the last frame's are reused, and of beams."""
@@ -227,6 +244,7 @@ class Caustics:
             self._places,
             self._end,
             self._find_bounds,
+            self._end_in_bounds,
             self._balls,
             self._tile_beams,
             self._find_tiles,

@@ -21,6 +21,7 @@ from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import PlacedVolume
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand
 
+LAST_TURN = 2**31 - 1
 FILL_RADIUS = 3  # texels of the reduced grid by which the change extends into a hole
 
 
@@ -37,8 +38,15 @@ class ChangeRatio:
         self.ratio = texture_2d(gpu, size, 4, "f2")
         self.distant: moderngl.Texture | None = None
         self.texels = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
-        self._ratio = Kernel(gpu, "change_ratio", RATIO=1, REAL=1, LATTICE_STEP=LATTICE_STEP)
-        self._near = Kernel(gpu, "change_ratio", FILL_RADIUS=FILL_RADIUS)
+        own, lists = (
+            {"RATIO": 1, "REAL": 1, "LATTICE_STEP": LATTICE_STEP},
+            {"LISTS": 1, "FILL_RADIUS": FILL_RADIUS},
+        )
+        # On a GPU it also lists the texels; in software, workgroups that wait for each other take longer.
+        self._ratio = Kernel(gpu, "change_ratio", **own, **({} if gpu.is_software else lists))
+        self._near = Kernel(gpu, "change_ratio", **lists) if gpu.is_software else None
+        self._marks = None if gpu.is_software else gpu.ctx.buffer(bytes(4 * size[0] * size[1]))
+        self._turn = 0
 
     def run(
         self,
@@ -51,9 +59,11 @@ class ChangeRatio:
         """Computes the ratio from one frame's fields; `reflection` as in RelitLayers, `distant` of DistantChange."""
         if distant is not None and self.distant is None:
             self.distant = texture_2d(self._gpu, self._size, 4, "f2")
+        self._gpu.clear_start(self.texels, LIST_HEADER_BYTES)
         self._ratio.run(
             grid.size,
             distant or {},
+            self._listing(),
             grid.bindings,
             direct_mu=direct.light.mu,
             direct_rho=direct.light.rho,
@@ -66,14 +76,20 @@ class ChangeRatio:
             DISTANT_CHANGE=distant is not None,
             distant_change_out=self.distant,
             change_ratio_out=self.ratio,
-            Texels=None,
         )
-        self._gpu.clear_start(self.texels, LIST_HEADER_BYTES)
-        self._near.run(grid.size, sample_pixels=grid.pixels, change_ratio=self.ratio, Texels=self.texels)
+        if self._near is not None:
+            self._near.run(grid.size, sample_pixels=grid.pixels, change_ratio=self.ratio, Texels=self.texels)
+
+    def _listing(self) -> dict[str, Binding]:
+        """What lists the texels in the same dispatch, if that does; a new turn needs no marks cleared."""
+        if self._marks is None:
+            return {"Texels": None}
+        self._turn = self._turn % LAST_TURN + 1
+        return {"Texels": self.texels, "Marks": self._marks, "turn": self._turn}
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.ratio, self.distant, self.texels, self._ratio, self._near)
+        release_all(self.ratio, self.distant, self.texels, self._marks, self._ratio, self._near)
 
 
 @dataclass(frozen=True)

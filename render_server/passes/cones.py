@@ -203,12 +203,19 @@ class TraceRealCones:
     def run(
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """Traces E_mu, E_rho and the specular cones; filters E so that where both are equal they stay equal."""
+        """Traces and filters."""
+        self.trace(fields, grid, mu, rho, scene)
+        filtered = self.to_filter(fields, grid)
+        self._filter.run(grid.size, filtered, grid.bindings, scene)
+
+    def trace(
+        self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
+    ) -> None:
+        """Traces E_mu, E_rho and the specular cones."""
         traced = self._traced(fields, grid)
-        specular: Bindings = {"specular_mu": fields.specular_mu, "specular_rho": fields.specular_rho}
         self._trace.run(
             (list_threads(self._gpu, grid.texel_count),),
-            specular,
+            _specular(fields),
             grid.bindings,
             scene,
             irradiance_mu=traced["traced_mu"],
@@ -218,15 +225,11 @@ class TraceRealCones:
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
-        self._filter.run(
-            grid.size,
-            traced,
-            specular,
-            grid.bindings,
-            scene,
-            irradiance_mu=fields.mu,
-            irradiance_rho=fields.rho,
-        )
+
+    def to_filter(self, fields: ConeFields, grid: LowResGrid) -> dict[str, Binding]:
+        """Returns what the filter reads and writes of them: where E_mu and E_rho are equal they stay equal."""
+        filtered: dict[str, Binding] = {"irradiance_mu": fields.mu, "irradiance_rho": fields.rho}
+        return {**self._traced(fields, grid), **_specular(fields), **filtered}
 
     def _traced(self, fields: ConeFields, grid: LowResGrid) -> dict[str, Binding]:
         """Returns what cones are traced into, and the list of texels from which."""
@@ -252,6 +255,10 @@ class TraceRealCones:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(*(self._own or ()), self._trace, self._filter, self._refract)
+
+
+def _specular(fields: ConeFields) -> dict[str, Binding]:
+    return {"specular_mu": fields.specular_mu, "specular_rho": fields.specular_rho}
 
 
 class RefractCones:
@@ -311,7 +318,14 @@ class TraceVirtualCones:
     def run(
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """Traces E_rho, filters it, and traces the specular cone."""
+        """Traces and filters."""
+        self.trace(fields, grid, mu, rho, scene)
+        self._filter.run(grid.size, self.to_filter(fields), grid.bindings, scene)
+
+    def trace(
+        self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
+    ) -> None:
+        """Traces E_rho and the specular cone."""
         traced = self._begin(fields)
         self._trace.run(
             (list_threads(self._gpu, grid.texel_count),),
@@ -324,22 +338,53 @@ class TraceVirtualCones:
             mipmap_rho=rho.texture,
             Occupied=rho.occupied,
         )
-        self._filter.run(grid.size, grid.bindings, scene, traced_rho=traced, irradiance_rho=fields.virtual)
+
+    def to_filter(self, fields: ConeFields) -> dict[str, Binding]:
+        """Returns what the filter reads and writes of them."""
+        return {"traced_objects": self._held(fields), "object_irradiance": fields.virtual}
+
+    def _held(self, fields: ConeFields) -> moderngl.Texture:
+        """Returns the texture that cones are traced into."""
+        if self._irradiance is not None:
+            return self._irradiance
+        assert fields.kept is not None
+        return fields.kept.virtual
 
     def _begin(self, fields: ConeFields) -> moderngl.Texture:
         """Returns the texture to trace into, which holds what is kept of the last frame and 0 elsewhere."""
-        if self._irradiance is None or self._target is None:
-            assert fields.kept is not None
-            return fields.kept.virtual
-        self._target.use()
-        self._target.clear()
-        return self._irradiance
+        if self._target is not None:
+            self._target.use()
+            self._target.clear()
+        return self._held(fields)
 
     def release(self) -> None:
         """Frees the GL objects."""
         if self._target is not None:
             release_target(self._target)
         release_all(self._irradiance, self._trace, self._filter)
+
+
+class FilterBothCones:
+    """Filters the cones of real surfaces and of objects in one dispatch."""
+
+    def __init__(self, gpu: GpuContext, *, reuses: bool) -> None:
+        self._kernel = Kernel(gpu, "bilateral_cone_filter", BOTH=1, **reuse_define(reuses))
+
+    def run(
+        self,
+        fields: ConeFields,
+        grid: LowResGrid,
+        traced: tuple[TraceRealCones, TraceVirtualCones],
+        scene: Bindings,
+    ) -> None:
+        """Filters what both have `traced` into the same fields."""
+        real, virtual = traced
+        both = {**real.to_filter(fields, grid), **virtual.to_filter(fields)}
+        self._kernel.run((*grid.size, 2), both, grid.bindings, scene)
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
 
 
 class TraceConesPaper:

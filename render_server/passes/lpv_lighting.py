@@ -14,6 +14,7 @@ from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import LightVolume, PropagatedLight, cells_of
+from deltalight.render_server.passes.lpv_small import HalfSteps
 from deltalight.render_server.passes.volumes import PlacedVolume, VolumePlacement
 from deltalight.render_server.passes.voxels import VoxelStore
 
@@ -126,17 +127,18 @@ class LpvBounce:
 
 
 class LpvAddBounce:
-    """Adds bounces to light that is under way, and those beyond the last one (docs/method.md 5.6)."""
+    """Adds bounces to light that is under way, and those beyond the last one (docs/method.md 5.6).
+
+    A small volume goes on in the same dispatch: `then` says by how many half steps.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
-        clears = {} if gpu.is_software else {"CLEARS": 1}
-        self._first = Kernel(gpu, "lpv_add_bounce", FIRST=1, **clears)
-        self._next = Kernel(gpu, "lpv_add_bounce", **clears)
-        self._last = Kernel(gpu, "lpv_add_bounce", TAIL=1, **clears)
+        self._clears = {} if gpu.is_software else {"CLEARS": 1}
+        self._kernels: dict[str, Kernel] = {}
         self._measure = Kernel(gpu, "lpv_bounce_share")
         width = self._measure.local_size[0]
-        self._threads = width**2  # as many workgroups as one of `_last` has threads
+        self._threads = width**2  # as many workgroups as there are parts (shaders/common/added_bounce.glsl)
         self.parts = gpu.ctx.buffer(reserve=8 * width)
 
     def measure(self, first: moderngl.Buffer, both: moderngl.Buffer) -> None:
@@ -144,30 +146,51 @@ class LpvAddBounce:
         threads, cells = (self._threads,), cells_of(both)
         self._measure.run(threads, Before=first, Injected=both, Parts=self.parts, cells=cells)
 
-    def run_first(self, volume: LightVolume, bounced: moderngl.Buffer, spare: moderngl.Buffer) -> None:
+    def run_first(
+        self,
+        volume: LightVolume,
+        bounced: moderngl.Buffer,
+        spare: moderngl.Buffer,
+        *,
+        then: HalfSteps | None = None,
+    ) -> None:
         """Adds the first bounce to `volume`; on a GPU also clears the `spare` sums, which the next one fills."""
         cleared: Bindings = {} if self._gpu.is_software else {"Before": spare}
-        self._run(self._first, volume, bounced, cleared)
+        self._run("FIRST", volume, bounced, cleared, then)
         note_cleared(self._gpu, (spare, spare.size))
 
     def run(
-        self, volume: LightVolume, bounced: moderngl.Buffer, before: moderngl.Buffer, *, is_last: bool
+        self,
+        volume: LightVolume,
+        bounced: moderngl.Buffer,
+        before: moderngl.Buffer,
+        *,
+        is_last: bool,
+        then: HalfSteps | None = None,
     ) -> None:
         """Adds what the sums `bounced` have more than those `before`, which it clears on a GPU.
 
         The last bounce brings all that are not propagated, to the sums `bounced` too.
         """
         own: Bindings = {"Before": before, **({"Parts": self.parts} if is_last else {})}
-        self._run(self._last if is_last else self._next, volume, bounced, own)
+        self._run("TAIL" if is_last else "", volume, bounced, own, then)
         note_cleared(self._gpu, (before, before.size))
 
-    def _run(self, kernel: Kernel, volume: LightVolume, bounced: moderngl.Buffer, own: Bindings) -> None:
-        cells = volume.cells
-        kernel.run((cells**3,), own, Injected=bounced, state=volume.state, total=volume.total, cells=cells)
+    def _run(
+        self, kind: str, volume: LightVolume, bounced: moderngl.Buffer, own: Bindings, then: HalfSteps | None
+    ) -> None:
+        cells, sums = volume.cells, {**own, "Injected": bounced}
+        defines = {**({kind: 1} if kind else {}), **self._clears}
+        if then is not None:
+            then.run(volume, sums, BOUNCE=1, **defines)
+            return
+        if kind not in self._kernels:
+            self._kernels[kind] = Kernel(self._gpu, "lpv_add_bounce", **defines)
+        self._kernels[kind].run((cells**3,), sums, state=volume.state, total=volume.total, cells=cells)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._first, self._next, self._last, self._measure, self.parts)
+        release_all(*self._kernels.values(), self._measure, self.parts)
 
 
 SOURCE_TEXELS = 9  # of a volume: those of two sources, and which fractions arrive where (light_sources.glsl)
@@ -222,18 +245,28 @@ class LpvSources:
 
 
 class LpvQuery:
-    """Reads irradiance from light volumes on the reduced grid, into the fields that other methods trace by cones."""
+    """Reads irradiance from light volumes on the reduced grid, into the fields that other methods trace by cones.
+
+    Of both geometries in one dispatch on a GPU; in software every workgroup would pay for entering the longer kernel.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._both = None if gpu.is_software else Kernel(gpu, "lpv_query", BOTH=1)
         self._real = Kernel(gpu, "lpv_query", REAL=1)
         self._change = Kernel(gpu, "lpv_query", REAL=1, CHANGE=1)
         self._virtual = Kernel(gpu, "lpv_query")
 
-    def read_real(
+    def read(
         self, fields: ConeFields, grid: LowResGrid, mu: PropagatedLight, rho: PropagatedLight, scene: Bindings
     ) -> None:
-        """Writes E_mu and E_rho of real surfaces."""
-        self._run_real(self._real, fields, grid, light_volume_bindings(mu, rho), scene)
+        """Writes E_mu and E_rho of real surfaces, and what `read_virtual` does."""
+        volumes = light_volume_bindings(mu, rho)
+        if self._both is None:
+            self._run_real(self._real, fields, grid, volumes, scene)
+            self.read_virtual(fields, grid, rho, scene)
+        else:
+            images = {**_real_images(fields), **_object_images(fields)}
+            self._both.run((*grid.size, 2), images, grid.bindings, volumes, scene)
 
     def read_change(
         self,
@@ -251,34 +284,31 @@ class LpvQuery:
     def _run_real(
         self, kernel: Kernel, fields: ConeFields, grid: LowResGrid, volumes: Bindings, scene: Bindings
     ) -> None:
-        kernel.run(
-            grid.size,
-            grid.bindings,
-            volumes,
-            scene,
-            irradiance_mu=fields.mu,
-            irradiance_rho=fields.rho,
-            specular_mu=fields.specular_mu,
-            specular_rho=fields.specular_rho,
-        )
+        kernel.run(grid.size, _real_images(fields), grid.bindings, volumes, scene)
 
     def read_virtual(
         self, fields: ConeFields, grid: LowResGrid, rho: PropagatedLight, scene: Bindings
     ) -> None:
         """Writes the irradiance of virtual surfaces, and the radiance that a mirror there would show."""
-        self._virtual.run(
-            grid.size,
-            grid.bindings,
-            light_volume_bindings(rho, rho),
-            scene,
-            irradiance_rho=fields.virtual,
-            specular_rho=fields.virtual_specular,
-        )
+        volumes = light_volume_bindings(rho, rho)
+        self._virtual.run(grid.size, _object_images(fields), grid.bindings, volumes, scene)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for kernel in (self._real, self._change, self._virtual):
-            kernel.release()
+        release_all(self._both, self._real, self._change, self._virtual)
+
+
+def _real_images(fields: ConeFields) -> dict[str, Binding]:
+    return {
+        "irradiance_mu": fields.mu,
+        "irradiance_rho": fields.rho,
+        "specular_mu": fields.specular_mu,
+        "specular_rho": fields.specular_rho,
+    }
+
+
+def _object_images(fields: ConeFields) -> dict[str, Binding]:
+    return {"object_irradiance": fields.virtual, "object_specular": fields.virtual_specular}
 
 
 def query_bindings(settings: DlpvMethod) -> dict[str, Binding]:
@@ -315,8 +345,7 @@ class LpvFields:
     ) -> ConeFields:
         """Reads the irradiance at real surfaces and at the objects."""
         own = {**scene, **self._bindings, "light_sources": sources}
-        self._query.read_real(self._fields, grid, mu, rho, own)
-        self._query.read_virtual(self._fields, grid, rho, own)
+        self._query.read(self._fields, grid, mu, rho, own)
         return self._fields
 
     def read_printed(  # noqa: PLR0917 (a stage, which the graph gives its inputs in order)

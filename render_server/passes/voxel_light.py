@@ -176,9 +176,16 @@ class LightVoxels:
         *,
         gathered: bool = False,
         from_mu: bool = False,
+        occupied: moderngl.Buffer | None = None,
     ) -> None:
-        """Sums c and a of virtual surfaces; `groups` keep each surfel's light."""
-        self._run("VIRTUAL", store, groups, scene, gathered=gathered, from_mu=from_mu)
+        """Sums c and a of virtual surfaces; `groups` keep each surfel's light.
+
+        On a GPU, also marks the voxels in the occupancy, which already holds the real ones.
+        """
+        more = ["MARKS"] * self._marks(occupied)
+        self._run(
+            "VIRTUAL", store, groups, scene, *more, gathered=gathered, from_mu=from_mu, occupied=occupied
+        )
 
     def light_solution(
         self,

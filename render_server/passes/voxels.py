@@ -286,11 +286,8 @@ class ResolveVoxels:
     """
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._gpu, self._threads = gpu, list_threads(gpu)
-        self._mu = Kernel(gpu, "resolve_voxels")
-        # In software, clearing the whole buffer is faster than emptying the sums one by one.
-        spends = {} if gpu.is_software else {"SPENDS": 1}
-        self._rho = Kernel(gpu, "resolve_voxels", RHO=1, **spends)
+        self._threads = list_threads(gpu)
+        self._mu, self._rho = Kernel(gpu, "resolve_voxels"), Kernel(gpu, "resolve_voxels", RHO=1)
 
     def resolve_mu(
         self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume, *, occupies: bool = False
@@ -306,26 +303,22 @@ class ResolveVoxels:
         virtual: VoxelStore,
         volume: PlacedVolume,
         *,
-        mu: VoxelMipmap | None = None,
+        occupies: bool = False,
     ) -> None:
-        """Writes (c_rho, a_real + a_virtual), and uses up the sums of changed light.
+        """Writes (c_rho, a_real + a_virtual).
 
-        With `mu`, of the real set alone, also replaces the occupancy by that of mu and what the virtual set adds.
+        `occupies`: adds the virtual set to the mipmap's occupancy, which is that of mu.
         """
-        if mu is not None:
-            self._gpu.ctx.copy_buffer(rho.occupied, mu.occupied)
         self._rho.run(
             (self._threads,),
             real.bindings,
             volume.bindings,
             mipmap=rho.texture,
             Occupied=rho.occupied,
-            marks=mu is not None,
+            marks=occupies,
             VirtualTouched=virtual.touched,
             **_joint_sums(real, virtual),
-            **({} if self._gpu.is_software else {"spends_virtual": False}),
         )
-        note_cleared(self._gpu, (real.delta_sums, real.delta_sums.size))
 
     def release(self) -> None:
         """Frees the programs."""
@@ -412,7 +405,7 @@ class FilterVoxels:
 
 
 class FillMipmap:
-    """Fills mipmaps from the sums of lit voxels; where their occupancy is known, on a GPU in one dispatch."""
+    """Fills mipmaps from the sums of lit voxels; on a GPU in one dispatch: `LightVoxels` marks occupancy."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
@@ -437,15 +430,23 @@ class FillMipmap:
             own: Bindings = {"Occupied": mu.occupied}
             self._mu.run(volume, DIRECTIONS, own, real.bindings, mipmap=mu.texture)
 
-    def fill_first_rho(
-        self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume, mu: VoxelMipmap
-    ) -> None:
-        """Writes (c_rho, a_real + a_virtual) and filters it, with the occupancy of mu and what objects add to it.
+    def begin_rho(self, rho: VoxelMipmap, mu: VoxelMipmap) -> moderngl.Buffer:
+        """Returns the occupancy of `rho` for `LightVoxels`, which adds the objects to it; it holds that of `mu`."""
+        self._gpu.ctx.copy_buffer(rho.occupied, mu.occupied)
+        return rho.occupied
 
-        It uses up the sums of changed light.
+    def fill_first_rho(
+        self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume
+    ) -> None:
+        """Writes (c_rho, a_real + a_virtual) and filters it; the objects have been lit since `begin_rho`.
+
+        On a GPU it uses up the sums of changed light.
         """
-        self._resolve.resolve_rho(rho, real, virtual, volume, mu=mu)
-        self._filter.run(rho, volume, real, virtual)
+        if self._rho is None:
+            self._resolve.resolve_rho(rho, real, virtual, volume, occupies=True)
+            self._filter.run(rho, volume, real, virtual)
+        else:
+            self.fill_rho(rho, real, virtual, volume)
 
     def fill_rho(
         self,

@@ -236,6 +236,9 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     light.release()
     for kind in ({"FIRST": 1}, {}, {"TAIL": 1}):
         Kernel(gpu, "lpv_add_bounce", CLEARS=1, **kind).release()
+        Kernel(gpu, "lpv_small_volume", BOUNCE=1, CLEARS=1, **kind).release()
+    for kind in ({"STARTS": 1}, {"CHANGE": 1}, {}):
+        Kernel(gpu, "lpv_small_volume", **kind).release()
     Kernel(gpu, "clear_buffer").release()
     for kind in ({}, {"FUSED": 1}, {"LISTED": 1}):
         Kernel(gpu, "filter_voxels", **kind).release()

@@ -13,11 +13,11 @@ from deltalight.render_server.gpu.clearing import (
     clear_buffer,
     clear_buffers,
     clear_for_later,
-    clear_used_up,
 )
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, watched
 from deltalight.render_server.gpu.list_groups import ListGroups
+from deltalight.render_server.passes.camera_image import CameraImage
 from tests.render_server.tiny_kernel import MakeKernel, floats
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -86,7 +86,14 @@ def test_on_a_gpu_no_buffer_is_mapped_to_be_cleared(
 
 
 def test_what_was_used_up_is_cleared_once_when_the_next_frame_begins(gpu: GpuContext) -> None:
+    """By the kernel that makes its picture linear."""
     hardware = replace(gpu, is_software=False)
+    image = CameraImage(hardware, (8, 8))
+
+    def begin_frame() -> None:
+        image.is_linear = False
+        image.linearize(begins_frame=True)
+
     buffers = [gpu.ctx.buffer(np.full(8, FULL, np.uint32).tobytes()) for _ in range(10)]
     short, released, again = buffers[0], buffers[1], buffers[2]
     seen: list[Dispatch] = []
@@ -96,19 +103,19 @@ def test_what_was_used_up_is_cleared_once_when_the_next_frame_begins(gpu: GpuCon
         released.release()
         clear_buffer(hardware, again)  # used in this frame already, and not used up since
         again.write(b"\xff" * 32)
-        clear_used_up(hardware)
+        begin_frame()
         assert len(seen) == 2
         assert [words(each)[0] for each in buffers if each is not released] == [0, FULL, *[0] * 7]
         clear_buffers(hardware, *((each, 32) for each in buffers[3:]))
-        clear_used_up(hardware)
-        assert len(seen) == 2
+        begin_frame()
+        assert [one.kernel.split()[0] for one in seen] == ["clear_buffer", "linearize", "linearize"]
         clear_buffers(hardware, (short, 32))  # more than was cleared
         buffers[3].write(b"\xff" * 32)
         clear_buffer(hardware, buffers[3])
-        assert len(seen) == 4
+        assert len(seen) == 5
     assert not words(short).any()
     assert not words(buffers[3]).any()
-    for each in buffers:
+    for each in (image, *buffers):
         each.release()
 
 

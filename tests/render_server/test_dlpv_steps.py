@@ -7,6 +7,7 @@ from jaxtyping import Float32
 from scipy.ndimage import uniform_filter
 
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.passes.lpv import (
     LOBE,
     LightVolume,
@@ -22,6 +23,7 @@ from deltalight.render_server.passes.lpv import (
     transmitted_fractions,
 )
 from deltalight.render_server.passes.lpv_lighting import LpvAddBounce
+from deltalight.render_server.passes.lpv_small import HalfSteps, SmallVolume
 from tests.render_server.lpv_scenes import INJECTED_STEPS
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -120,8 +122,9 @@ def sums_of(gpu: GpuContext, light: Float32[np.ndarray, "3 n n n 4"]) -> moderng
 class ChangedLight:
     """V_mu after some steps, and V_rho that starts with it and with what objects send and block."""
 
-    def __init__(self, gpu: GpuContext, *, in_place: bool, tiled: bool = False) -> None:
+    def __init__(self, gpu: GpuContext, *, in_place: bool, tiled: bool = False, small: bool = False) -> None:
         self._gpu, self._in_place, self._half_step = gpu, in_place, in_place and tiled
+        self._small = SmallVolume(gpu) if small else None
         self.mu, self.rho = LightVolume(gpu, CELLS), LightVolume(gpu, CELLS)
         self._start, self._start_change, self._add, self._steps = (
             LpvStart(gpu),
@@ -148,22 +151,29 @@ class ChangedLight:
         past_real, self._past_all = (
             medium_bindings(CELLS, WEIGHTS["moments"], each) for each in (real, joint)
         )
-        self._start.run(self.mu, past_real, self._sums(light), half_step=self._half_step)
+        injected, changed = self._sums(light), self._sums(change)
+        if self._small is not None:
+            self._small.start(self.mu, HalfSteps(self._small, past_real, steps[0]), injected, None)
+            half_steps = HalfSteps(self._small, self._past_all, steps[1])
+            self._small.start_change(self.rho, half_steps, self.mu, changed, real)
+            return
+        self._start.run(self.mu, past_real, injected, half_step=self._half_step)
         self._steps.run(self.mu, past_real, steps[0], in_place=self._in_place)
         own = {"in_place": self._in_place, "half_step": self._half_step}
-        self._start_change.run(self.rho, self.mu, self._sums(change), self._past_all, real, **own)
+        self._start_change.run(self.rho, self.mu, changed, self._past_all, real, **own)
         self._steps.run(self.rho, self._past_all, steps[1], in_place=self._in_place)
 
     def add(
         self, more: Float32[np.ndarray, "3 n n n 4"], known: Float32[np.ndarray, "3 n n n 4"], steps: int
     ) -> None:
-        self._add.run(self.rho, self._sums(more), self._sums(known), is_last=False)
-        self._steps.run(self.rho, self._past_all, steps, in_place=self._in_place)
+        then = None if self._small is None else HalfSteps(self._small, self._past_all, steps)
+        self._add.run(self.rho, self._sums(more), self._sums(known), is_last=False, then=then)
+        if then is None:
+            self._steps.run(self.rho, self._past_all, steps, in_place=self._in_place)
 
     def release(self) -> None:
-        passes = self._start, self._start_change, self._add, self._steps
-        for item in (self.mu, self.rho, *passes, *self._held):
-            item.release()
+        passes = self._start, self._start_change, self._add, self._steps, self._small
+        release_all(self.mu, self.rho, *passes, *self._held)
 
 
 MANY_STEPS = 160  # nothing is under way any more
@@ -176,10 +186,11 @@ def surroundings() -> tuple[Float32[np.ndarray, "3 n n n 4"], Float32[np.ndarray
     return light, rng.uniform(0.8, 1, (CELLS, CELLS, CELLS, 8)).astype(np.float32)
 
 
+IN_SHARED_MEMORY = "tiled", "small"
 STEPS = pytest.mark.parametrize(
     "how",
-    [{"in_place": False}, {"in_place": True}, {"in_place": True, "tiled": True}],
-    ids=["whole", "in place", "tiled in place"],
+    [{"in_place": False}, {"in_place": True}, *({"in_place": True, kind: True} for kind in IN_SHARED_MEMORY)],
+    ids=["whole", "in place", "tiled in place", "small volume"],
 )
 
 
@@ -214,13 +225,14 @@ def test_what_objects_send_and_block_comes_to_the_light_with_them(
     assert rho == pytest.approx(expected, abs=5e-4)
 
 
-def test_tiles_in_shared_memory_make_the_same_half_steps(gpu: GpuContext) -> None:
-    """Although they begin where the volume is started, and each dispatch makes several."""
+@pytest.mark.parametrize("kind", IN_SHARED_MEMORY)
+def test_shared_memory_makes_the_same_half_steps(gpu: GpuContext, kind: str) -> None:
+    """Although they begin where the volume is started, and each dispatch makes several, or all."""
     light, through = surroundings()
     joint = through * np.random.default_rng(9).uniform(0.5, 1, through.shape).astype(np.float32)
     found = []
-    for tiled in (False, True):
-        changed = ChangedLight(gpu, in_place=True, tiled=tiled)
+    for how in ({}, {kind: True}):
+        changed = ChangedLight(gpu, in_place=True, **how)
         changed.propagate(light, spot(seed=6), (through, joint), (CELLS, 5))
         changed.add(spot(seed=7), spot(seed=8), 3)
         found.append([cells_of(each, "total").copy() for each in (changed.mu, changed.rho)])

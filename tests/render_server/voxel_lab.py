@@ -116,7 +116,7 @@ class VoxelLab:
         }
         self.voxelize(voxels.store, mesh)
         self._light.light_virtual(voxels.store, scene)
-        self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume, mu=voxels.mu)
+        self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume, occupies=True)
         self._filter.run(voxels.rho, self._volume, voxels.store)
         materials.release()
         return voxels

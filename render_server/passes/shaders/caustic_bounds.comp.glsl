@@ -1,16 +1,22 @@
 // Where each beam may light the picture; and a ball around the surfaces that need light in each tile (its middle and radius, world m),
 // of real surfaces and below them of objects. The first workgroups find the balls, the others walk the beams. With REUSES, some
 // between them bring over the caustics that the last frame's texels know: one dispatch, for none of these waits for another.
-// CLEARS: the threads that walk the beams also empty the sums.
+// CLEARS: the threads that walk the beams also empty the sums. ENDS: they walk those that were sent, and end them first.
 #include "common/geometry.glsl"
 #include "common/walk.glsl"
 #define FINDS_PLACES
 #if defined(REUSES) || defined(CLEARS)
 #define ADDS_CAUSTICS
 #endif
+#ifdef ENDS
+#define APPENDS_BEAMS
+#endif
 #include "common/beam_footprint.glsl"
 #include "common/beam_tiles.glsl"
 #include "common/camera.glsl"
+#ifdef ENDS
+#include "common/beam_ends.glsl"
+#endif
 
 layout(local_size_x = 64) in;
 layout(rgba32f) writeonly uniform image2D tile_balls;
@@ -104,6 +110,19 @@ void reuse_texel(int number) {}
 int texels_reused() { return 0; }
 #endif
 
+#ifdef ENDS
+uint beams_walked() { return beams_sent(); }
+
+void find_place(uint i) {
+    Beam beam;
+    if (ends(sent_beams[i], beam)) put_place(append_beam(beam), place_of(beam));
+}
+#else
+uint beams_walked() { return beams_held(); }
+
+void find_place(uint i) { put_place(i, place_of(beam_at(i))); }
+#endif
+
 uint groups_of(int items) { return uint(items + 63) / 64u; }
 
 void main() {
@@ -114,9 +133,8 @@ void main() {
     } else if (group < before_beams) {
         reuse_texel(int(64u * (group - of_balls) + thread));
     } else {
-        uint count = beams_held();
-        for (uint i = 64u * (group - before_beams) + thread; i < count; i += 64u * (groups - before_beams))
-            put_place(i, place_of(beam_at(i)));
+        uint count = beams_walked();
+        for (uint i = 64u * (group - before_beams) + thread; i < count; i += 64u * (groups - before_beams)) find_place(i);
 #ifdef CLEARS
         uint sums = uint(caustic_sums.length());
         for (uint i = 64u * (group - before_beams) + thread; i < sums; i += 64u * (groups - before_beams)) caustic_sums[i] = 0;

@@ -1,7 +1,7 @@
 // How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed visibly
-// in its block of pixels. Otherwise: list the texels that are within FILL_RADIUS of a change or show an object; only
-// their pixels are composed.
-#ifndef RATIO
+// in its block of pixels. LISTS: list the texels that are within FILL_RADIUS of a change or show an object; only their pixels are
+// composed. Both in one dispatch: a workgroup lists the texels around its own, and `marks` tell what others have listed.
+#ifdef LISTS
 #define APPENDS_TEXELS
 #endif
 #include "common/work_list.glsl"
@@ -62,6 +62,42 @@ vec4 value(ivec2 texel) {
 #endif
     return vec4(ratio, changed ? 2.0 : 1.0);
 }
+#endif
+
+#ifdef LISTS
+bool shows_object(ivec2 texel) { return texelFetch(sample_pixels, texel, 0).z >= 0; }
+
+#ifdef RATIO
+layout(std430) buffer Marks { uint marks[]; };   // `turn` where a texel is listed
+uniform uint turn;       // another for each dispatch, not 0
+const int GROUP = 8;     // texels an edge of a workgroup
+const int AROUND = GROUP + 2 * FILL_RADIUS;
+const uint NEAR = (1u << (2 * FILL_RADIUS + 1)) - 1u;   // as many bits as columns are near a texel
+shared uint changed_rows[GROUP];   // bit x + 2 FILL_RADIUS: what changed in column x
+
+void list_once(ivec2 texel, ivec2 size) {
+    if (atomicExchange(marks[texel.y * size.x + texel.x], turn) != turn) append_texel(texel, size.x);
+}
+
+// `place`: counted from the workgroup's first texel.
+bool near_change(ivec2 place) {
+    uint rows = 0u;
+    for (int y = max(place.y - FILL_RADIUS, 0); y <= min(place.y + FILL_RADIUS, GROUP - 1); ++y) rows |= changed_rows[y];
+    return (rows >> (place.x + FILL_RADIUS) & NEAR) != 0u;
+}
+
+void list_around(ivec2 texel, ivec2 size, bool changed, bool shows) {
+    ivec2 own = ivec2(gl_LocalInvocationID.xy), first = texel - own;
+    if (own.x == 0) changed_rows[own.y] = 0u;
+    barrier();
+    if (changed) atomicOr(changed_rows[own.y], 1u << (own.x + 2 * FILL_RADIUS));
+    if (shows) list_once(texel, size);
+    barrier();
+    for (int i = int(gl_LocalInvocationIndex); i < AROUND * AROUND; i += GROUP * GROUP) {
+        ivec2 place = ivec2(i % AROUND, i / AROUND) - FILL_RADIUS, at = first + place;
+        if (all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, size)) && near_change(place)) list_once(at, size);
+    }
+}
 #else
 uniform sampler2D change_ratio;
 #pragma texels rgba16f change_ratio
@@ -78,15 +114,25 @@ bool near_change(ivec2 texel) {
     return near > 1.5;
 }
 #endif
+#endif
 
-void main() {
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
-    ivec2 size = textureSize(sample_pixels, 0);
-    if (any(greaterThanEqual(texel, size))) return;
 #ifdef RATIO
-    imageStore(change_ratio_out, texel, value(texel));
-#else
-    if (texelFetch(sample_pixels, texel, 0).z >= 0 || near_change(texel))
-        append_texel(texel, size.x);
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy), size = textureSize(sample_pixels, 0);
+    bool inside = all(lessThan(texel, size));
+    vec4 found = vec4(0.0);
+    if (inside) {
+        found = value(texel);
+        imageStore(change_ratio_out, texel, found);
+    }
+#ifdef LISTS
+    list_around(texel, size, found.a > 1.5, inside && shows_object(texel));
 #endif
 }
+#else
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy), size = textureSize(sample_pixels, 0);
+    if (any(greaterThanEqual(texel, size))) return;
+    if (shows_object(texel) || near_change(texel)) append_texel(texel, size.x);
+}
+#endif

@@ -1,6 +1,6 @@
 // Irradiance from the light volumes at 1/scale of the picture (docs/method.md 5), in addition to the environment R.
-// REAL: E_mu and E_rho of real surfaces; CHANGE: E_rho = E_mu + the volumes of the change, indirect and direct. VIRTUAL otherwise: the
-// light on the objects, and what a mirror on them would see.
+// REAL: E_mu and E_rho of real surfaces; CHANGE: E_rho = E_mu + the volumes of the change, indirect and direct. VIRTUAL: the
+// light on the objects, and what a mirror on them would see. BOTH of these: of the objects by workgroups with z = 1.
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
 #include "common/volume.glsl"
@@ -9,17 +9,21 @@
 #include "common/low_res_grid.glsl"
 
 #include "common/pixel_group.glsl"
-#ifdef REAL
+#if defined(REAL) || defined(BOTH)
+#define READS_REAL
 layout(rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where known
 layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
 layout(rgba16f) writeonly uniform image2D specular_mu;
+layout(rgba16f) writeonly uniform image2D specular_rho;
 #ifdef CHANGE
 uniform int direct_size;   // cells an edge of the direct change, in place of the light without objects; 0: none
 #endif
-#else
-layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where known
 #endif
-layout(rgba16f) writeonly uniform image2D specular_rho;
+#ifndef REAL
+#define READS_OBJECTS
+layout(rgba16f) writeonly uniform image2D object_irradiance;   // rgb E_rho, a: 1 where known
+layout(rgba16f) writeonly uniform image2D object_specular;
+#endif
 #include "common/camera.glsl"
 
 const float RIM = 2.0;   // cells over which the change fades at the border
@@ -35,8 +39,8 @@ vec3 mirrored(SurfacePoint s) {
     return environment(reflect(normalize(s.position - camera_position), s.normal), specular_half_angle(s.roughness));
 }
 
-#ifdef REAL
-void shade(ivec2 texel, SurfacePoint s) {
+#ifdef READS_REAL
+void shade_real(ivec2 texel, SurfacePoint s) {
     enter_volume(s.position);
     vec3 q = volume_coordinate(s.position);
     vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), c = vec3(0.0);
@@ -62,8 +66,10 @@ void shade(ivec2 texel, SurfacePoint s) {
     imageStore(specular_mu, texel, vec4(c, 1.0));
     imageStore(specular_rho, texel, vec4(c, 1.0));
 }
-#else
-void shade(ivec2 texel, SurfacePoint s) {
+#endif
+
+#ifdef READS_OBJECTS
+void shade_object(ivec2 texel, SurfacePoint s) {
     vec3 e = vec3(0.0), c = vec3(0.0);
     if (s.present) {
         enter_volume(s.position);
@@ -72,13 +78,20 @@ void shade(ivec2 texel, SurfacePoint s) {
         e = max(environment_irradiance(s.normal) + arriving, vec3(0.0));
         c = mirrored(s);
     }
-    imageStore(irradiance_rho, texel, vec4(e, s.present ? 1.0 : 0.0));
-    imageStore(specular_rho, texel, vec4(c, 1.0));
+    imageStore(object_irradiance, texel, vec4(e, s.present ? 1.0 : 0.0));
+    imageStore(object_specular, texel, vec4(c, 1.0));
 }
 #endif
 
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
-    shade(texel, surface_point(texel));
+#ifdef BOTH
+    if (gl_WorkGroupID.z == 0u) shade_real(texel, real_point(texel));
+    else shade_object(texel, object_point(texel));
+#elif defined(REAL)
+    shade_real(texel, real_point(texel));
+#else
+    shade_object(texel, object_point(texel));
+#endif
 }

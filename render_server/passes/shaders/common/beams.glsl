@@ -14,14 +14,16 @@ ivec2 texel_of_beam(uint i, int texels) { return ivec2(int(i) % BEAMS_A_ROW * te
 layout(std430) buffer BeamCount { uint beam_count; };
 layout(rgba32f) writeonly uniform image2D beam_texels;
 
-void append_beam(Beam beam) {
+// Its number; there is room for all that are sent.
+uint append_beam(Beam beam) {
     uint i = atomicAdd(beam_count, 1u);
     ivec2 at = texel_of_beam(i, 4);
-    if (at.y >= imageSize(beam_texels).y) return;
+    if (at.y >= imageSize(beam_texels).y) return i;
     imageStore(beam_texels, at, beam.from);
     imageStore(beam_texels, at + ivec2(1, 0), beam.direction);
     imageStore(beam_texels, at + ivec2(2, 0), beam.flux);
     imageStore(beam_texels, at + ivec2(3, 0), beam.across);
+    return i;
 }
 #else
 layout(std430) readonly buffer BeamCount { uint beam_count; };
