@@ -123,6 +123,8 @@ class GpuContext:
     """Asks the driver whether the context was lost (lost_context.py); 0 = it was not."""
     most_images: int = NEEDED["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]
     """Images of a kernel."""
+    defers_draws: bool = False
+    """A dispatch may run before earlier draws and clears: in llvmpipe, if what they change was bound before."""
     compiles_unrun: bool = False
     """Kernels compile their program without switches when they are made, for checks of shaders that run none."""
     errors: Counter[str] = field(default_factory=Counter)
@@ -235,6 +237,11 @@ class GpuContext:
                 f"A buffer of {size / 1e6:.0f} MB is needed, and shaders of this GPU reach {limit / 1e6:.0f} MB "
                 f"of one: lower {lower}."
             )
+
+    def settle_draws(self) -> None:
+        """Before a dispatch: ends earlier draws and clears where the driver puts them off."""
+        if self.defers_draws:
+            self.ctx.memory_barrier()
 
     def clear_start(self, buffer: moderngl.Buffer, size: int) -> None:
         """Sets the first few bytes of a buffer to zero (a multiple of 4), on the GPU; more of it: `clear_buffer`.
@@ -381,7 +388,10 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
         spread_raster_threads()
     ask = reset_status(ctx, context.load)
     images = limits["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]
-    return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software, reset_status=ask, most_images=images)
+    version = str(ctx.info["GL_VERSION"])
+    return GpuContext(
+        ctx, name, version, software, reset_status=ask, most_images=images, defers_draws=software
+    )
 
 
 def spread_raster_threads() -> None:

@@ -385,6 +385,7 @@ class Kernel(Shader):
         program, known = self._bound(own, shared)
         (x, y, z, *_), (width, height, depth) = (*threads, 1, 1), self.local_size
         groups = -(-x // width) or 1, -(-y // height) or 1, -(-z // depth) or 1
+        self._gpu.settle_draws()
         program.compute.run(*groups)
         self._gpu.ctx.memory_barrier()
         if self._gpu.watchers:
@@ -396,6 +397,7 @@ class Kernel(Shader):
         Nothing is read back, so the CPU does not wait until the GPU has counted.
         """
         program, known = self._bound(own, shared)
+        self._gpu.settle_draws()
         program.compute.run_indirect(groups)
         self._gpu.ctx.memory_barrier()
         if self._gpu.watchers:

@@ -17,7 +17,7 @@ from deltalight.render_server.gpu.context import GpuContext, count_gl_objects
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, Kernel, ShaderError, watched
 from deltalight.render_server.gpu.raster_kernel import RasterKernel
 from deltalight.render_server.gpu.shader_source import SHADERS
-from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.gpu.textures import release_target, texture_2d
 from deltalight.render_server.gpu.uniform_block import (
     STD140,
     Block,
@@ -191,6 +191,30 @@ def test_watchers_are_told_what_may_have_been_written(
     assert seen[0].written == {"Out": out, "filled": target}
     assert gpu.watchers == []
     target.release()
+
+
+@pytest.mark.parametrize(
+    ("declared", "read"),
+    [
+        ("uniform sampler2D seen;", "textureLod(seen, vec2(0.5), 0).r"),
+        ("layout(r32f) uniform image2D seen;", "imageLoad(seen, ivec2(0)).r"),
+    ],
+    ids=["sampled", "image"],
+)
+def test_what_is_cleared_between_runs_is_read(
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer, declared: str, read: str
+) -> None:
+    """llvmpipe puts clears and draws off until a barrier ends them, if what they change was bound before."""
+    kernel = make(declared, f"values[0] = {read};")
+    seen = texture_2d(gpu, (1, 1), 1, "f4", data=np.float32(1).tobytes())
+    target = gpu.ctx.framebuffer([seen])
+    target.use()
+    for value in (1, 5, 6):
+        target.clear(value)
+        kernel.run((1,), Out=out, seen=seen)
+        assert floats(out, 1) == [value]
+    release_target(target)
+    seen.release()
 
 
 # None
