@@ -2,6 +2,7 @@
 
 import difflib
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -52,13 +53,11 @@ class StrictModel(BaseModel):
         return validate(type(self), {**dict(self), **changes}, type(self).__name__)
 
 
-def read_mapping(path: Path, *, unique_keys: bool = False) -> dict[str, Any]:
+def read_mapping(path: Path) -> dict[str, Any]:
     """Read a JSON (`.json`) or YAML document whose top level is a mapping.
 
-    With `unique_keys` a key that comes twice is refused, where otherwise the last one counts.
-
     Raises:
-        DeltalightError: the file is missing, unreadable, malformed, or not a mapping.
+        DeltalightError: the file is missing, unreadable, malformed or no mapping, or has a key twice in one place.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -69,23 +68,20 @@ def read_mapping(path: Path, *, unique_keys: bool = False) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise DeltalightError(f"{path} is not a text file; give a JSON or YAML document.") from error
     is_json = path.suffix.lower() == ".json"
-    return parse_mapping(text, str(path), is_json=is_json, unique_keys=unique_keys)
+    return parse_mapping(text, str(path), is_json=is_json)
 
 
-def parse_mapping(text: str, name: str, *, is_json: bool, unique_keys: bool = False) -> dict[str, Any]:
+def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
     """Parse the text of a document called `name` whose top level is a mapping.
 
     Raises:
-        DeltalightError: the text is malformed or not a mapping.
+        DeltalightError: the text is malformed or not a mapping, or has a key twice in one place.
     """
     kind = "JSON" if is_json else "YAML"
     if not text.strip():
         raise DeltalightError(f"{name} is empty; write {kind} with keys and values.")
     try:
-        if is_json:
-            data = json.loads(text, object_pairs_hook=_unique if unique_keys else None)
-        else:
-            data = parse_yaml(text, unique_keys=unique_keys)
+        data = json.loads(text, object_pairs_hook=_unique) if is_json else parse_yaml(text)
     except (ValueError, RecursionError) as error:
         detail = " ".join(str(error).split())[:160]
         raise DeltalightError(f"{name} is not valid {kind} ({detail}); correct it there.") from error
@@ -99,7 +95,7 @@ def parse_mapping(text: str, name: str, *, is_json: bool, unique_keys: bool = Fa
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        doubled = next(key for key in found if sum(key == other for other, _ in pairs) > 1)
+        ((doubled, _),) = Counter(key for key, _ in pairs).most_common(1)
         raise ValueError(f"`{doubled[:LONGEST_WORD]}` appears twice")
     return found
 

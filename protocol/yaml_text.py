@@ -17,7 +17,10 @@ MAX_KEY_SHOWN = 64
 
 # Ten times as fast as the loader in Python; a PyYAML that was built without libyaml has that one only.
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Reads `1e-3` as a number, as in YAML 1.2; in YAML 1.1 it is a string."""
+    """Reads `1e-3` as a number, as in YAML 1.2, and refuses a key that a mapping already has.
+
+    In YAML 1.1 the former is a string, and PyYAML would keep the last value of a key.
+    """
 
 
 class _Dumper(yaml.SafeDumper):
@@ -30,15 +33,15 @@ for _kind in (_Loader, _Dumper):
     )
 
 
-def parse_yaml(text: str, *, unique_keys: bool = False) -> Any:  # noqa: ANN401 - whatever the text holds
-    """Return the data of a YAML document; with `unique_keys` a mapping may hold each key once only.
+def parse_yaml(text: str) -> Any:  # noqa: ANN401 - whatever the text holds
+    """Return the data of a YAML document.
 
     Raises:
-        ValueError: the text is no YAML, or takes more than a document may.
+        ValueError: the text is no YAML, takes more than a document may, or has a key twice in one mapping.
     """
     try:
         _require_limits(text)
-        return yaml.load(text, _UniqueLoader if unique_keys else _Loader)
+        return yaml.load(text, _Loader)
     except (yaml.YAMLError, ArithmeticError, RecursionError) as error:  # 1:60:60... is a number in YAML 1.1
         raise ValueError(str(error).replace('in "<unicode string>",', "at")) from error
 
@@ -55,21 +58,19 @@ def _integer(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
 _Loader.add_constructor("tag:yaml.org,2002:int", _integer)
 
 
-class _UniqueLoader(_Loader):
-    """Refuses a key that a mapping already has, where YAML would keep the last one."""
-
-
 def _unique_mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-    keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-    doubled = next((key for index, key in enumerate(keys) if key in keys[:index]), None)
-    if doubled is not None:
-        raise yaml.constructor.ConstructorError(
-            None, None, f"`{doubled[:MAX_KEY_SHOWN]}` appears twice", node.start_mark
-        )
+    found: set[str] = set()
+    for key, _ in node.value:
+        if isinstance(key, yaml.ScalarNode):
+            if key.value in found:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"`{key.value[:MAX_KEY_SHOWN]}` appears twice", key.start_mark
+                )
+            found.add(key.value)
     return loader.construct_mapping(node, deep=True)
 
 
-_UniqueLoader.add_constructor("tag:yaml.org,2002:map", _unique_mapping)
+_Loader.add_constructor("tag:yaml.org,2002:map", _unique_mapping)
 
 
 def yaml_text(data: Mapping[str, Any]) -> str:

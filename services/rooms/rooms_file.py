@@ -128,7 +128,7 @@ def load_rooms(path: Path) -> RoomsFile:
     Raises:
         DeltalightError: it is missing, malformed, or names what it does not define.
     """
-    rooms = validate(RoomsFile, read_mapping(path, unique_keys=True), str(path))
+    rooms = validate(RoomsFile, read_mapping(path), str(path))
     folder = path.absolute().parent
     nodes = {name: _placed(node, folder) for name, node in rooms.nodes.items()}
     entries = {name: _with_scene(name, room, folder) for name, room in rooms.rooms.items()}

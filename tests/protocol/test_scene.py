@@ -225,6 +225,13 @@ def test_files_that_cannot_be_used(tmp_path: Path, name: str, text: str, message
     assert "\n" not in str(caught.value)
 
 
+def test_a_key_that_comes_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scene.json"
+    path.write_text('{"output": {"width": 80, "height": 60, "width": 96}}')
+    with pytest.raises(DeltalightError, match=r"scene\.json is not valid JSON \(`width` appears twice\)"):
+        load_scene(path)
+
+
 def test_a_missing_document_is_named(tmp_path: Path) -> None:
     with pytest.raises(DeltalightError, match=r"none\.json cannot be read"):
         load_scene(tmp_path / "none.json")

@@ -35,6 +35,8 @@ def nested(depth: int, line: str) -> str:
         ("a: !!int ''", "tag"),
         ("a: !!python/name:os.system x", "tag"),
         ('a: "\\ud800"', "character"),
+        ("objects: [1]\nobjects: [2]", "`objects` appears twice at line 2, column 1"),
+        ("a: {b: 1, c: 2, b: 3}", "`b` appears twice"),
         ("a: [", "not valid YAML"),
     ],
 )
@@ -61,7 +63,9 @@ def test_scene_files_of_the_command_line_have_the_same_limits(tmp_path: Path) ->
 
 
 def test_anchors_and_merge_keys_that_stay_small_are_read() -> None:
-    text = "base: &base {a: 1, b: 1e-3}\nitem: {<<: *base, a: 2}\nagain: *base\n"
+    text = (
+        "base: &base {a: 1, b: 1e-3}\nitem: {<<: *base, a: 2}\nagain: *base\n"  # `a` is replaced, not doubled
+    )
     assert parse_yaml(text) == {
         "base": {"a": 1, "b": 1e-3},
         "item": {"a": 2, "b": 1e-3},
