@@ -5,6 +5,7 @@ which owns the OpenGL context and does nothing but render and execute commands.
 """
 
 import queue
+import sys
 import threading
 import time
 from collections import defaultdict
@@ -44,6 +45,9 @@ from deltalight.render_server.server.renderer_interface import Renderer
 from deltalight.render_server.server.session import RenderedFrame, RenderSession
 from deltalight.render_server.server.session_host import SessionHost, SessionIdentity, SourceInUse
 
+SWITCH_INTERVAL_S = (
+    0.0005  # after which another thread may have the interpreter; Python's own is 10 times as long
+)
 SHORT_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive
 STATS_INTERVAL_S = 1.0
@@ -231,6 +235,9 @@ def run_server(settings: ServerSettings, keys: Keys | None = None, ahead: BuiltA
         GpuResetError: the GPU was reset; a new process goes on where this one ended.
     """
     scene = settings.initial_scene()
+    sys.setswitchinterval(
+        SWITCH_INTERVAL_S
+    )  # a frame lets go of the interpreter dozens of times, and waits each time
     for fault in PLUGINS.faults.values():
         log.warning(fault)
     with ExitStack() as stack:
