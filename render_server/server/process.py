@@ -45,9 +45,7 @@ from deltalight.render_server.server.renderer_interface import Renderer
 from deltalight.render_server.server.session import RenderedFrame, RenderSession
 from deltalight.render_server.server.session_host import SessionHost, SessionIdentity, SourceInUse
 
-SWITCH_INTERVAL_S = (
-    0.0005  # after which another thread may have the interpreter; Python's own is 10 times as long
-)
+SWITCH_INTERVAL_S = 0.0005  # how long a thread may keep the interpreter; 5 ms in Python itself
 SHORT_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive
 STATS_INTERVAL_S = 1.0
@@ -235,9 +233,7 @@ def run_server(settings: ServerSettings, keys: Keys | None = None, ahead: BuiltA
         GpuResetError: the GPU was reset; a new process goes on where this one ended.
     """
     scene = settings.initial_scene()
-    sys.setswitchinterval(
-        SWITCH_INTERVAL_S
-    )  # a frame lets go of the interpreter dozens of times, and waits each time
+    sys.setswitchinterval(SWITCH_INTERVAL_S)  # frames wait for it dozens of times
     for fault in PLUGINS.faults.values():
         log.warning(fault)
     with ExitStack() as stack:
