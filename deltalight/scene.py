@@ -11,9 +11,9 @@ from jaxtyping import Float
 from deltalight.protocol.array_checks import kind_of
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.files import replacing
+from deltalight.protocol.files import replacing, require_path
 from deltalight.protocol.scene import SceneDocument, load_scene, resolve_asset
-from deltalight.protocol.scene_objects import Material, SceneObject
+from deltalight.protocol.scene_objects import MESH_SUFFIXES, Material, SceneObject
 
 Vector = Sequence[float] | Float[np.ndarray, "..."]
 
@@ -46,18 +46,18 @@ class Scene:
         """Reads a scene document (JSON or YAML); its assets are relative to it.
 
         Raises:
-            DeltalightError: the file, a key or an asset is missing or wrong.
+            DeltalightError: it is no path; or the file, a key or an asset is missing or wrong.
         """
-        return cls(load_scene(Path(path)))
+        return cls(load_scene(require_path(path, "The path of a scene document")))
 
     def save(self, path: str | Path) -> None:
         """Writes the scene document as JSON; its assets stay where they are.
 
         Raises:
-            DeltalightError: the file cannot be written.
+            DeltalightError: it is no path, or the file cannot be written.
         """
         text = json.dumps(self.document.model_dump(mode="json"), indent=2, ensure_ascii=False)
-        with replacing(Path(path)) as temporary:
+        with replacing(require_path(path, "The path of a scene document")) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
     def add(
@@ -142,11 +142,14 @@ class Scene:
 
 
 def _found(asset: str | Path) -> Path:
+    asset = require_path(asset, "The path of a mesh")
     path = Path(resolve_asset(str(asset), Path.cwd()))
     if path.is_dir():
         raise DeltalightError(f"{asset} is a folder; name a mesh file.")
     if not path.is_file():
         raise DeltalightError(f"{asset} does not exist; correct the path.")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise DeltalightError(f"{asset} is not a mesh file; use one of {', '.join(MESH_SUFFIXES)}.")
     return path
 
 

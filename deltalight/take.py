@@ -8,6 +8,7 @@ from typing import Self, SupportsIndex, overload
 from deltalight.protocol.counts import counted
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import require_path
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.source import Source, open_source
 from deltalight.scene import Scene
@@ -130,6 +131,8 @@ def open_take(source: str | Path | Camera, *, calibration: str | Path | None = N
     Raises:
         DeltalightError: there is no such source, it cannot be read, or its calibration is missing.
     """
+    if not isinstance(source, Camera):
+        require_path(source, "A recording, a dataset folder or a camera")
     live = isinstance(source, str) and is_live(source)
     if calibration is not None and not live:
         raise DeltalightError(

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -83,6 +84,9 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
     try:
         data = json.loads(text, object_pairs_hook=_unique) if is_json else parse_yaml(text)
     except (ValueError, RecursionError) as error:
+        limit = beyond_limits(error)
+        if limit is not None:
+            raise DeltalightError(f"{name} {limit}.") from error
         detail = " ".join(str(error).split())[:160]
         raise DeltalightError(f"{name} is not valid {kind} ({detail}); correct it there.") from error
     if not isinstance(data, dict):
@@ -90,6 +94,15 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
             f"{name} must hold keys and values, not a {type(data).__name__}; write `key: value` lines."
         )
     return data
+
+
+def beyond_limits(error: ValueError | RecursionError) -> str | None:
+    """Return what is too much about a text that Python refused to parse; None: it is malformed."""
+    if isinstance(error, RecursionError):
+        return "is nested too deeply; give the keys that a document has"
+    if str(error).startswith("Exceeds the limit"):  # json.JSONDecodeError has other words
+        return f"has a number of more than {sys.get_int_max_str_digits()} digits; give a shorter one"
+    return None
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

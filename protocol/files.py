@@ -10,10 +10,24 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from deltalight.protocol.array_checks import kind_of
 from deltalight.protocol.errors import DeltalightError, unreachable
 
 ACTIVE_SUFFIX = ".active"  # of a recording that is not finished
 PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
+
+
+def require_path(value: object, what: str) -> Path:
+    """Return a program's argument as a path; `what` says in a sentence which one is needed.
+
+    Raises:
+        DeltalightError: it is no path.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise DeltalightError(
+            f"{what} is needed and {kind_of(value)} was given; give its path as text or a `Path`."
+        )
+    return Path(value)
 
 
 def is_file(path: Path) -> bool:

@@ -11,6 +11,7 @@ from deltalight.protocol.documents import StrictModel, read_mapping, validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import is_file
 from deltalight.protocol.methods import Method
+from deltalight.protocol.scene_fields import Text
 from deltalight.protocol.scene_lights import Lights, default_lights
 from deltalight.protocol.scene_method import DvctMethod
 from deltalight.protocol.scene_objects import ModelGeometry, PrecomputedMaterial, RealScene, SceneObject
@@ -27,7 +28,7 @@ class SceneDocument(StrictModel):
     exposure).
     """
 
-    name: str = Field(default="", max_length=200, description="Title to display.")
+    name: Text = Field(default="", max_length=200, description="Title to display.")
     revision: int = Field(default=0, ge=0, description="Increases with every change.")
     real: RealScene = Field(default_factory=RealScene)
     objects: tuple[SceneObject, ...] = Field(

@@ -35,6 +35,14 @@ def _unit_quaternion(values: tuple[float, float, float, float]) -> tuple[float, 
     return w, x, y, z
 
 
+def _without_nul(text: str) -> str:
+    """Refuse what no text in PostgreSQL can hold, and no file name."""
+    if "\0" in text:
+        raise ValueError("must not hold a NUL character; leave it out")
+    return text
+
+
+Text = Annotated[str, AfterValidator(_without_nul)]
 Coordinate = Annotated[float, Field(gt=-1e4, lt=1e4)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9)]

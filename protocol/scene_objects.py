@@ -20,10 +20,12 @@ from deltalight.protocol.scene_fields import (
     Point,
     Quaternion,
     Radiance,
+    Text,
 )
 
 SheetEdge = Annotated[float, Field(gt=0, le=100)]
 GLTF_SUFFIXES = (".gltf", ".glb")
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 ASSETS_KEPT = 256  # whose names were looked at
 # Rotates an asset whose y is up so that its z is up: +90 degrees about x.
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -150,7 +152,7 @@ def _addressable(name: str) -> str:
 class SceneObject(StrictModel):
     """A virtual object."""
 
-    id: Annotated[str, AfterValidator(_addressable)] = Field(
+    id: Annotated[Text, AfterValidator(_addressable)] = Field(
         default="object", min_length=1, max_length=200, description="Unique name; default `object<index>`."
     )
     asset: Asset = Field(description=f"Mesh: {ASSET_TEXT}")

@@ -135,7 +135,7 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
         try:
             for sentence in size_warnings(job.scene):
                 progress.notice(sentence)
-            with _written(job) as write:
+            with _written(job, progress) as write:
                 return _render_frames(
                     job, renderer, RenderSummary(gpu.renderer_name, job.out), progress, write
                 )
@@ -146,10 +146,13 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
 
 
 @contextmanager
-def _written(job: RenderJob) -> "Iterator[Write]":
+def _written(job: RenderJob, progress: Progress) -> "Iterator[Write]":
     """Yield what writes a frame: to a folder, or to a video that appears at the end."""
     if not job.is_video:
-        make_output_folder(job.out)
+        if (make_output_folder(job.out) / INDEX_FILE).exists():
+            progress.notice(
+                f"'{job.out}' has pictures of an earlier run; those of the same numbers are replaced."
+            )
         yield partial(_write_frame, job)
         return
     times_ns = [job.source.timestamps_ns[number] for number in job.frames]

@@ -130,3 +130,14 @@ def test_the_examples_fit(copy: Path) -> None:
             assert (copy / path).is_file()
             if path.endswith(".py"):
                 compile((copy / path).read_text(), path, "exec")
+
+
+def test_floors_installs_what_its_tests_import() -> None:
+    tools = re.search(r"TEST_TOOLS=\((.*?)\)", (ROOT / ".ci" / "floors").read_text())
+    assert tools is not None
+    collected = [path for path in (ROOT / "tests" / "services").glob("*.py") if "dashboard" not in path.name]
+    for module in ("playwright", "psutil", "hypothesis", "pypdfium2"):
+        if any(
+            re.search(rf"^(import|from) {module}\b", path.read_text(), re.MULTILINE) for path in collected
+        ):
+            assert module in tools[1].split(), module

@@ -18,6 +18,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.methods import InstalledMethod, load_methods
 from deltalight.protocol.plugins import LoadedPlugins
 from deltalight.protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneMethod
+from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods import registry
 from deltalight.render_server.methods.method import RelightingMethod
@@ -300,6 +301,7 @@ def test_every_method_of_the_project_is_registered() -> None:
         choice = registry.choose_method(settings(), software=True)
         assert choice.relights_real is (settings is not NoneMethod)
         assert choice.plugin is None
+    assert registry.choose_method(NoneMethod(), software=True).remark is None, "it has no setting for memory"
 
 
 @pytest.mark.parametrize(
@@ -422,6 +424,28 @@ def test_a_stage_that_fails_is_named_with_its_plugin(
     own.stage("fog", fail)
     with pytest.raises(ValueError, match="too thin"):
         own.run()
+
+
+def test_what_a_plugin_does_with_objects_and_transparency_is_blamed_on_it(
+    install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del install
+    (direct,) = load_methods().values.values()
+
+    def fail(*_: object) -> Any:  # noqa: ANN401
+        raise KeyError("mesh")
+
+    method = RelightingMethod(direct.settings, fail, require=fail)
+    weak = InstalledMethod(direct.plugin, direct.settings, method)
+    monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": weak}, {}))
+    choice = registry.choose_method(direct.settings(), software=True)
+    nothing = cast(Any, None)
+    said = r"`direct` of package direct-light 1\.0 .*\(KeyError: 'mesh'\)"
+    with pytest.raises(DeltalightError, match=said):
+        choice.require([SceneObject(asset="cube.ply")])
+    layers = Layers(*[nothing] * 9, transmit=fail)
+    with pytest.raises(DeltalightError, match=said):
+        choice.shaded(Graph(nothing), nothing, layers, (4, 4), nothing)
 
 
 Stages = Callable[[Graph], Layers]

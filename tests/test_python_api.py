@@ -204,6 +204,12 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
             method={"name": "dvct", "volume_siz": 32}
         ),
         "the path is empty; name a dataset folder": lambda: dl.open(""),
+        "A recording, a dataset folder or a camera is needed and `int` was given": lambda: dl.open(5),  # type: ignore[arg-type]
+        "path of a scene document is needed and None was given": lambda: dl.Scene.load(None),  # type: ignore[arg-type]
+        "path of a scene document is needed and `dict` was given": lambda: scene.save({}),  # type: ignore[arg-type]
+        "path of a mesh is needed and None was given": lambda: scene.add(None),  # type: ignore[arg-type]
+        "demo.mcap is not a mesh file; use one of .glb": lambda: scene.add(RECORDING),
+        "demo.mcap is not a mesh file": lambda: scene.change("knot", asset=RECORDING),
         "cannot be reached .File name too long": lambda: dl.open("x" * 5000),
         "'/' cannot be written .it names no file": lambda: scene.save("/"),
         "cannot be read|does not exist|no such": lambda: dl.open(tmp_path / "none.mcap"),

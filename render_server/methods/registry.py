@@ -74,13 +74,15 @@ class MethodChoice:
         """Refuses visible objects that the method or the shading cannot render.
 
         Raises:
-            DeltalightError: an object's shape may change, but the method or the shading precomputes it.
+            DeltalightError: an object's shape may change, but the method or the shading precomputes it; or a plugin
+                cannot look at one.
         """
         shading = require_rigid_transfer if self.shading.is_precomputed else None
-        for require in (self.method.require, shading):
+        for require, plugin in ((self.method.require, self.plugin), (shading, None)):
             for item in objects:
                 if item.visible and require is not None:
-                    require(item)
+                    with blamed(plugin):
+                        require(item)
 
     def setup(self, picture_size: tuple[int, int], fields: OcclusionFields) -> Setup[Any]:
         """Returns the arguments of the method's declaration, for pictures of this size."""
@@ -112,7 +114,10 @@ class MethodChoice:
             radiance = image_based_radiance(graph, resources, self.shading, size)
         elif self.shading.is_precomputed:
             radiance = precomputed_radiance(graph, resources, self.shading, size, transfers)
-        return replace(layers, radiance=radiance if layers.transmit is None else layers.transmit(radiance))
+        if layers.transmit is not None:
+            with blamed(self.plugin), graph.of_plugin(self.plugin):
+                radiance = layers.transmit(radiance)
+        return replace(layers, radiance=radiance)
 
 
 def choose_method(
@@ -125,7 +130,7 @@ def choose_method(
     """
     if isinstance(document, NoneMethod):
         drawn = choose_method(DvctMethod(quality=document.quality), shading, software=software)
-        return replace(drawn, relights_real=False)
+        return replace(drawn, relights_real=False, remark=None)  # `none` has no setting for the memory
     method, plugin = _registered(document)
     with blamed(plugin):
         resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)

@@ -8,6 +8,7 @@ from typing import Any
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import is_file
+from deltalight.protocol.scene_objects import MESH_SUFFIXES
 from deltalight.render_server.scene.gltf_document import (
     COMPONENT_TYPES,
     COMPONENTS,
@@ -18,7 +19,6 @@ from deltalight.render_server.scene.gltf_document import (
     uri_bytes,
 )
 
-MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 MAX_FILE_BYTES = 512 << 20
 MAX_TRIANGLES = 20_000_000
 _GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 
-from deltalight.protocol.documents import wrong_in_words
+from deltalight.protocol.documents import beyond_limits, wrong_in_words
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.message_fields import as_sentence
 from deltalight.services.api.render_link import UnansweredError
@@ -77,6 +77,13 @@ class ProblemError(HTTPException):
         self.kind = kind
 
 
+def unreadable_json(cause: BaseException | None) -> ProblemError:
+    """Return the refusal of a body that `json.loads` ended with `cause`."""
+    limit = beyond_limits(cause) if isinstance(cause, ValueError | RecursionError) else None
+    sentence = "The body is not valid JSON; correct it." if limit is None else f"The body {limit}."
+    return ProblemError(400, "not-json", sentence)
+
+
 class Problems:
     """Turns errors into responses and counts them by kind."""
 
@@ -108,7 +115,7 @@ class Problems:
     def of_http(self, fault: HTTPException) -> JSONResponse:
         """Return the response to a refusal by the framework or the middleware."""
         if fault.status_code == 400 and not isinstance(fault, ProblemError):  # the body's text cannot be read
-            return self._not_json()
+            return self._not_json(fault.__cause__)
         status = fault.status_code
         kind = fault.kind if isinstance(fault, ProblemError) else _slug(status)
         return self.response(
@@ -156,8 +163,8 @@ class Problems:
             sentence = f"The service failed ({type(fault).__name__}); see its log and report it."
             return self.response(500, "internal", sentence)
 
-    def _not_json(self) -> JSONResponse:
-        return self.response(400, "not-json", "The body is not valid JSON; correct it.")
+    def _not_json(self, cause: BaseException | None = None) -> JSONResponse:
+        return self.of_http(unreadable_json(cause))
 
     def _of_request(self, fault: RequestValidationError) -> JSONResponse:
         first = fault.errors()[0]

@@ -21,7 +21,7 @@ from deltalight.protocol.scene_objects import RealScene, SceneObject
 from deltalight.protocol.scene_output import Output, Shading
 from deltalight.protocol.yaml_text import yaml_text
 from deltalight.services.api.context import Shared
-from deltalight.services.api.problems import ProblemError
+from deltalight.services.api.problems import ProblemError, unreadable_json
 
 UPLOAD_TYPE = "application/octet-stream"
 
@@ -117,7 +117,7 @@ def _parsed_json(body: bytes) -> object:
     try:
         return json.loads(_text(body))
     except (ValueError, RecursionError) as fault:
-        raise ProblemError(400, "not-json", "The body is not valid JSON; correct it.") from fault
+        raise unreadable_json(fault) from fault
 
 
 def _text(body: bytes) -> str:

@@ -216,6 +216,18 @@ def test_json_and_yaml_say_the_same_and_assets_become_absolute(tmp_path: Path) -
         ("s.json", "", r"s\.json is empty; write JSON"),
         ("s.yaml", "\n", r"s\.yaml is empty; write YAML"),
         ("s.yaml", "objects: [", "not valid YAML"),
+        ("s.json", '{"a": ' * 100_000, r"s\.json is nested too deeply"),
+        (
+            "s.json",
+            '{"revision": ' + "9" * 5000 + "}",
+            "has a number of more than 4300 digits; give a shorter",
+        ),
+        ("s.json", r'{"name": "a\u0000b"}', "`name` is wrong: must not hold a NUL character"),
+        (
+            "s.json",
+            r'{"objects": [{"id": "\u0000", "asset": "a"}]}',
+            r"`objects\[0\]\.id` is wrong: must not hold",
+        ),
         ("s.json", '{"lights": {"manual": [{"intensity": NaN}]}}', "finite"),
     ],
 )

@@ -261,6 +261,25 @@ def test_yaml_that_is_a_trap(api: RunningApi) -> None:
         refused(api, lambda text=text: sent(text), 422, "invalid")
 
 
+@pytest.mark.parametrize("path", ["/scenes", "/recordings"])  # read by this service, and by its framework
+def test_json_beyond_limits_is_not_called_malformed(api: RunningApi, path: str) -> None:
+    for body, said in (
+        (b'{"name": ' + b"9" * 5000 + b"}", "has a number of more than 4300 digits; give a shorter one."),
+        (b'{"name": ' * 100_000, "is nested too deeply; give the keys that a document has."),
+    ):
+        post = partial(api.client.post, path, content=body, headers=JSON)
+        assert refused(api, post, 400, "not-json") == f"The body {said}"
+
+
+def test_names_that_postgresql_cannot_keep(api: RunningApi) -> None:
+    client = api.client
+    for send in (
+        lambda: client.post("/scenes", json={"name": "a\0b"}),
+        lambda: upload(client, mesh(), "a\0b.glb"),
+    ):
+        assert "must not hold a NUL character" in refused(api, send, 422, "invalid")
+
+
 def test_text_that_no_encoding_has_and_long_keys(api: RunningApi) -> None:
     key = b'"\\ud800": 1'
     for path, body in (

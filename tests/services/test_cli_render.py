@@ -130,11 +130,12 @@ def test_second_run_overwrites_and_is_bit_identical(
     cli: RunCli, cli_process: RunCli, take: Path, tmp_path: Path
 ) -> None:
     pictures = []
-    for start in (cli, cli_process):
+    for start, is_second in ((cli, False), (cli_process, True)):
         done = start(
             "render", take / "take", "--scene", take / "scene.json", "--out", tmp_path, "--frames", ":1"
         )
         assert done.returncode == 0, done.stderr
+        assert ("has pictures of an earlier run" in done.stderr) is is_second
         pictures.append((tmp_path / "000000.png").read_bytes())
     assert pictures[0] == pictures[1]
     assert len(records(tmp_path)) == 1

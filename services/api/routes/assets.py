@@ -6,6 +6,7 @@ from fastapi import Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from deltalight.protocol.scene import DIGEST_PREFIX
+from deltalight.protocol.scene_fields import Text
 from deltalight.services.api.api_router import api_router
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
@@ -53,7 +54,7 @@ async def upload_asset(
     shared: Shared,
     request: Request,
     response: Response,
-    name: Annotated[str, Query(max_length=1000, description="Name of the file.", examples=["chair.glb"])],
+    name: Annotated[Text, Query(max_length=1000, description="Name of the file.", examples=["chair.glb"])],
 ) -> AssetAnswer:
     """Upload a mesh, map or precomputed material as the request body; 200 if the content already exists.
 
