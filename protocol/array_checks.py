@@ -1,4 +1,4 @@
-"""Checks of arrays that strangers make: plugins, and programs that use the package."""
+"""Checks of arrays that come from outside the project: from plugins, and from programs that use the package."""
 
 import numpy as np
 

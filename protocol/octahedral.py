@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+SUPERSAMPLING = 2  # samples along each edge of a texel
 SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
 
 
@@ -80,16 +81,16 @@ def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
     return np.asarray(weight)
 
 
-def resample_to_octahedral(sample: SampleMap, size: int, supersampling: int = 2) -> np.ndarray:
+def resample_to_octahedral(sample: SampleMap, size: int) -> np.ndarray:
     """Average a radiance function over the texels of an octahedral map, weighted by solid angle.
 
-    `sample` maps directions (n, m, 3) to radiance (n, m, c); every texel takes supersampling^2 of them.
+    `sample` maps directions (n, m, 3) to radiance (n, m, c); every texel takes SUPERSAMPLING^2 of them.
     """
-    uv = _grid_uv(size * supersampling)
+    uv = _grid_uv(size * SUPERSAMPLING)
     folded = _folded_direction(uv)
     weight = (np.linalg.norm(folded, axis=-1, keepdims=True) ** -3).astype(np.float32)
     weighted = sample(folded.astype(np.float32)) * weight
-    blocks = (size, supersampling, size, supersampling, -1)
+    blocks = (size, SUPERSAMPLING, size, SUPERSAMPLING, -1)
     total = weighted.reshape(blocks).sum(axis=(1, 3)) / weight.reshape(blocks).sum(axis=(1, 3))
     return np.asarray(total, np.float32)
 

@@ -38,7 +38,7 @@ class Plugin:
         """
         try:
             return self.entry_point.load()
-        except (Exception, SystemExit) as error:  # a stranger's code may raise anything
+        except (Exception, SystemExit) as error:  # a plugin's code may raise anything
             raise self.fault(f"{type(error).__name__}: {error}") from error
 
     @contextmanager

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
+from deltalight.services.garbage_collection import no_garbage_collection
 from deltalight.services.process import Process
-from deltalight.services.uncollected import uncollected
 
 SPARE_VARIABLE = "DELTALIGHT_SPARE_PREPARES"
 GO, REHEARSE = "1", "2"  # what spares are told, a line each, arguments following; GO is the last one
@@ -137,7 +137,7 @@ def wait_if_spare(run: Callable[[list[str]], int]) -> None:
 
 def prepare(names: Sequence[str]) -> None:
     """Prepare these (`spare_environment`) in this process."""
-    with uncollected():
+    with no_garbage_collection():
         for name in names:
             found = pkgutil.resolve_name(name)
             if callable(found):

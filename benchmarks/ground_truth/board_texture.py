@@ -10,6 +10,7 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
 
 PIXELS_PER_CELL = 20
+MARGIN_M = 0.02
 """Texels along one black or white cell of a marker."""
 
 INK_ALBEDO = 0.04
@@ -24,8 +25,8 @@ class BoardTexture:
     max_m: Float[np.ndarray, "2"]
 
 
-def board_texture(board: BoardSpec, margin_m: float = 0.02) -> BoardTexture:
-    """Print `board` with a white margin of `margin_m`, rounded so that marker edges fall on texel edges.
+def board_texture(board: BoardSpec) -> BoardTexture:
+    """Print `board` with a white margin of about MARGIN_M: marker edges fall on texel edges.
 
     Raises:
         DeltalightError: the board is not a grid of markers.
@@ -39,7 +40,7 @@ def board_texture(board: BoardSpec, margin_m: float = 0.02) -> BoardTexture:
     texel_m = board.marker_length_m / side
     corners = board.corner_points()
     points = np.concatenate(list(corners.values()))[:, :2]
-    margin = round(margin_m / texel_m) * texel_m
+    margin = round(MARGIN_M / texel_m) * texel_m
     min_m, max_m = points.min(axis=0) - margin, points.max(axis=0) + margin
     width, height = (round(extent / texel_m) for extent in max_m - min_m)
     albedo = np.full((height, width), board.paper_albedo, np.float32)

@@ -63,10 +63,6 @@ class SoakReport(StrictModel):
     times_s: list[float]
     courses: dict[str, dict[str, list[float | None]]]
 
-    def lacking(self) -> list[Figure]:
-        """Return the figures whose bar is not met."""
-        return [each for each in self.figures if not each.is_met]
-
 
 @dataclass(frozen=True)
 class Bar:

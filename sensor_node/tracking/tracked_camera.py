@@ -14,9 +14,12 @@ LENS_TIMEOUT_S = 6.0  # producers send what seldom changes about every 2 s
 
 
 class TrackedCamera(AccompaniedCamera):
-    """A camera with poses of OpenTrackIO; frames whose moment the tracker says nothing of have none of it.
+    """A camera whose poses come from OpenTrackIO packets; a frame has no pose if no packet covers its time.
 
-    Opening it waits for the lens if the tracker shall give it, and raises DeltalightError if no packet tells it.
+    If the settings take the lens from the tracker, opening waits for it.
+
+    Raises:
+        DeltalightError: no packet describes the lens.
     """
 
     def __init__(self, camera: Camera, settings: TrackingSettings) -> None:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from deltalight.services.commands.options import ConfigFile, Data, DatabaseAddress, NodeName, data_folder
+from deltalight.services.garbage_collection import no_garbage_collection
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
-from deltalight.services.uncollected import uncollected
 
 if TYPE_CHECKING:
     from deltalight.protocol.keys import KeySettings
@@ -83,7 +83,7 @@ def serve(
     """Serve the dashboard at /, and scenes, assets, live video and state at /api/v1, until Ctrl-C."""
     if context.invoked_subcommand is not None:
         return
-    with uncollected():
+    with no_garbage_collection():
         from deltalight.protocol.keys import KeySettings
         from deltalight.services.api.serve import run_api
         from deltalight.services.api.settings import ApiSettings

@@ -9,8 +9,8 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.method_names import require_method
 from deltalight.services.child import NODE, SERVER, WEB, ending_spares, fork_spares
 from deltalight.services.commands.options import MethodName
+from deltalight.services.garbage_collection import no_garbage_collection
 from deltalight.services.ports import PAGE_PORT, require_free
-from deltalight.services.uncollected import uncollected
 from deltalight.services.warm_spare import SHARED, prepare
 
 
@@ -41,7 +41,7 @@ def demo(
     require_free(port, "dashboard", "--port")
     prepare(SHARED)
     early = fork_spares({SERVER: "server", NODE: "replay"})  # they need not wait for the storage's libraries
-    with uncollected():
+    with no_garbage_collection():
         from deltalight.services.live_demo import run_live
 
     with ending_spares(fork_spares({WEB: "api"}, early)) as spares:
@@ -52,7 +52,7 @@ def _write(method: str, frames: int, out: Path | None, *, as_json: bool) -> None
     if out is None:
         raise DeltalightError("A headless demo writes files; give a folder for them with --out.")
     prepare(SHARED)
-    with uncollected():
+    with no_garbage_collection():
         from deltalight.services.files import make_output_folder
         from deltalight.services.headless_demo import run_headless
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from deltalight.services.commands.options import ConfigFile
-from deltalight.services.uncollected import uncollected
+from deltalight.services.garbage_collection import no_garbage_collection
 
 if TYPE_CHECKING:
     from deltalight.sensor_node.cameras.driver import Discovery
@@ -77,7 +77,7 @@ def node(
         "tracking": {} if tracking else None,
         "fisheye": None if fisheye is None else {"source": fisheye},
     }
-    with uncollected():
+    with no_garbage_collection():
         from deltalight.services.node_process import run_configured_node
 
     run_configured_node({key: value for key, value in given.items() if value is not None}, config_file)

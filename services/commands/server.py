@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from deltalight.services.commands.options import ConfigFile, Device, NodeName
-from deltalight.services.uncollected import uncollected
+from deltalight.services.garbage_collection import no_garbage_collection
 from deltalight.services.warm_spare import this_spare
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def server(
     config_file: ConfigFile = None,
 ) -> None:
     """Render the frames of sensor nodes and publish the pictures, until Ctrl-C."""
-    with uncollected():
+    with no_garbage_collection():
         from deltalight.protocol.keys import KeySettings
         from deltalight.render_server.server.process import ServerSettings, run_server
         from deltalight.render_server.server.standby import StandbyRenderer

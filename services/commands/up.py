@@ -27,6 +27,7 @@ from deltalight.services.commands.up_options import (
     SourceOfNode,
     Spares,
 )
+from deltalight.services.garbage_collection import no_garbage_collection
 from deltalight.services.ports import (
     COMPOSITE_PORT,
     CONTROL_PORT,
@@ -37,7 +38,6 @@ from deltalight.services.ports import (
     answers,
 )
 from deltalight.services.process import Process
-from deltalight.services.uncollected import uncollected
 from deltalight.services.warm_spare import SHARED, prepare
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def up(
     says which nodes and render servers there are.
     """
     prepare(SHARED)
-    with uncollected():
+    with no_garbage_collection():
         from deltalight.services.host import HostCommands, HostPlan, recording_of
         from deltalight.services.host_store import open_store, scene_to_show
 

@@ -18,8 +18,8 @@ from importlib import import_module
 from pathlib import Path
 
 from deltalight.protocol.errors import DeltalightError, install_command
+from deltalight.services.garbage_collection import no_garbage_collection
 from deltalight.services.storage.asset_kinds import Facts
-from deltalight.services.uncollected import uncollected
 
 IDLE_S = 60.0  # without work; what it has imported takes 100 MB and more
 REQUEST_BYTES = 1 << 16
@@ -118,7 +118,7 @@ def _fork_workers(requests: socket.socket) -> None:
 
 
 def _prepare(task: str, path: Path) -> None:
-    with uncollected(), suppress(ImportError, DeltalightError):  # the worker says it
+    with no_garbage_collection(), suppress(ImportError, DeltalightError):  # the worker says it
         _task(task)
         for name in IMPORTED_LATE.get(task, ()):
             import_module(name)

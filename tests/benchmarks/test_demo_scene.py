@@ -62,7 +62,7 @@ def test_printed_markers_lie_where_the_board_says(board: BoardSpec) -> None:
 
 
 def test_printed_sheet_has_ink_paper_and_margin() -> None:
-    sheet = board_texture(scene_demo.BOARD, margin_m=0.02)
+    sheet = board_texture(scene_demo.BOARD)
     assert set(np.unique(sheet.albedo)) == {np.float32(INK_ALBEDO), np.float32(0.8)}
     assert sheet.min_m == pytest.approx([-0.02, -0.16])
     assert sheet.max_m == pytest.approx([0.21, 0.02])

@@ -81,12 +81,12 @@ bool is_wanted(ivec2 texel, int material) {
 
 // Of a mirror's ray from this texel to the next block along `axis`.
 Drift drift_along(LightView view, ivec2 texel, ivec2 axis, Spot here, float side) {
-    int apart = max(block_edge / 2, 1);
+    int neighbour_texels = max(block_edge / 2, 1);
     vec3 own = reflect(here.seen_from, here.normal);
     for (int sign = 1; sign >= -1; sign -= 2) {
-        Spot other = spot_at(view, texel + sign * apart * axis);
+        Spot other = spot_at(view, texel + sign * neighbour_texels * axis);
         if (!other.present || other.material != here.material || dot(other.normal, here.normal) < ALIKE) continue;
-        float blocks = float(sign * block_edge) / float(apart) * RAYS_APART;
+        float blocks = float(sign * block_edge) / float(neighbour_texels) * RAYS_APART;
         return Drift(blocks * (other.point - here.point), blocks * (reflect(other.seen_from, other.normal) - own));
     }
     vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * RAYS_APART;
@@ -143,8 +143,8 @@ Passage strongest_held() {
 }
 
 // Of a ray: where its lamp's light starts, relative to the lamp's middle and to the distance; the depth in the light's view at which
-// rays from all over the lamp through one place of the view meet; and how far rays from that part of the lamp are apart, in blocks.
-struct LampPart { vec3 aside; float depth; float apart; };
+// rays from all over the lamp through one place of the view meet; and the spacing of rays from that part of the lamp, in blocks.
+struct LampPart { vec3 aside; float depth; float ray_spacing; };
 
 Passage first_passage(LightView view, vec2 s, LampPart part) {
     vec3 meeting = ray_point(view, s, part.depth);
@@ -184,14 +184,14 @@ Passage along_ways(LightView view, vec2 s, LampPart part, uint ways) {
 
 // Drift of a path from this texel to the next block along `axis`.
 Drift drift_through(LightView view, ivec2 texel, ivec2 axis, LampPart part, Passage here, float side) {
-    int apart = max(block_edge / 2, 1);
+    int neighbour_texels = max(block_edge / 2, 1);
     for (int sign = 1; sign >= -1; sign -= 2) {
-        Passage other = along_ways(view, texel_lateral(view, texel + sign * apart * axis), part, here.ways);
+        Passage other = along_ways(view, texel_lateral(view, texel + sign * neighbour_texels * axis), part, here.ways);
         if (other.ways != here.ways) continue;
-        float blocks = float(sign * block_edge) / float(apart) * part.apart;
+        float blocks = float(sign * block_edge) / float(neighbour_texels) * part.ray_spacing;
         return Drift(blocks * (other.from - here.from), blocks * (other.direction - here.direction));
     }
-    vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * part.apart;
+    vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * part.ray_spacing;
     return Drift(across, vec3(0.0));
 }
 
@@ -239,8 +239,8 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     float depth = (view.view_from_world * vec4(spot.point, 1.0)).z, angle = 2.0 * PI * numbers.x;
     vec2 on_lamp = tan(radius) * sqrt(numbers.y) * vec2(cos(angle), sin(angle));
     // Over the length of the objects a lamp spreads light by so many blocks; rays of a small one share a block.
-    float apart = clamp(radius * view.tile.z / float(block_edge), RAYS_APART, 1.0);
-    LampPart part = LampPart(transpose(mat3(view.view_from_world)) * vec3(on_lamp, 0.0), depth, apart);
+    float ray_spacing = clamp(radius * view.tile.z / float(block_edge), RAYS_APART, 1.0);
+    LampPart part = LampPart(transpose(mat3(view.view_from_world)) * vec3(on_lamp, 0.0), depth, ray_spacing);
     send_paths(view, texel, texel_side(view, depth), part, flux, radius);
 }
 #else

@@ -162,9 +162,9 @@ vec3 surrounding_ratio(ivec2 pixel, vec3 b, bool wanted) {
             vec4 ratio = texelFetch(change_ratio, texel, 0);
             if (ratio.a == 0.0) continue;
             ivec2 at = texelFetch(sample_pixels, texel, 0).xy;
-            vec3 apart = (texelFetch(linear_picture, at, 0).rgb - b) / (0.1 + b);
+            vec3 difference = (texelFetch(linear_picture, at, 0).rgb - b) / (0.1 + b);
             vec2 away = vec2(at - pixel) / float(FILL_RADIUS * scale);
-            float w = exp(-4.0 * dot(away, away) - 4.0 * dot(apart, apart));
+            float w = exp(-4.0 * dot(away, away) - 4.0 * dot(difference, difference));
             sum += w * ratio.rgb;
             total += w;
         }

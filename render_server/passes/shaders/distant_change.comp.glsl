@@ -30,8 +30,8 @@ ivec2 texel_of(ivec2 point) {
     for (int i = 0; i < LATTICE_STEP * LATTICE_STEP; ++i) {
         ivec2 inside = ivec2(i % LATTICE_STEP, i / LATTICE_STEP), texel = point * LATTICE_STEP + inside;
         if (any(greaterThanEqual(texel, low_resolution_size)) || texelFetch(sample_pixels, texel, 0).x < 0) continue;
-        vec2 apart = vec2(inside) - 0.5 * float(LATTICE_STEP - 1);
-        if (dot(apart, apart) < nearest) { nearest = dot(apart, apart); found = texel; }
+        vec2 offset = vec2(inside) - 0.5 * float(LATTICE_STEP - 1);
+        if (dot(offset, offset) < nearest) { nearest = dot(offset, offset); found = texel; }
     }
     return found;
 }
@@ -52,9 +52,9 @@ vec3 direct_irradiance(SurfacePoint s) {
 
 // Share of the hemisphere about n, weighted by cosine, that a ball fills at most.
 float greatest_share(vec3 to_ball, float radius, vec3 n) {
-    float apart = length(to_ball), sine = min(radius / apart, 1.0);
+    float ball_distance = length(to_ball), sine = min(radius / ball_distance, 1.0);
     float height = dot(to_ball, n) + radius;
-    return height > 0.0 ? sine * sine * min(height / apart, 1.0) : 0.0;
+    return height > 0.0 ? sine * sine * min(height / ball_distance, 1.0) : 0.0;
 }
 
 // Whether a ray meets what a volume before this one holds: near each other, both hold the same objects.

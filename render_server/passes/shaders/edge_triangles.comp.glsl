@@ -60,8 +60,8 @@ float beyond(vec2 p, vec2 a, vec2 b, vec2 c, out float length_along_axes) {
 // Whether a square around a middle, of edges 2 `reach`, meets a triangle whose bounds it meets.
 bool meets(vec2 middle, float reach, Projected p) {
     vec3 l;
-    vec3 apart = vec3(beyond(middle, p.a, p.b, p.c, l.x), beyond(middle, p.b, p.c, p.a, l.y), beyond(middle, p.c, p.a, p.b, l.z));
-    return all(lessThanEqual(apart, reach * l));
+    vec3 distances = vec3(beyond(middle, p.a, p.b, p.c, l.x), beyond(middle, p.b, p.c, p.a, l.y), beyond(middle, p.c, p.a, p.b, l.z));
+    return all(lessThanEqual(distances, reach * l));
 }
 
 // The next of the texels or tiles from `first` to `last`, row by row. (Two loops would execute the body for no lane, each once more.)

@@ -13,9 +13,9 @@ uniform int cells;
 float amount(vec3 flux) { return abs(dot(flux, vec3(0.2126, 0.7152, 0.0722))); }
 
 void main() {
-    int count = cells * cells * cells, apart = int(gl_NumWorkGroups.x) * THREADS, thread = int(gl_LocalInvocationID.x);
+    int count = cells * cells * cells, stride = int(gl_NumWorkGroups.x) * THREADS, thread = int(gl_LocalInvocationID.x);
     vec2 own = vec2(0.0);
-    for (int i = int(gl_GlobalInvocationID.x); i < count; i += apart) {
+    for (int i = int(gl_GlobalInvocationID.x); i < count; i += stride) {
         int at = i * INJECTED_SUMS;
         vec3 first = vec3(before[at], before[at + 4], before[at + 8]);
         float second = amount(vec3(injected[at], injected[at + 4], injected[at + 8]) - first);

@@ -104,8 +104,8 @@ float measured_share() {
     int thread = int(gl_LocalInvocationID.x);
     if (thread < SHARE_PARTS) held[thread].xy = parts[thread];
     share();
-    for (int apart = SHARE_PARTS / 2; apart > 0; apart /= 2) {
-        if (thread < apart) held[thread].xy += held[thread + apart].xy;
+    for (int stride = SHARE_PARTS / 2; stride > 0; stride /= 2) {
+        if (thread < stride) held[thread].xy += held[thread + stride].xy;
         share();
     }
     float found = share_of(held[0].xy);

@@ -77,8 +77,8 @@ vec4 sum_of_all(vec4 own, int thread) {
     barrier();
     parts[thread] = own;
     barrier();
-    for (int apart = THREADS / 2; apart > 0; apart /= 2) {
-        if (thread < apart) parts[thread] += parts[thread + apart];
+    for (int stride = THREADS / 2; stride > 0; stride /= 2) {
+        if (thread < stride) parts[thread] += parts[thread + stride];
         barrier();
     }
     return parts[0];

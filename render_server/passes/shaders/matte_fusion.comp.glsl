@@ -16,8 +16,8 @@ const float STEP = 1.0 / 3072.0;    // variance: of a sixteenth, in which fracti
 
 // Mean and variance of the thing's fraction.
 vec2 fused(ivec2 pixel) {
-    vec3 own = texelFetch(linear_picture, pixel, 0).rgb, apart = texelFetch(contrast, pixel, 0).rgb, sum = vec3(0.0);
-    float range = max(dot(apart, apart), NOISE);
+    vec3 own = texelFetch(linear_picture, pixel, 0).rgb, side_contrast = texelFetch(contrast, pixel, 0).rgb, sum = vec3(0.0);
+    float range = max(dot(side_contrast, side_contrast), NOISE);
     ivec2 first = max(pixel - REACH, rectangle.xy), last = min(pixel + REACH, rectangle.xy + rectangle.zw - 1);
     for (int y = first.y; y <= last.y; ++y)
         for (int x = first.x; x <= last.x; ++x) {

@@ -47,8 +47,8 @@ const float NEARNESS = 0.1;    // weight of the distance beside the distance fro
 // Distance of a position from the surface of a pixel, m; large where that shows no object.
 float away(ivec2 at, vec3 place) {
     if (texelFetch(sample_coverage, at, 0).r == 0.0) return 1e9;
-    vec3 apart = place - texelFetch(virtual_raster_position, at, 0).xyz;
-    return abs(dot(apart, texelFetch(virtual_raster_normal, at, 0).xyz)) + NEARNESS * length(apart);
+    vec3 offset = place - texelFetch(virtual_raster_position, at, 0).xyz;
+    return abs(dot(offset, texelFetch(virtual_raster_normal, at, 0).xyz)) + NEARNESS * length(offset);
 }
 
 // The share of samples that show another surface of the objects, and the neighbour that shows it; 0 if none does, or if there are no

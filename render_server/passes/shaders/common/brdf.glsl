@@ -96,10 +96,10 @@ vec3 diffuse_under_lobe(vec3 f0, float roughness, float n_dot_l, float n_dot_v) 
 // half the angle to d, the lobe is alpha^2 / (PI (alpha^2 + s^2)^2): even light on a sphere, projected stereographically. Of that sphere
 // the disc is a cap.
 float lobe_in_disc(vec3 d, vec3 l, float alpha, float radius) {
-    vec3 both = d + l, apart = d - l;
-    float s2 = dot(apart, apart) / max(dot(both, both), 1e-6), r = tan(0.5 * radius);
-    float beyond = alpha * alpha + s2 - r * r, both2 = 4.0 * r * r * alpha * alpha;
-    float root = sqrt(beyond * beyond + both2), less = 0.5 * both2 / (root * (root + abs(beyond)));   // without cancellation
+    vec3 sum = d + l, difference = d - l;
+    float s2 = dot(difference, difference) / max(dot(sum, sum), 1e-6), r = tan(0.5 * radius);
+    float beyond = alpha * alpha + s2 - r * r, cross_term = 4.0 * r * r * alpha * alpha;
+    float root = sqrt(beyond * beyond + cross_term), less = 0.5 * cross_term / (root * (root + abs(beyond)));   // without cancellation
     return beyond > 0.0 ? less : 1.0 - less;
 }
 

@@ -11,15 +11,15 @@ layout(std430) writeonly buffer Cleared7 { uint cleared_7[]; };
 uniform ivec4 word_counts;
 uniform ivec4 more_word_counts;   // of the last four
 
-// By an invocation of as many as lie `apart`.
-void clear_starts(uint first, uint apart) {
+// Called by each of `stride` invocations, numbered by `first`.
+void clear_starts(uint first, uint stride) {
     uvec4 counts = uvec4(word_counts), more = uvec4(more_word_counts);
-    for (uint i = first; i < counts.x; i += apart) cleared[i] = 0u;
-    for (uint i = first; i < counts.y; i += apart) cleared_1[i] = 0u;
-    for (uint i = first; i < counts.z; i += apart) cleared_2[i] = 0u;
-    for (uint i = first; i < counts.w; i += apart) cleared_3[i] = 0u;
-    for (uint i = first; i < more.x; i += apart) cleared_4[i] = 0u;
-    for (uint i = first; i < more.y; i += apart) cleared_5[i] = 0u;
-    for (uint i = first; i < more.z; i += apart) cleared_6[i] = 0u;
-    for (uint i = first; i < more.w; i += apart) cleared_7[i] = 0u;
+    for (uint i = first; i < counts.x; i += stride) cleared[i] = 0u;
+    for (uint i = first; i < counts.y; i += stride) cleared_1[i] = 0u;
+    for (uint i = first; i < counts.z; i += stride) cleared_2[i] = 0u;
+    for (uint i = first; i < counts.w; i += stride) cleared_3[i] = 0u;
+    for (uint i = first; i < more.x; i += stride) cleared_4[i] = 0u;
+    for (uint i = first; i < more.y; i += stride) cleared_5[i] = 0u;
+    for (uint i = first; i < more.z; i += stride) cleared_6[i] = 0u;
+    for (uint i = first; i < more.w; i += stride) cleared_7[i] = 0u;
 }

@@ -15,12 +15,12 @@ vec3 interpolated(ivec2 texel, SurfacePoint s) {
     vec3 sum = vec3(0.0);
     for (int j = 0; j < 16; ++j) {
         ivec2 o = ivec2(j & 3, j >> 2) - 1, point = clamp(base + o, ivec2(0), last);
-        vec2 apart = abs(vec2(o) - f);
+        vec2 offset = abs(vec2(o) - f);
         vec4 change = texelFetch(lattice_change, point, 0);
         if (change.a == 0.0) continue;
         ivec2 pixel = texelFetch(lattice_pixels, point, 0).xy;
         vec3 sp = texelFetch(real_surface_position, pixel, 0).xyz, sn = texelFetch(real_surface_normal, pixel, 0).xyz;
-        float w = (2.0 - apart.x) * (2.0 - apart.y) + 1e-3;
+        float w = (2.0 - offset.x) * (2.0 - offset.y) + 1e-3;
         w *= continuation(s.position, s.normal, sp, sn, size) + 1e-4;
         sum += w * change.rgb;
         total += w;

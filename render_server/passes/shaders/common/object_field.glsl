@@ -56,6 +56,6 @@ vec4 field_sample(sampler3D field, ShellPlace place, int slabs, int slab) {
 float above_horizon(vec3 q, vec3 n) {
     vec3 direction = field_centre - q;
     float height = dot(n, direction) + dot(abs(n), object_half);
-    float apart = length(max(abs(direction) - object_half, vec3(0.0)));
-    return clamp(height / max(LOW * apart, 1e-3 * object_radius), 0.0, 1.0);
+    float distance_to_box = length(max(abs(direction) - object_half, vec3(0.0)));
+    return clamp(height / max(LOW * distance_to_box, 1e-3 * object_radius), 0.0, 1.0);
 }

@@ -45,10 +45,10 @@ bool object_may_block_sphere(Light light, vec3 p, float radius, float bias) {
         if (deepest - bias <= view.range.x) continue;
         vec2 s = lateral(view, v);
         bool straight = view.range.z > 0.5;
-        float apart = straight ? radius : radius * (1.0 + length(s)) / max(nearest, 1e-6);
+        float footprint = straight ? radius : radius * (1.0 + length(s)) / max(nearest, 1e-6);
         float texel = 2.0 * view.tile.w / view.tile.z, reach = light.shape.x * drift(view, deepest, view.range.x);
         found = (!straight && nearest <= 0.0)
-            || texels_to_caster(view, s) <= (reach + apart) / texel + COMPARED_TEXELS + 2.0 * sqrt(2.0) * CASTER_CELL;
+            || texels_to_caster(view, s) <= (reach + footprint) / texel + COMPARED_TEXELS + 2.0 * sqrt(2.0) * CASTER_CELL;
     } while (++j < end && !found);
     return found;
 }

@@ -110,7 +110,7 @@ void add_disc_blockers(sampler2D map, LightExtent k, LightView view, Receiver r,
     float limit = map_depth(view, r.depth) + slope * 0.5 / texels;   // a shift counts beyond half a texel
     vec2 low = view.tile.xy, high = low + view.tile.z, centre = low + 0.5 * view.tile.z + texels * r.s;
     vec2 turn = vec2(cos(GOLDEN_ANGLE), sin(GOLDEN_ANGLE)), direction = vec2(1.0, 0.0);
-    float apart = widest / float(count), shift = 0.5 * apart;
+    float spacing = widest / float(count), shift = 0.5 * spacing;
     int j = 0;
     if (count > 0) do {
         vec2 t = centre + texels * shift * direction;
@@ -118,7 +118,7 @@ void add_disc_blockers(sampler2D map, LightExtent k, LightView view, Receiver r,
         bool in_tile = all(greaterThanEqual(t, low)) && all(lessThan(t, high));
         if (in_tile && d < min(nearer, limit - slope * shift)) add_blocker(linear_depth(view, d), found);
         direction = vec2(direction.x * turn.x - direction.y * turn.y, direction.x * turn.y + direction.y * turn.x);
-        shift += apart;
+        shift += spacing;
     } while (++j < count);
 }
 

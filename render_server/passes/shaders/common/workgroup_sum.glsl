@@ -4,8 +4,8 @@ shared vec2 workgroup_parts[THREADS];
 vec2 workgroup_sum(vec2 own, int thread) {
     workgroup_parts[thread] = own;
     barrier();
-    for (int apart = THREADS / 2; apart > 0; apart /= 2) {
-        if (thread < apart) workgroup_parts[thread] += workgroup_parts[thread + apart];
+    for (int stride = THREADS / 2; stride > 0; stride /= 2) {
+        if (thread < stride) workgroup_parts[thread] += workgroup_parts[thread + stride];
         barrier();
     }
     return workgroup_parts[0];
