@@ -70,13 +70,18 @@ struct Walk {
 
 #ifdef TWO_SIDED_STARTS
 const float OWN_REACH = 2.0;   // voxels in front of a surface where samples still meet it
-vec3 two_sided_normal = vec3(0.0);   // of the surface where marches start, if it has two sides: both are in its voxels
+// Of the surface where marches start: its normal, and whether it has two sides, so that both are in its voxels. A normal of none
+// in place of the latter would take registers of its own.
+vec3 start_normal = vec3(0.0);
+bool starts_two_sided = false;
 
-void start_on(vec3 n, bool two_sided) { two_sided_normal = two_sided ? n : vec3(0.0); }
+void start_on(vec3 n, bool two_sided) {
+    start_normal = n;
+    starts_two_sided = two_sided;
+}
 
 void clear_own_surface(inout Walk w) {
-    float rise = dot(two_sided_normal, w.slope);
-    if (two_sided_normal != vec3(0.0)) w.clear = int(ceil(w.first + OWN_REACH / max(rise, 1e-3)));
+    if (starts_two_sided) w.clear = int(ceil(w.first + OWN_REACH / max(dot(start_normal, w.slope), 1e-3)));
 }
 #else
 void clear_own_surface(inout Walk w) {}
