@@ -38,7 +38,7 @@ class DashboardHook(BuildHookInterface):
 
 
 def fingerprint() -> str:
-    """Return a hash of the names and contents of the dashboard's sources."""
+    """Returns a hash of the names and contents of the dashboard's sources."""
     digest = hashlib.sha256()
     for path in sorted(_sources()):
         digest.update(f"{path.relative_to(DASHBOARD).as_posix()}\0".encode())

@@ -25,7 +25,7 @@ Record = dict[str, Any]
 
 
 def main() -> None:
-    """Print what is known of the packages; exit code 1: something is, 2: the database cannot be read."""
+    """Prints what is known of the packages; exit code 1: something is, 2: the database cannot be read."""
     listed = runpy.run_path(str(Path(__file__).with_name("sbom.py")))["bill"]()["components"]
     components = [each for each in listed if _kind(each) in ECOSYSTEMS]
     try:
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def read_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a file, a folder or an archive, those aside that were withdrawn.
+    """Yields the records of a file, a folder or an archive, those aside that were withdrawn.
 
     Raises:
         OSError, ValueError, zipfile.BadZipFile: it cannot be read, or there is no record in it.
@@ -71,7 +71,7 @@ def _texts(path: Path) -> Iterator[bytes]:
 
 
 def weaknesses(components: list[Record], records: list[Record]) -> Iterator[str]:
-    """Yield a line for each package and each record that names its version."""
+    """Yields a line for each package and each record that names its version."""
     by_package: dict[tuple[str, str], list[tuple[Record, Record]]] = {}
     for record in records:
         for affected in record.get("affected", []):
@@ -121,12 +121,12 @@ def _place(event: Record) -> tuple[Version, bool]:
 
 
 def _kind(component: Record) -> str:
-    """Return where a package is from; images and Debian's have no version that a record could name."""
+    """Returns where a package is from; images and Debian's have no version that a record could name."""
     return str(component["purl"].removeprefix("pkg:").partition("/")[0])
 
 
 def _key(ecosystem: str, name: str) -> tuple[str, str]:
-    """Return how a package is looked up: by its name as PyPI compares names (PEP 503), else as it is."""
+    """Returns how a package is looked up: by its name as PyPI compares names (PEP 503), else as it is."""
     return ecosystem, re.sub(r"[-_.]+", "-", name).lower() if ecosystem == "PyPI" else name
 
 

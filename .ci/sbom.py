@@ -42,7 +42,7 @@ Component = dict[str, Any]
 
 
 def bill() -> dict[str, Any]:
-    """Return the bill: what runs is `required`, what only builds and tests is `excluded` (of a release)."""
+    """Returns the bill: what runs is `required`, what only builds and tests is `excluded` (of a release)."""
     listed = [
         *(each for lock in (DEVELOPMENT, NODE_JS) for each in python_components(lock, "excluded")),
         *(each for lock in (RUNTIME, *IMAGES) for each in python_components(lock, "required")),
@@ -60,7 +60,7 @@ def bill() -> dict[str, Any]:
 
 
 def own_component() -> Component:
-    """Return what the bill is of."""
+    """Returns what the bill is of."""
     text = (ROOT / "deltalight/__init__.py").read_text()
     found = re.search(r'^__version__ = "(.+)"$', text, re.MULTILINE)
     assert found is not None
@@ -69,7 +69,7 @@ def own_component() -> Component:
 
 
 def python_components(lock: str, scope: str) -> Iterator[Component]:
-    """Yield the packages of a lock file."""
+    """Yields the packages of a lock file."""
     for entry in re.split(r"\n(?=\S)", (ROOT / lock).read_text()):
         pinned = PINNED.match(entry)
         if pinned is None:
@@ -87,7 +87,7 @@ def python_components(lock: str, scope: str) -> Iterator[Component]:
 
 
 def python_licences(name: str) -> list[Component]:
-    """Return the licence that an installed package states: as an expression, a classifier or a name."""
+    """Returns the licence that an installed package states: as an expression, a classifier or a name."""
     try:
         stated = metadata(name)
     except PackageNotFoundError:
@@ -104,7 +104,7 @@ def python_licences(name: str) -> list[Component]:
 
 
 def dashboard_components() -> Iterator[Component]:
-    """Yield the packages of the dashboard; `dev` ones build it and are not in it."""
+    """Yields the packages of the dashboard; `dev` ones build it and are not in it."""
     packages = json.loads((ROOT / DASHBOARD).read_text())["packages"]
     for path, package in packages.items():
         name = path.rpartition("node_modules/")[2]
@@ -123,7 +123,7 @@ def dashboard_components() -> Iterator[Component]:
 
 
 def image_components() -> Iterator[Component]:
-    """Yield what the Dockerfile takes from elsewhere: the images that it begins with, and Debian's packages."""
+    """Yields what the Dockerfile takes from elsewhere: the images that it begins with, and Debian's packages."""
     text = (ROOT / DOCKERFILE).read_text()
     for name, tag, stage in FROM.findall(text):
         yield {

@@ -52,7 +52,7 @@ class Costs:
 
     @classmethod
     def measured(cls, results: Path = RESULTS) -> "Costs":
-        """Read the reports in `results`: starts of the soak under kills, the others of the fleet's own."""
+        """Reads the reports in `results`: starts of the soak under kills, the others of the fleet's own."""
         soak = json.loads((results / "soak-kills-llvmpipe-2cores.json").read_text())
         kills = [each["outcome"] for each in soak["faults"] if each["name"] == "kill-server"]
         warm = tuple(each["back_s"] for each in kills if each["by_spare"])
@@ -61,7 +61,7 @@ class Costs:
         return cls(warm, cold, **{each.name: own[each.name] for each in fields(cls)[2:]})
 
     def answer_for(self, rooms: int) -> float:
-        """Return the time of an answer about so many rooms, s."""
+        """Returns the time of an answer about so many rooms, s."""
         return self.answer_s + rooms * self.answer_s_per_room
 
 
@@ -130,11 +130,11 @@ class Events:
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
 
     def after(self, delay_s: float, action: Callable[[], None]) -> None:
-        """Do `action` after a delay."""
+        """Does `action` after a delay."""
         heapq.heappush(self._waiting, (self.now_s + delay_s, next(self._order), action))
 
     def run(self, until_s: float) -> None:
-        """Do everything up to a time."""
+        """Does everything up to a time."""
         while self._waiting and self._waiting[0][0] <= until_s:
             self.now_s, _, action = heapq.heappop(self._waiting)
             action()
@@ -153,7 +153,7 @@ class Servers:
     _queue: deque[tuple[float, float, Callable[[], None]]] = field(default_factory=deque)
 
     def ask(self, service_s: float, done: Callable[[], None] = lambda: None) -> None:
-        """Ask for a service of this length; `done` is called at its end."""
+        """Asks for a service of this length; `done` is called at its end."""
         self._queue.append((self.events.now_s, service_s, done))
         self._serve()
 
@@ -191,7 +191,7 @@ class Outcome:
     downtime_share: float
 
     def gap_s(self, percent: int) -> float:
-        """Return a percentile of the gaps, s; 0 without any."""
+        """Returns a percentile of the gaps, s; 0 without any."""
         return quantiles(self.gaps_s, n=100)[percent - 1] if len(self.gaps_s) > 1 else sum(self.gaps_s)
 
 
@@ -222,7 +222,7 @@ class FleetSimulation:
         self._first_start_s = 0.0
 
     def run(self, days: float) -> Outcome:
-        """Simulate and return what happened."""
+        """Simulates and returns what happened."""
         for room in range(self._fleet.rooms):
             self._want(room)
         self._fail_again("crash", self._fleet.crashes * self._fleet.rooms, self._crash)
@@ -241,7 +241,7 @@ class FleetSimulation:
         )
 
     def _fail_again(self, kind: str, per_day: float, fail: Callable[[], int]) -> None:
-        """Have failures come as a Poisson process."""
+        """Has failures come as a Poisson process."""
         if per_day <= 0:
             return
 
@@ -293,7 +293,7 @@ class FleetSimulation:
         self._place_waiting(keeper)
 
     def _place_waiting(self, keeper: int) -> None:
-        """Place a keeper's rooms on its GPUs with the fewest, as long as there are slots."""
+        """Places a keeper's rooms on its GPUs with the fewest, as long as there are slots."""
         waiting = self._waiting[keeper]
         while waiting:
             number = min(self._gpus_of[keeper], key=self._load, default=None)
@@ -342,31 +342,31 @@ class FleetSimulation:
 
 
 def directory_load(fleet: Fleet, costs: Costs) -> float:
-    """Return the fraction of a directory's one thread that web processes take which each ask five times a second."""
+    """Returns the fraction of a directory's one thread that web processes take which each ask five times a second."""
     processes = -(-fleet.rooms_of_keeper // fleet.rooms_per_web_process)
     return processes / FOLLOWER_POLL_S * costs.answer_for(fleet.rooms_of_keeper)
 
 
 def web_traffic_gbit_s(fleet: Fleet, costs: Costs) -> float:
-    """Return what a web process receives (the pictures of all rooms of its keeper) and sends, Gbit/s."""
+    """Returns what a web process receives (the pictures of all rooms of its keeper) and sends, Gbit/s."""
     pictures = fleet.rooms_of_keeper + fleet.rooms_per_web_process * fleet.viewers_per_room
     return pictures * fleet.frames_per_s * costs.picture_bytes * 8 / 1e9
 
 
 def gcs_load(fleet: Fleet, costs: Costs) -> float:
-    """Return the fraction of a core that the control process of a keeper's Ray cluster takes while nothing starts."""
+    """Returns the fraction of a core that the control process of a keeper's Ray cluster takes while idle."""
     return costs.gcs_idle_share + -(-fleet.hosts // fleet.keepers) * costs.gcs_share_per_host
 
 
 def rack_traffic_gbit_s(fleet: Fleet, costs: Costs) -> float:
-    """Return what goes through the uplink of a rack whose slots are full, both ways, Gbit/s."""
+    """Returns what goes through the uplink of a rack whose slots are full, both ways, Gbit/s."""
     rooms = fleet.hosts_per_rack * fleet.gpus_per_host * fleet.slots_per_gpu
     per_room = costs.node_frame_bytes + (1 + fleet.viewers_per_room) * costs.picture_bytes
     return rooms * fleet.frames_per_s * per_room * 8 / 1e9
 
 
 def loads(fleet: Fleet, costs: Costs) -> dict[str, float]:
-    """Return how much of each resource a fleet takes; above 1 it is exhausted."""
+    """Returns how much of each resource a fleet takes; above 1 it is exhausted."""
     directory_bits = directory_load(fleet, costs) / costs.answer_for(fleet.rooms_of_keeper)
     directory_bits *= fleet.rooms_of_keeper * costs.answer_bytes_per_room * 8
     return {
@@ -411,7 +411,7 @@ def simulate(
 
 
 def figures(outcome: Outcome) -> dict[str, str]:
-    """Return the figures of an outcome, for people."""
+    """Returns the figures of an outcome, for people."""
     waits_s = [each for each in outcome.waits_for_slot_s if each > 0]
     return {
         "start of all at once": f"{outcome.first_start_s:.1f} s",

@@ -44,29 +44,29 @@ class UnlimitedPlacer:
         self._slots: list[Slot] = []
 
     def slots(self) -> Sequence[Slot]:
-        """Return the slots in use."""
+        """Returns the slots in use."""
         return self._slots
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
-        """Invent a placement."""
+        """Invents a placement."""
         name = slot or f"slot-{len(self._slots) + 1}"
         self._slots.append(Slot(name, "EGL 0", order.room))
         endpoint = ports.endpoint(ports.PRIVATE_PORTS.start + len(self._slots))
         return Placement(order.room, order.epoch, name, endpoint, endpoint)
 
     def release(self, placement: Placement) -> None:
-        """Do nothing."""
+        """Does nothing."""
 
     def watch(self) -> Sequence[PlacementEvent]:
         """Nothing happens."""
         return []
 
     def close(self) -> None:
-        """Do nothing."""
+        """Does nothing."""
 
 
 def kept(rooms: int) -> RoomKeeper:
-    """Return a keeper of so many rooms, all of them placed."""
+    """Returns a keeper of so many rooms, all of them placed."""
     node = RoomNode(name="camera", endpoint=ports.endpoint(ports.NODE_PORT))
     plans = [RoomPlan(f"room-{number}", "", (node,), Path("unused")) for number in range(rooms)]
     keeper = RoomKeeper(plans, UnlimitedPlacer())
@@ -75,13 +75,13 @@ def kept(rooms: int) -> RoomKeeper:
 
 
 def answer(keeper: RoomKeeper) -> list[bytes]:
-    """Return an answer about all rooms as it is sent."""
+    """Returns an answer about all rooms as it is sent."""
     payload = keeper.status().model_dump(mode="json")
     return encode_control(ControlReply(node="rooms", id="fleet", ok=True, payload=payload))
 
 
 def seconds_of(work: Callable[[], object]) -> float:
-    """Return the median processor time of a call, s."""
+    """Returns the median processor time of a call, s."""
     taken_s = []
     for _ in range(TIMES):
         began_s = time.thread_time()
@@ -91,7 +91,7 @@ def seconds_of(work: Callable[[], object]) -> float:
 
 
 def web_process(rooms: int) -> dict[str, float]:
-    """Return what a web process of so many rooms takes that show nothing: threads, files, and fraction of a core."""
+    """Returns what a web process of so many rooms takes that show nothing: threads, files, and fraction of a core."""
     page, number = ports.private_ports(2)
     directory = ports.endpoint(number)
     words = ["api", "--config", os.devnull, "--port", str(page), "--rooms", directory]
@@ -113,7 +113,7 @@ def web_process(rooms: int) -> dict[str, float]:
 
 
 def _wait_until_started(process_id: int) -> None:
-    """Wait until a process starts no more threads."""
+    """Waits until a process starts no more threads."""
     before, threads = -1, _threads(process_id)
     while threads != before:
         time.sleep(WEB_S)
@@ -125,13 +125,13 @@ def _threads(process_id: int) -> int:
 
 
 def measure_web() -> dict[str, float]:
-    """Return what a room costs a web process that follows it, without pictures."""
+    """Returns what a room costs a web process that follows it, without pictures."""
     one, most = web_process(1), web_process(MAX_ROOMS)
     return {f"web_{key}_per_room": (most[key] - one[key]) / (MAX_ROOMS - 1) for key in one}
 
 
 def measure() -> dict[str, float]:
-    """Measure and return the costs."""
+    """Measures and returns the costs."""
     keepers = {rooms: kept(rooms) for rooms in ROOMS}
     taken_s = [seconds_of(lambda keeper=keeper: answer(keeper)) for keeper in keepers.values()]  # type: ignore[misc]
     per_room_s, fixed_s = np.polyfit(ROOMS, taken_s, 1)

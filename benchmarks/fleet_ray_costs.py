@@ -33,23 +33,23 @@ class ControlPlane:
         self._port = cluster.address.rpartition(":")[2]
 
     def cpu_s(self) -> float:
-        """Return the processor time that it has taken, s."""
+        """Returns the processor time that it has taken, s."""
         return processor_time_s(self._process_id)
 
     def traffic_bytes(self) -> int:
-        """Return what its open connections have sent and received."""
+        """Returns what its open connections have sent and received."""
         command = ["ss", "-tinH", f"sport = :{self._port}"]
         shown = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         return sum(int(count) for count in COUNTERS.findall(shown))
 
     def add_hosts(self, count: int) -> None:
-        """Start more hosts that do nothing."""
+        """Starts more hosts that do nothing."""
         for _ in range(count):
             self._cluster.add_node(**HOST)
         self._cluster.wait_for_nodes()
 
     def idle(self) -> tuple[float, float]:
-        """Return the fraction of a core, and the bytes a second, while nothing happens."""
+        """Returns the fraction of a core, and the bytes a second, while nothing happens."""
         time.sleep(SETTLING_S)
         began_s, before_s, before_bytes = time.monotonic(), self.cpu_s(), self.traffic_bytes()
         time.sleep(IDLE_S)
@@ -57,7 +57,7 @@ class ControlPlane:
         return (self.cpu_s() - before_s) / elapsed_s, (self.traffic_bytes() - before_bytes) / elapsed_s
 
     def per_actor_s(self) -> tuple[float, float]:
-        """Return its processor time for a detached actor that does nothing, s, and the time until it answers, s."""
+        """Returns its processor time for a detached actor that does nothing, s, and the time until it answers, s."""
         remote = self._ray.remote(num_cpus=0, lifetime="detached")(IdleActor).remote
         began_s, before_s = time.monotonic(), self.cpu_s()
         actors = [remote() for _ in range(ACTORS)]
@@ -72,12 +72,12 @@ class IdleActor:
     """An actor that does nothing."""
 
     def answer(self) -> None:
-        """Do nothing."""
+        """Does nothing."""
 
 
 @contextmanager
 def control_plane() -> Iterator[ControlPlane]:
-    """Run a cluster of one host."""
+    """Runs a cluster of one host."""
     os.environ.update(LOOPBACK_ONLY | NO_STATISTICS)
     import ray
     from ray.cluster_utils import Cluster
@@ -93,7 +93,7 @@ def control_plane() -> Iterator[ControlPlane]:
 
 
 def measure_ray() -> dict[str, float]:
-    """Measure and return the costs of Ray's control plane."""
+    """Measures and returns the costs of Ray's control plane."""
     with control_plane() as plane:
         alone_load, alone_bytes = plane.idle()
         plane.add_hosts(MORE_HOSTS)

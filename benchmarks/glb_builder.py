@@ -20,20 +20,20 @@ class GlbBuilder:
         self._binary = b""
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """Append to a top-level list of the document; return the index there."""
+        """Appends to a top-level list of the document; returns the index there."""
         entries = self.document.setdefault(kind, [])
         entries.append(entry)
         return len(entries) - 1
 
     def view(self, values: Shaped[np.ndarray, "..."]) -> int:
-        """Store an array; return the index of its buffer view."""
+        """Stores an array; returns the index of its buffer view."""
         data = np.ascontiguousarray(values).tobytes()
         view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": len(data)}
         self._binary += data + bytes(-len(data) % 4)
         return self.add("bufferViews", view)
 
     def described(self, values: Shaped[np.ndarray, "n ..."]) -> dict[str, Any]:
-        """Return an accessor's description of an array, its extent included."""
+        """Returns an accessor's description of an array, its extent included."""
         rows = values.reshape(len(values), -1)
         return {
             "componentType": _COMPONENT_TYPES[values.dtype.str[1:]],
@@ -44,12 +44,12 @@ class GlbBuilder:
         }
 
     def array(self, values: Shaped[np.ndarray, "n ..."], *, normalized: bool = False) -> int:
-        """Store rows of numbers; return the index of their accessor."""
+        """Stores rows of numbers; returns the index of their accessor."""
         entry = {"bufferView": self.view(values), **self.described(values)}
         return self.add("accessors", {**entry, "normalized": True} if normalized else entry)
 
     def floats(self, values: Any) -> int:  # noqa: ANN401 - whatever numpy takes
-        """Store rows of numbers as float32; return the index of their accessor."""
+        """Stores rows of numbers as float32; returns the index of their accessor."""
         return self.array(np.array(values, np.float32))
 
     def track(  # noqa: PLR0917 - a channel in one line
@@ -61,21 +61,21 @@ class GlbBuilder:
         values: Any,  # noqa: ANN401 - whatever numpy takes
         interpolation: str = "LINEAR",
     ) -> None:
-        """Append a channel with its sampler to a clip; `times` is an accessor."""
+        """Appends a channel with its sampler to a clip; `times` is an accessor."""
         sampler = {"input": times, "output": self.floats(values), "interpolation": interpolation}
         clip.setdefault("samplers", []).append(sampler)
         channel = {"sampler": len(clip["samplers"]) - 1, "target": {"node": node, "path": path}}
         clip.setdefault("channels", []).append(channel)
 
     def data(self) -> bytes:
-        """Return the file's bytes."""
+        """Returns the file's bytes."""
         document = {**self.document, "buffers": [{"byteLength": len(self._binary)}]}
         text = json.dumps(document, separators=(",", ":")).encode()
         chunks = _chunk(_JSON_CHUNK, text + b" " * (-len(text) % 4)) + _chunk(_BIN_CHUNK, self._binary)
         return b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks
 
     def write(self, path: Path) -> Path:
-        """Write the file; return its path."""
+        """Writes the file; returns its path."""
         path.write_bytes(self.data())
         return path
 

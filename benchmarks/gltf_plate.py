@@ -37,7 +37,7 @@ class Plate:
         sampler: dict[str, Any] | None = None,
         **info: Any,  # noqa: ANN401 - whatever a `textureInfo` holds
     ) -> dict[str, Any]:
-        """Store a picture (h, w, 3 or 4; R G B A bytes) as PNG; return the `textureInfo` of a material."""
+        """Stores a picture (h, w, 3 or 4; R G B A bytes) as PNG; returns the `textureInfo` of a material."""
         order = cv2.COLOR_RGB2BGR if codes.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
         data = cv2.imencode(".png", cv2.cvtColor(np.asarray(codes, np.uint8), order))[1]
         return self.encoded(data.tobytes(), sampler, **info)
@@ -49,7 +49,7 @@ class Plate:
         mime: str = "image/png",
         **info: Any,  # noqa: ANN401 - as above
     ) -> dict[str, Any]:
-        """Store the bytes of a picture file; return the `textureInfo` of a material."""
+        """Stores the bytes of a picture file; returns the `textureInfo` of a material."""
         view = self.glb.view(np.frombuffer(data, np.uint8))
         texture = {"source": self.glb.add("images", {"bufferView": view, "mimeType": mime})}
         if sampler is not None:
@@ -57,7 +57,7 @@ class Plate:
         return {"index": self.glb.add("textures", texture), **info}
 
     def write(self, path: Path, node: dict[str, Any] | None = None) -> Path:
-        """Write the file; `node`: the plate's transform."""
+        """Writes the file; `node`: the plate's transform."""
         indices = self.glb.array(np.array([0, 1, 2, 0, 2, 3], np.uint16))
         part = {"attributes": self.attributes, "indices": indices, "material": 0}
         self.glb.add("materials", self.material)
@@ -66,5 +66,5 @@ class Plate:
 
 
 def even(*code: int, size: int = 4) -> UInt8[np.ndarray, "h w c"]:
-    """Return a picture of one colour."""
+    """Returns a picture of one colour."""
     return np.full((size, size, len(code)), code, np.uint8)

@@ -177,7 +177,7 @@ def main(
     out: Annotated[Path, typer.Argument(help="Folder of the pictures.")],
     names: Annotated[list[str] | None, typer.Argument(help="Models to draw; all, if none is named.")] = None,
 ) -> None:
-    """Draw Khronos' sample models beside the screenshots of their authors."""
+    """Draws Khronos' sample models beside the screenshots of their authors."""
     try:
         write_pairs(folder, out, names or ())
     except DeltalightError as error:

@@ -75,7 +75,7 @@ class Seen:
 
 
 def relit_pictures() -> list[Relit]:
-    """Render the demo's recording.
+    """Renders the demo's recording.
 
     Raises:
         DeltalightError: the recording is not there, or no OpenGL.
@@ -112,7 +112,7 @@ def _rows(pose: Float64[np.ndarray, "4 4"] | None) -> tuple[Row, Row, Row, Row] 
 
 
 def coded(relit: Sequence[Relit], size: tuple[int, int], motion: str) -> list[tuple[CompositeMessage, bytes]]:
-    """Return the messages and JPEGs of a motion, to be repeated without a jump."""
+    """Returns the messages and JPEGs of a motion, to be repeated without a jump."""
     chosen = [*relit, *relit[-2:0:-1]] if motion == "moving" else [relit[0]] * len(relit)
     dice = np.random.default_rng(1)
     made = []
@@ -138,7 +138,7 @@ class Matched:
     decoded_ns: dict[bytes, int] = field(default_factory=dict)
 
     def delays_ms(self) -> list[float]:
-        """Return the delays of the pictures that both got."""
+        """Returns the delays of the pictures that both got."""
         both = self.captured_ns.keys() & self.decoded_ns.keys()
         return [(self.decoded_ns[unit] - self.captured_ns[unit]) / 1e6 for unit in both]
 
@@ -149,7 +149,7 @@ def _unit(data: bytes) -> bytes:
 
 @contextmanager
 def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) -> Iterator[None]:
-    """Publish pictures in turn, at the recording's rate, as captured at that moment."""
+    """Publishes pictures in turn, at the recording's rate, as captured at that moment."""
     stop = threading.Event()
 
     def run() -> None:
@@ -175,7 +175,7 @@ def publishing(port: int, pictures: Sequence[tuple[CompositeMessage, bytes]]) ->
 
 @contextmanager
 def web_process(stream_port: int) -> Iterator[httpx.Client]:
-    """Run a web process that listens to a port; a client of its API.
+    """Runs a web process that listens to a port; a client of its API.
 
     Raises:
         DeltalightError: it does not answer.
@@ -238,7 +238,7 @@ def _decode(h264: H264Decoder, header: LiveHeader, content: bytes) -> None:
 
 
 async def _watch(address: str, seen: Seen, measures: asyncio.Event, matched: Matched | None) -> None:
-    """Watch by WHEP; the one with `matched` decodes, and notes there when."""
+    """Watches by WHEP; the one with `matched` decodes, and notes there when."""
     from av import CodecContext, Packet
 
     from deltalight.benchmarks.whep_viewer import WhepViewer
@@ -266,7 +266,7 @@ async def _watch(address: str, seen: Seen, measures: asyncio.Event, matched: Mat
 
 
 async def _note_captures(address: str, matched: Matched) -> None:
-    """Note when each picture in H.264 was captured."""
+    """Notes when each picture in H.264 was captured."""
     from websockets.asyncio.client import connect
 
     header = None
@@ -281,7 +281,7 @@ async def _note_captures(address: str, matched: Matched) -> None:
 
 
 async def _crowd(client: httpx.Client, way: str, viewers: int, seconds: float) -> tuple[Seen, float]:
-    """Return what viewers got together, and the web process's fraction of a core."""
+    """Returns what viewers got together, and the web process's fraction of a core."""
     base = str(client.base_url).rstrip("/")
     socket, whep = base.replace("http", "ws", 1) + "/live", f"{base}/whep"
     seen, measures, matched = Seen(), asyncio.Event(), Matched()
@@ -311,7 +311,7 @@ async def _crowd(client: httpx.Client, way: str, viewers: int, seconds: float) -
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=6.0, help="Of each measurement.")
     seconds = parser.parse_args().seconds

@@ -40,7 +40,7 @@ Views = dict[float, tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w
 
 
 def render_views(mesh_folder: Path, spp: int, progress: Progress) -> Views:
-    """Render colour and depth without noise for each different pose of the take, by the camera's x coordinate."""
+    """Renders colour and depth without noise for each different pose of the take, by the camera's x coordinate."""
     room = RoomRenderer(scene_demo.mitsuba_scene(mesh_folder, with_object=False), scene_demo.CAMERA)
     poses = {_pose_key(frame): scene_demo.world_from_camera(frame) for frame in range(scene_demo.FRAME_COUNT)}
     views: Views = {}
@@ -51,14 +51,14 @@ def render_views(mesh_folder: Path, spp: int, progress: Progress) -> Views:
 
 
 def _pose_key(frame: int) -> float:
-    """Return a key of the pose: the swing returns along its own path, so most poses occur twice."""
+    """Returns a key of the pose: the swing returns along its own path, so most poses occur twice."""
     return round(float(scene_demo.world_from_camera(frame)[0, 3]), 9)
 
 
 def sensor_frame(
     frame: int, color: Float32[np.ndarray, "h w 3"], depth_m: Float32[np.ndarray, "h w"]
 ) -> SensorFrame:
-    """Return one frame as the sensors deliver it; noise depends only on the frame's number."""
+    """Returns one frame as the sensors deliver it; noise depends only on the frame's number."""
     rng = np.random.default_rng([SEED, frame])
     jpeg = encode_color(ColorSensor().expose(color, rng), "jpeg", JPEG_QUALITY)
     stereo = StereoDepthSensor()
@@ -77,7 +77,7 @@ def sensor_frame(
 
 
 def write_demo(out: Path, spp: int, progress: Progress) -> None:
-    """Write the demo's files into `out`, replacing older ones when all are complete."""
+    """Writes the demo's files into `out`, replacing older ones when all are complete."""
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out, prefix=".making-") as folder:
         made = Path(folder)
@@ -97,12 +97,12 @@ def write_demo(out: Path, spp: int, progress: Progress) -> None:
 
 
 def facts_by_digest(mesh: Path) -> dict[str, Facts]:
-    """Return what `storage.assets` need not find out again: the facts of a mesh file, by the hash of its content."""
+    """Returns what `storage.assets` need not find out again: the facts of a mesh file, by the hash of its content."""
     return {sha256(mesh.read_bytes()).hexdigest(): mesh_facts(mesh)}
 
 
 def write_truth(out: Path, spp: int, progress: Progress) -> None:
-    """Write the first frame without noise: {without,with}.png (sRGB) and .npy (linear camera units)."""
+    """Writes the first frame without noise: {without,with}.png (sRGB) and .npy (linear camera units)."""
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for name in progress.track(("without", "with"), description="rendering truth"):
@@ -119,7 +119,7 @@ def main(
     truth: Annotated[Path | None, typer.Option(help="Folder for noise-free pictures of frame 0.")] = None,
     truth_spp: Annotated[int, typer.Option(min=1, help="Light paths per pixel of these.")] = 1024,
 ) -> None:
-    """Render the demo recording and its virtual object."""
+    """Renders the demo recording and its virtual object."""
     try:
         variant = choose_variant()
         with Progress() as progress:

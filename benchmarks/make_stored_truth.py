@@ -32,7 +32,7 @@ LEFT_OUT = ("fisheye", "truth")
 
 
 def pack(truth: Truth, file: Path, psnr_db: Mapping[str, float]) -> None:
-    """Write the frame, its scene and what it is compared with into a file, the same bytes each time."""
+    """Writes the frame, its scene and what it is compared with into a file, the same bytes each time."""
     frame = truth.frame(0)
     regions = find_regions(frame.without, frame.with_objects, frame.cover)
     parts = {
@@ -50,7 +50,7 @@ def pack(truth: Truth, file: Path, psnr_db: Mapping[str, float]) -> None:
 
 
 def main() -> None:
-    """Write the file twice: to measure by it, and with what was measured."""
+    """Writes the file twice: to measure by it, and with what was measured."""
     with Progress() as progress:
         truth = ensure_truth(scene_named(SCENE), size=SIZE, spp=SPP, progress=progress)
     pack(truth, FILE, {})

@@ -32,7 +32,7 @@ COUNTS = (4, 16)
 
 
 def room(size: int) -> HemisphereMap:
-    """Return a room with three windows and a lamp, seen from below, with noise: peaks spread over most of the map."""
+    """Returns a room with three windows and a lamp from below, with noise: peaks spread over most of the map."""
     rng = np.random.default_rng(4)
     directions = texel_directions(size)
     radiance = np.full((size, size, 3), 0.2, np.float32) + 0.05 * rng.random((size, size, 3), np.float32)
@@ -48,7 +48,7 @@ def room(size: int) -> HemisphereMap:
 
 
 def median_ms(work: Callable[[], object]) -> float:
-    """Return the median time of a call, ms, without the first one, which fills caches."""
+    """Returns the median time of a call, ms, without the first one, which fills caches."""
     work()
     times = []
     for _ in range(ROUNDS):
@@ -59,7 +59,7 @@ def median_ms(work: Callable[[], object]) -> float:
 
 
 def message(split: Split[HemisphereMap]) -> list[bytes]:
-    """Return the message in which a node publishes a split."""
+    """Returns the message in which a node publishes a split."""
     sky, tracker = to_world(split.residual, RESIDUAL_SIZE), LightTracker(0.0)
     tracker.set_target(0, split.lights, sky.filled())
     assert tracker.residual is not None
@@ -70,14 +70,14 @@ def message(split: Split[HemisphereMap]) -> list[bytes]:
 
 
 def taken(multipart: list[bytes]) -> SkyLights:
-    """Return the lights that a server takes from a message."""
+    """Returns the lights that a server takes from a message."""
     header, parts = decode(multipart)
     assert isinstance(header, LightsMessage)
     return sky_lights(header, parts)
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     cv2.setNumThreads(1)
     table = Table(title="fish-eye picture to lights, median ms")
     table.add_column("hemisphere")

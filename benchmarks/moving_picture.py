@@ -23,7 +23,7 @@ QUALITY = 70
 
 
 def moving_picture(pictures: int) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Render pictures from the whole recording; the line goes across and back once."""
+    """Renders pictures from the whole recording; the line goes across and back once."""
     take = dl.open(RECORDING)
     assert isinstance(take, dl.Take)
     scene = take.scene
@@ -47,7 +47,7 @@ def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
 
 
 def main() -> None:
-    """Write the picture."""
+    """Writes the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="File to write, NAME.webp.")
     parser.add_argument("--pictures", type=int, default=PICTURES, help="How many pictures it has.")

@@ -62,7 +62,7 @@ class _Times:
 
 
 def measure_node(size: tuple[int, int], rounds: int, say: Callable[[str], None]) -> NodeReport:
-    """Measure frames of the demo at a size (width, height), each `rounds` times.
+    """Measures frames of the demo at a size (width, height), each `rounds` times.
 
     Raises:
         DeltalightError: the demo's recording is missing.
@@ -102,7 +102,7 @@ def _measured(source: RecordingReader, frames: Sequence[int], rounds: int) -> di
 
 
 def run_node_costs(size: tuple[int, int], rounds: int, *, out: Path | None, as_json: bool) -> None:
-    """Measure, write the report to `out` if given, and print it."""
+    """Measures, writes the report to `out` if given, and prints it."""
     report = measure_node(size, rounds, lambda text: Console(stderr=True).print(text))
     put_report(
         report.model_dump_json(indent=2), lambda: Console().print(_table(report)), out=out, as_json=as_json

@@ -39,7 +39,7 @@ BOARD_YAML = (
 
 
 def read_camera(path: Path, width: int, height: int) -> CameraModel:
-    """Return the intrinsics of the authors' OpenCV XML file."""
+    """Returns the intrinsics of the authors' OpenCV XML file."""
     root = ElementTree.parse(path).getroot()
     values = {
         name: np.array((root.findtext(f"{name}/data") or "").split(), float)
@@ -49,7 +49,7 @@ def read_camera(path: Path, width: int, height: int) -> CameraModel:
 
 
 def read_light_direction(path: Path) -> Float64[np.ndarray, "3"]:
-    """Return the direction of travel in the optical frame.
+    """Returns the direction of travel in the optical frame.
 
     The file's camera space is left-handed, y up, z forward.
     """
@@ -60,13 +60,13 @@ def read_light_direction(path: Path) -> Float64[np.ndarray, "3"]:
 
 
 def _settings(path: Path) -> ElementTree.Element:
-    """Parse the settings file, which has several roots, by wrapping them in one."""
+    """Parses the settings file, which has several roots, by wrapping them in one."""
     text = path.read_text().split("?>", 1)[-1]
     return ElementTree.fromstring(f"<settings>{text}</settings>")
 
 
 def scene_document(direction: Float64[np.ndarray, "3"], asset: Path) -> dict[str, Any]:
-    """Return table from a model, Buddha on the marker, window light and ambient, registered by the marker's paper."""
+    """Returns table from a model, Buddha on the marker, window and ambient light, registered by its paper."""
     mesh = trimesh.load(asset, force="mesh", process=False)
     low, high = mesh.bounds[:, 1]
     scale = BUDDHA_HEIGHT_M / float(high - low)
@@ -100,7 +100,7 @@ def scene_document(direction: Float64[np.ndarray, "3"], asset: Path) -> dict[str
 
 
 def write_scene(source: Path, out: Path) -> None:
-    """Write dataset folder, table model and scene document into `out`.
+    """Writes dataset folder, table model and scene document into `out`.
 
     Raises:
         DeltalightError: a file of the authors' data is missing, or the marker is not found.
@@ -130,7 +130,7 @@ def write_scene(source: Path, out: Path) -> None:
 
 
 def _board(marker: Path, out: Path) -> BoardSpec:
-    """Return the one-marker board; its code is read from the authors' picture."""
+    """Returns the one-marker board; its code is read from the authors' picture."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "marker.png").write_bytes(marker.read_bytes())
     (out / "board.yaml").write_text(BOARD_YAML)
@@ -141,7 +141,7 @@ def main(
     source: Annotated[Path, typer.Argument(help="The `data` folder of the Dirtchamber release.")],
     out: Annotated[Path, typer.Argument(help="Folder to make.")],
 ) -> None:
-    """Make the papers' scene ready for `deltalight render`."""
+    """Makes the papers' scene ready for `deltalight render`."""
     try:
         write_scene(source, out)
     except DeltalightError as error:

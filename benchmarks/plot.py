@@ -80,7 +80,7 @@ class Plot:
 
 
 def read_plot(speed: Sequence[Path], quality: Sequence[Path], motion: str) -> Plot:
-    """Join reports by the methods' names; of a method that several reports of one kind hold, the first counts.
+    """Joins reports by the methods' names; of a method that several reports of one kind hold, the first counts.
 
     Raises:
         DeltalightError: a file is no such report, the reports of speed differ in machine or picture size, those of
@@ -148,7 +148,7 @@ def _captions(speed: SpeedReport, quality: _Means, motion: str) -> list[str]:
 
 
 def draw_plot(plot: Plot) -> str:
-    """Draw the points as text of an SVG file; lines join the tiers of a method."""
+    """Draws the points as text of an SVG file; lines join the tiers of a method."""
     svg = new_svg("Speed against quality", SIZE)
     text(svg, (LEFT, 30), "Speed against quality", 20, INK, bold=True)
     for number, line in enumerate(plot.lines):
@@ -261,7 +261,7 @@ def _draw_legend(svg: ElementTree.Element, tiers: Sequence[str]) -> None:
 def place_labels(
     points: Sequence[Point], labels: Sequence[str], lines: Sequence[tuple[Point, Point]] = ()
 ) -> list[Box]:
-    """Find a box for each label, near its point, that meets no other label, marker or line, and stays in the field.
+    """Finds a box for each label, near its point, that meets no other label, marker or line, and stays in the field.
 
     Greedy: the first free place, outwards. Where there is none, which takes more labels than the field holds, a label
     stands beside its point.

@@ -23,7 +23,7 @@ REPEATS = 9
 
 
 def skinned_ball(path: Path, subdivisions: int) -> Path:
-    """Write a ball of 0.1 m radius whose joints drift."""
+    """Writes a ball of 0.1 m radius whose joints drift."""
     mesh = trimesh.creation.icosphere(subdivisions, 0.1)
     count = len(mesh.vertices)
     random, glb = np.random.default_rng(0), GlbBuilder()
@@ -47,7 +47,7 @@ def skinned_ball(path: Path, subdivisions: int) -> Path:
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the least processor time, ms (other work on the machine only adds to it), and the result."""
+    """Returns the least processor time, ms (other work on the machine only adds to it), and the result."""
     spent = []
     for _ in range(REPEATS):
         start = time.thread_time()
@@ -57,7 +57,7 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def row(path: Path) -> str:
-    """Return one line of the table."""
+    """Returns one line of the table."""
     asset = load_gltf(path)
     clip = asset.clips[0]
     pose_ms, meshes = timed(lambda: asset.meshes(asset.pose(clip, 0.3)))
@@ -69,7 +69,7 @@ def row(path: Path) -> str:
 
 
 def main() -> None:
-    """Print the table."""
+    """Prints the table."""
     print("vertices triangles    pose ms   place ms   merge ms")
     with tempfile.TemporaryDirectory() as folder:
         for subdivisions in (3, 4, 5, 6, 7):

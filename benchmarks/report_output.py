@@ -7,7 +7,7 @@ from deltalight.protocol.files import write_bytes
 
 
 def put_report(json_text: str, show: Callable[[], object], *, out: Path | None, as_json: bool) -> None:
-    """Write a report to `out` if given, and print it: as JSON, or by `show`."""
+    """Writes a report to `out` if given, and prints it: as JSON, or by `show`."""
     if out is not None:
         write_bytes(out, json_text.encode())
     if as_json:

@@ -37,7 +37,7 @@ TEXT_SUFFIXES = (".js", ".css", ".html", ".svg")  # fonts are compressed already
 
 
 def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | None) -> dict[str, Any]:
-    """Measure requests, viewers and the page's size; each measurement takes `seconds`.
+    """Measures requests, viewers and the page's size; each measurement takes `seconds`.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a process that died for good.
@@ -63,7 +63,7 @@ def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | 
 def _running(
     size: tuple[int, int] | None, device: int | None, *, with_rendering: bool
 ) -> Iterator[tuple[httpx.Client, Supervisor]]:
-    """Start the demo's processes, or the web process alone, with a data folder of their own; a client of the API."""
+    """Starts the demo's processes, or the web process alone, with a data folder of their own; a client of the API."""
     scene = with_output(demo_scene("dvct"), size, None)
     with TemporaryDirectory(prefix="deltalight-bench-") as folder:
         data = Path(folder)
@@ -90,7 +90,7 @@ def _wait_for_pictures(client: httpx.Client, supervisor: Supervisor) -> None:
 
 
 def _requests(client: httpx.Client, seconds: float, mark: Callable[[httpx.Client], Sample]) -> dict[str, Any]:
-    """Read four times, then move the shown scene's object once, repeatedly; count pictures between two marks."""
+    """Reads four times, then moves the shown scene's object once, repeatedly; counts pictures between two marks."""
     scene = client.get("/active-scene").raise_for_status().json()
     path, thing = f"/scenes/{scene['id']}", scene["document"]["objects"][0]
     x, y, z = thing["pose"]["translation_m"]
@@ -109,7 +109,7 @@ def _requests(client: httpx.Client, seconds: float, mark: Callable[[httpx.Client
 
 
 def _viewers(client: httpx.Client, seconds: float) -> dict[str, Any]:
-    """Measure many viewers against none, in turn: pictures rendered per second, and processor time."""
+    """Measures many viewers against none, in turn: pictures rendered per second, and processor time."""
     alone, watched, got = Usage(), Usage(), list[int]()
     for _ in range(ROUNDS):
         started = next_picture(client)
@@ -138,7 +138,7 @@ def _address(client: httpx.Client) -> str:
 
 
 def _picture(client: httpx.Client) -> dict[str, Any]:
-    """Return the renderer's name and the size of its pictures."""
+    """Returns the renderer's name and the size of its pictures."""
     import cv2
     import numpy as np
 
@@ -151,7 +151,7 @@ def _picture(client: httpx.Client) -> dict[str, Any]:
 
 
 def dashboard_sizes(folder: Path) -> dict[str, Any] | None:
-    """Return the bytes of the built dashboard's files, plain and gzipped; None = it is not built."""
+    """Returns the bytes of the built dashboard's files, plain and gzipped; None = it is not built."""
     if not (folder / "index.html").is_file():
         return None
     files = {}
@@ -164,7 +164,7 @@ def dashboard_sizes(folder: Path) -> dict[str, Any] | None:
 
 
 def print_report(report: dict[str, Any]) -> None:
-    """Print the report as tables."""
+    """Prints the report as tables."""
     console = Console()
     width, height = report["size"]
     console.print(

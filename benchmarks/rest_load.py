@@ -35,7 +35,7 @@ class Times:
     pictures: Counter[str] = field(default_factory=Counter)
 
     def figures(self) -> dict[str, Any]:
-        """Return median and 99th percentile by method, milliseconds."""
+        """Returns median and 99th percentile by method, milliseconds."""
         found: dict[str, Any] = {}
         for method, values in sorted(self.seconds.items()):
             p50_s, p99_s = np.percentile(values, (50, 99))
@@ -48,7 +48,7 @@ class Times:
 
 
 async def send_paced(address: str, calls: Sequence[Call], per_s: float, seconds: float) -> Times:
-    """Send `calls` in turn, `per_s` a second, whether or not earlier ones were answered.
+    """Sends `calls` in turn, `per_s` a second, whether or not earlier ones were answered.
 
     Times count from when a request was due, so that one that had to wait for its turn does not count as fast.
     """
@@ -83,13 +83,13 @@ async def _send(client: httpx.AsyncClient, call: Call, turn: int, due_s: float, 
 
 
 async def watch(address: str, viewers: int, frames_per_s: float, seconds: float) -> list[int]:
-    """Watch with many viewers, each at most at this rate; return how many frames each got."""
+    """Watches with many viewers, each at most at this rate; returns how many frames each got."""
     ends_s = time.perf_counter() + seconds
     return list(await asyncio.gather(*(_view(address, 1 / frames_per_s, ends_s) for _ in range(viewers))))
 
 
 async def _view(address: str, period_s: float, ends_s: float) -> int:
-    """Run one viewer: it acknowledges a frame when the next is due, like a slow browser."""
+    """Runs one viewer: it acknowledges a frame when the next is due, like a slow browser."""
     from websockets.asyncio.client import connect
 
     frames = 0

@@ -32,7 +32,7 @@ class Usage:
     _frames_s: float = 0.0
 
     def add(self, started: Sample, ended: Sample, last: Sample) -> None:
-        """Count a round: processor time until it `ended`, pictures until the `last` one."""
+        """Counts a round: processor time until it `ended`, pictures until the `last` one."""
         self.wall_s += ended.at_s - started.at_s
         for name in self.cpu_s:
             self.cpu_s[name] += ended.cpu_s[name] - started.cpu_s[name]
@@ -51,7 +51,7 @@ class Usage:
 
 
 def sample(client: httpx.Client) -> Sample:
-    """Return the current counts; the client's base address is that of the API."""
+    """Returns the current counts; the client's base address is that of the API."""
     lines = client.get("/metrics").raise_for_status().text.splitlines()
     values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
     cpu_s = {WEB: float(values[_CPU_S]), CLIENTS: time.process_time()}
@@ -59,7 +59,7 @@ def sample(client: httpx.Client) -> Sample:
 
 
 def next_picture(client: httpx.Client) -> Sample:
-    """Return the counts at the arrival of the next picture.
+    """Returns the counts at the arrival of the next picture.
 
     Rates are measured from one picture to another: a fixed time would be off by one of its twenty pictures.
 

@@ -32,7 +32,7 @@ GAP_PX = 8
 
 
 def room() -> tuple[SceneDocument, list[ViewFrame]]:
-    """Return the scene document, and a frame of each camera."""
+    """Returns the scene document, and a frame of each camera."""
     camera = SyntheticCamera()
     build = ViewFrameBuilder(camera)
     demo = demo_scene("dvct")
@@ -43,7 +43,7 @@ def room() -> tuple[SceneDocument, list[ViewFrame]]:
 
 
 def pictures() -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Render the pictures of both cameras by one call, once for what is learnt of the light and once to show."""
+    """Renders the pictures of both cameras by one call, once for what is learnt of the light and once to show."""
     scene, frames = room()
     with opened(None) as gpu, rendering(gpu, scene) as renderer:
         renderer.render_views(frames)
@@ -51,7 +51,7 @@ def pictures() -> list[UInt8[np.ndarray, "h w 3"]]:
 
 
 def main() -> None:
-    """Write the picture."""
+    """Writes the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="File to write, NAME.jpg.")
     out: Path = parser.parse_args().out

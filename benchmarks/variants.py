@@ -58,7 +58,7 @@ class Variant:
         return self.kind in SETTINGS
 
     def applied(self, document: SceneDocument, volume_size: int | None) -> SceneDocument:
-        """Return the document with this variant's method; `volume_size` applies if no setting names one."""
+        """Returns the document with this variant's method; `volume_size` applies if no setting names one."""
         if self.kind == "none":
             return document.replaced(method=NoneMethod())
         if (
@@ -123,7 +123,7 @@ RENDERED = tuple(
 
 
 def parse_variants(text: str, known: Collection[str] = FIXED) -> list[Variant]:
-    """Parse `camera,paper,exact:cone_count=32,output.antialiasing=true`: names among `known`, separated by commas.
+    """Parses `camera,paper,exact:cone_count=32,output.antialiasing=true`: names among `known`, separated by commas.
 
     Settings are the method's, or the document's `output` or `shading`.
 

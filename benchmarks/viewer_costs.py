@@ -43,7 +43,7 @@ REQUESTS_PER_S = 10_000  # all viewers are one client here
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     with _web_process() as (process_id, address):
         for codec in ("jpeg", "h264"):
             join = partial(_joined, f"{address}?codec={codec}")
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def _cost_ms(process_id: int, load: Callable[[], Coroutine[Any, Any, None]]) -> float:
-    """Return the processor time of a process for one of `JOINS` loads, beyond its own."""
+    """Returns the processor time of a process for one of `JOINS` loads, beyond its own."""
     began_s, before_s = time.monotonic(), _processor_s(process_id)
     time.sleep(2.0)
     idle = (_processor_s(process_id) - before_s) / (time.monotonic() - began_s)
@@ -70,7 +70,7 @@ async def _joined(address: str) -> None:
 
 
 def _processor_s(process_id: int) -> float:
-    """Return what a process has computed, nanoseconds of all its threads as the scheduler counts them."""
+    """Returns what a process has computed, nanoseconds of all its threads as the scheduler counts them."""
     spent = 0
     for task in Path(f"/proc/{process_id}/task").iterdir():
         with suppress(OSError):  # it has just ended
@@ -80,7 +80,7 @@ def _processor_s(process_id: int) -> float:
 
 @contextmanager
 def _web_process() -> Iterator[tuple[int, str]]:
-    """Run a web process that composites come to; yield its id and the address of its live pictures."""
+    """Runs a web process that composites come to; yields its id and the address of its live pictures."""
     port, control, stream = ports.private_ports(3)
     with TemporaryDirectory() as folder, _published(stream):
         settings = Path(folder) / "deltalight.toml"
@@ -109,7 +109,7 @@ def _await_picture(address: str) -> None:
 
 @contextmanager
 def _published(port: int) -> Iterator[None]:
-    """Publish the pictures of the demo as composites."""
+    """Publishes the pictures of the demo as composites."""
     publisher, ended = Publisher(ports.endpoint(port)), threading.Event()
     frames = [
         (frame.camera, encode_color(frame.color))
@@ -148,7 +148,7 @@ def _published(port: int) -> Iterator[None]:
 
 
 def _refusals(dice: Random) -> dict[str, object]:
-    """Return what it costs to find that a message is nonsense, microseconds of processor time."""
+    """Returns what it costs to find that a message is nonsense, microseconds of processor time."""
     known, refused_us = known_messages(), []
     for message in [mutated(dice, dice.choice(known)) for _ in range(NONSENSE)]:
         began_ns = time.thread_time_ns()

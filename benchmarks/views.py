@@ -109,7 +109,7 @@ class Room:
         self._known: dict[int, ViewFrame] = {}
 
     def frames(self, step: int, moment: int) -> list[ViewFrame]:
-        """Return a frame of each camera at a step of its way, as taken at that moment."""
+        """Returns a frame of each camera at a step of its way, as taken at that moment."""
         taken = [self._at(camera * APART + step) for camera in range(CAMERAS)]
         return [replace(each, frame_id=moment, timestamp_ns=moment * STEP_NS) for each in taken]
 
@@ -122,7 +122,7 @@ class Room:
 def moments_of(
     motion: str, room: Room, scene: SceneDocument, count: int
 ) -> Iterator[tuple[SceneDocument, list[ViewFrame]]]:
-    """Return scene and frames of each moment.
+    """Returns scene and frames of each moment.
 
     `camera`: all cameras move, so that everything is made anew but what was learnt of the light. `object`: the object
     goes round a small circle, and nothing else moves.
@@ -138,7 +138,7 @@ def moments_of(
 
 
 def measure_views(job: ViewsJob, progress: Progress) -> ViewsReport:
-    """Measure every motion by every method, with one camera, two and three in turn at each moment.
+    """Measures every motion by every method, with one camera, two and three in turn at each moment.
 
     Raises:
         DeltalightError: no OpenGL, or missing demo files.
@@ -186,14 +186,14 @@ def _measured(
 
 
 def _timed(run: Callable[[], object]) -> tuple[float, float]:
-    """Return processor time of this process (software renders in it) and wall time, s."""
+    """Returns processor time of this process (software renders in it) and wall time, s."""
     processor_s, wall_s = time.process_time(), time.perf_counter()
     run()
     return time.process_time() - processor_s, time.perf_counter() - wall_s
 
 
 def run_views(job: ViewsJob, *, out: Path | None, as_json: bool) -> None:
-    """Measure, write the report to `out` if given, and print it."""
+    """Measures, writes the report to `out` if given, and prints it."""
     console = Console(stderr=True)
     hidden = not console.is_terminal
     with Progress(console=console, transient=True, refresh_per_second=1, disable=hidden) as progress:

@@ -68,7 +68,7 @@ class Limb:
 
 
 def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float, float], rings: int) -> Limb:
-    """Return a limb from the first joint over the others to `end`, tapering towards it, round at both ends."""
+    """Returns a limb from the first joint over the others to `end`, tapering towards it, round at both ends."""
     stations = np.array([*(JOINTS[name][1] for name in joints), end], float)
     lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(stations, axis=0), axis=1))])
     cap = np.radians(np.linspace(-90, 0, 5))
@@ -103,7 +103,7 @@ def _tube_triangles(rings: int) -> Int32[np.ndarray, "m 3"]:
 def _joint_weights(
     joints: list[str], along: Float64[np.ndarray, " r"], lengths: Float64[np.ndarray, " s"]
 ) -> Float64[np.ndarray, "r j"]:
-    """Return the weights of the joints: each bone its own stretch, both of them around a joint."""
+    """Returns the weights of the joints: each bone its own stretch, both of them around a joint."""
     weights = np.zeros((len(along), len(NAMES)))
     above = np.ones(len(along))
     for number, name in enumerate(joints):
@@ -115,7 +115,7 @@ def _joint_weights(
 
 
 def limbs() -> dict[str, list[Limb]]:
-    """Return the figure's parts by what covers them."""
+    """Returns the figure's parts by what covers them."""
     top = JOINTS["chest"][1][1]
     found: dict[str, list[Limb]] = {
         "shirt": [limb(["hips", "chest"], (0, top + 0.027, 0), (0.017, 0.021), 9)],
@@ -138,7 +138,7 @@ def limbs() -> dict[str, list[Limb]]:
 
 
 def leg_angles(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 k"]:
-    """Return thigh (forward), knee (bent) and foot (toes up from a right angle with the shin), radians.
+    """Returns thigh (forward), knee (bent) and foot (toes up from a right angle with the shin), radians.
 
     The thigh swings evenly; the knee bends while it swings forward, so that the foot clears the ground.
     """
@@ -148,7 +148,7 @@ def leg_angles(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 k"]:
 
 
 def hip_height(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
-    """Return the height of the hips, m, at which the lowest end of a sole touches the ground."""
+    """Returns the height of the hips, m, at which the lowest end of a sole touches the ground."""
     depths = []
     for shift in (0, np.pi):
         thigh, knee, foot = leg_angles(phase + shift)
@@ -159,7 +159,7 @@ def hip_height(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
 
 
 def motion(time_s: Float64[np.ndarray, " k"]) -> dict[str, Float64[np.ndarray, "k 4"]]:
-    """Return the rotations (quaternions x y z w) of the joints that walking moves."""
+    """Returns the rotations (quaternions x y z w) of the joints that walking moves."""
     phase = 2 * np.pi * time_s / CYCLE_S
     rotations = {
         "chest": _about((0, 1, 0), 0.12 * np.sin(phase)),
@@ -181,7 +181,7 @@ def _about(axis: tuple[float, float, float], angle: Float64[np.ndarray, " k"]) -
 
 
 def _add_mesh(glb: GlbBuilder) -> int:
-    """Add one primitive per material, on the figure's joints."""
+    """Adds one primitive per material, on the figure's joints."""
     primitives = []
     for name, parts in limbs().items():
         material = {"baseColorFactor": [*CLOTHES[name], 1], "metallicFactor": 0, "roughnessFactor": 0.6}
@@ -206,7 +206,7 @@ def _add_mesh(glb: GlbBuilder) -> int:
 
 
 def _add_joints(glb: GlbBuilder) -> int:
-    """Add the nodes of the joints, in the order of `NAMES` from node 0 on, and the skin."""
+    """Adds the nodes of the joints, in the order of `NAMES` from node 0 on, and the skin."""
     matrices = []
     for name, (parent, place) in JOINTS.items():
         origin = np.array((0, 0, 0) if parent is None else JOINTS[parent][1])
@@ -221,7 +221,7 @@ def _add_joints(glb: GlbBuilder) -> int:
 
 
 def _add_clip(glb: GlbBuilder, name: str, cycles: int, radius_m: float) -> None:
-    """Add some cycles of walking, once around a circle if it has a radius."""
+    """Adds some cycles of walking, once around a circle if it has a radius."""
     time_s = np.linspace(0, cycles * CYCLE_S, cycles * KEYS_A_CYCLE + 1)
     times = glb.floats(time_s)
     clip: dict[str, Any] = {"name": name}
@@ -237,7 +237,7 @@ def _add_clip(glb: GlbBuilder, name: str, cycles: int, radius_m: float) -> None:
 
 
 def build() -> GlbBuilder:
-    """Return the figure: y up, facing +z, its feet on y = 0."""
+    """Returns the figure: y up, facing +z, its feet on y = 0."""
     glb = GlbBuilder()
     skin = _add_joints(glb)
     body = glb.add("nodes", {"name": "body", "mesh": _add_mesh(glb), "skin": skin})
@@ -249,7 +249,7 @@ def build() -> GlbBuilder:
 
 
 def scene_document() -> dict[str, Any]:
-    """Return the demo's room with the figure in place of the knot."""
+    """Returns the demo's room with the figure in place of the knot."""
     room = scene_demo.scene_document()
     figure = {
         "id": "figure",
@@ -262,7 +262,7 @@ def scene_document() -> dict[str, Any]:
 
 
 def main(out: Annotated[Path, typer.Option(help="Folder for figure.glb and figure.json.")]) -> None:
-    """Write the figure and its scene."""
+    """Writes the figure and its scene."""
     out.mkdir(parents=True, exist_ok=True)
     size = build().write(out / "figure.glb").stat().st_size
     (out / "figure.json").write_text(json.dumps(scene_document(), indent=2) + "\n")

@@ -32,7 +32,7 @@ class WhepViewer:
         listen_at(self._video, [LOOPBACK])
 
     async def __aenter__(self) -> Self:
-        """Open the session."""
+        """Opens the session."""
         await self._peer.setLocalDescription()
         async with httpx.AsyncClient() as http:
             offer = self._peer.localDescription.sdp
@@ -44,11 +44,11 @@ class WhepViewer:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the session, which ends with that."""
+        """Leaves the session, which ends with that."""
         await self._peer.close()
 
     async def received_bytes(self) -> int:
-        """Return the bytes of all datagrams so far, without their headers of UDP and IP."""
+        """Returns the bytes of all datagrams so far, without their headers of UDP and IP."""
         stats = (await self._video.receiver.getStats()).values()
         return sum(each.bytesReceived for each in stats if isinstance(each, RTCTransportStats))
 

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def misfit(array: object, kind: type[np.generic], shape: tuple[int, ...]) -> str | None:
-    """Return what is wrong with an array, `must be ..., and is ...`; None if it has that kind and shape."""
+    """Returns what is wrong with an array, `must be ..., and is ...`; None if it has that kind and shape."""
     if isinstance(array, np.ndarray) and array.shape == shape and np.issubdtype(array.dtype, kind):
         return None
     wanted = {np.floating: "float32", np.bool_: "bool"}.get(kind, kind.__name__)
@@ -13,5 +13,5 @@ def misfit(array: object, kind: type[np.generic], shape: tuple[int, ...]) -> str
 
 
 def kind_of(value: object) -> str:
-    """Return what a value is, for sentences: its type's name in backticks, or `None`."""
+    """Returns what a value is, for sentences: its type's name in backticks, or `None`."""
     return "None" if value is None else f"`{type(value).__name__}`"

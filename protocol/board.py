@@ -52,7 +52,7 @@ class CustomDictionary(StrictModel):
         return self
 
     def cells(self) -> UInt8[np.ndarray, "n n"]:
-        """Return the code's cells, 0 = black, 1 = white."""
+        """Returns the code's cells, 0 = black, 1 = white."""
         return np.array([int(bit) for bit in self.bits], np.uint8).reshape(self.marker_size, self.marker_size)
 
 
@@ -66,7 +66,7 @@ class LampMarker(StrictModel):
     marker_length_m: Length = Field(description="Outer edge of the marker's black border, in metres.")
 
     def corner_points(self) -> Float64[np.ndarray, "4 3"]:
-        """Return the corners in the marker's frame, in OpenCV's order (top-left, then clockwise)."""
+        """Returns the corners in the marker's frame, in OpenCV's order (top-left, then clockwise)."""
         half = self.marker_length_m / 2
         return _rectangle(-half, half, self.marker_length_m, self.marker_length_m)
 
@@ -82,7 +82,7 @@ class GreyCard(StrictModel):
     albedo: float = Field(gt=0, le=1, description="Diffuse albedo; 0.18 for the usual grey card.")
 
     def outline(self) -> Float64[np.ndarray, "4 3"]:
-        """Return the corners in world coordinates."""
+        """Returns the corners in world coordinates."""
         width, height = self.size_m
         angle = np.radians(self.rotation_deg)
         across, along = (
@@ -187,7 +187,7 @@ class BoardSpec(StrictModel):
 
     @model_serializer(mode="wrap")
     def _without_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out margins, cards and lamps of a board without: it serialises as before these existed."""
+        """Leaves out margins, cards and lamps of a board without: it serialises as before these existed."""
         return {
             key: value
             for key, value in dump(self).items()
@@ -216,31 +216,31 @@ class BoardSpec(StrictModel):
 
     @cached_property
     def _cells(self) -> list[tuple[int, int]]:
-        """Return (row, column) of every marker, in the order of the ids."""
+        """Returns (row, column) of every marker, in the order of the ids."""
         every = [(row, column) for row in range(self.rows) for column in range(self.columns)]
         # OpenCV's ChArUco boards (from 4.6 on) start with a black square.
         return [cell for cell in every if self.type != "charuco" or sum(cell) % 2 == 1]
 
     def opencv_dictionary(self) -> Any:  # noqa: ANN401 - cv2 has no types
-        """Return the `cv2.aruco.Dictionary` that holds the board's markers."""
+        """Returns the `cv2.aruco.Dictionary` that holds the board's markers."""
         if isinstance(self.dictionary, str):
             return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         cells = self.dictionary.cells()
         return cv2.aruco.Dictionary(cv2.aruco.Dictionary.getByteListFromBits(cells), len(cells), 0)
 
     def _marker_corner(self, row: int, column: int) -> tuple[float, float]:
-        """Return the top-left corner (x, y) of the marker in a cell."""
+        """Returns the top-left corner (x, y) of the marker in a cell."""
         first_row, first_column = self._cells[0]
         return (column - first_column) * self._pitch, -(row - first_row) * self._pitch
 
     def corner_points(self) -> dict[int, Float64[np.ndarray, "4 3"]]:
-        """Return the corners of every marker by id, in OpenCV's order (top-left, then clockwise)."""
+        """Returns the corners of every marker by id, in OpenCV's order (top-left, then clockwise)."""
         length = self.marker_length_m
         quads = [_rectangle(*self._marker_corner(*cell), length, length) for cell in self._cells]
         return dict(zip(self.marker_ids, quads, strict=True))
 
     def chessboard_corners(self) -> Float64[np.ndarray, "n 3"]:
-        """Return the inner corners of a `charuco` board, row by row (OpenCV's ids); else none."""
+        """Returns the inner corners of a `charuco` board, row by row (OpenCV's ids); else none."""
         if self.type != "charuco":
             return np.zeros((0, 3))
         left, top = self._first_square()
@@ -248,19 +248,19 @@ class BoardSpec(StrictModel):
         return np.array([(left + column * self._pitch, top - row * self._pitch, 0.0) for row, column in grid])
 
     def _first_square(self) -> tuple[float, float]:
-        """Return the top-left corner (x, y) of the square in row 0, column 0."""
+        """Returns the top-left corner (x, y) of the square in row 0, column 0."""
         x, y = self._marker_corner(0, 0)
         return x - self.separation_m / 2, y + self.separation_m / 2
 
     def sheet_outline(self) -> Float64[np.ndarray, "4 3"]:
-        """Return the corners of the printed area (top-left, then clockwise), without outer margin."""
+        """Returns the corners of the printed area (top-left, then clockwise), without outer margin."""
         if self.type == "charuco":
             return _rectangle(*self._first_square(), self.columns * self._pitch, self.rows * self._pitch)
         gap = self.separation_m
         return _rectangle(0.0, 0.0, self.columns * self._pitch - gap, self.rows * self._pitch - gap)
 
     def paper_outline(self) -> Float64[np.ndarray, "4 3"]:
-        """Return the corners of the paper (as in `sheet_outline`).
+        """Returns the corners of the paper (as in `sheet_outline`).
 
         Where `margins_m` does not give them, only the margin is certain that markers need to be found: one cell, and
         separation_m around a single marker; a chessboard needs none.
@@ -277,7 +277,7 @@ class BoardSpec(StrictModel):
         return max(cell, self.separation_m) if self.type == "single" else cell
 
     def paper_patches(self) -> Float64[np.ndarray, "n 4 3"]:
-        """Return quads of white paper between the markers (corners as in `sheet_outline`).
+        """Returns quads of white paper between the markers (corners as in `sheet_outline`).
 
         Grids: the gaps between two neighbouring markers, without the crossings (some grids print squares
         there). Others: the white margin on the four sides of each marker.
@@ -303,7 +303,7 @@ class BoardSpec(StrictModel):
         ]
 
     def _gaps(self, row: int, column: int) -> list[Float64[np.ndarray, "4 3"]]:
-        """Return the gaps to the right of and below the marker in a cell, where it has a neighbour."""
+        """Returns the gaps to the right of and below the marker in a cell, where it has a neighbour."""
         x, y = self._marker_corner(row, column)
         length, inset = self.marker_length_m, PATCH_INSET * self.separation_m
         thin, quads = self.separation_m - 2 * inset, []
@@ -315,13 +315,13 @@ class BoardSpec(StrictModel):
 
 
 def _rectangle(left: float, top: float, width: float, height: float) -> Float64[np.ndarray, "4 3"]:
-    """Return the corners from the top-left one on, clockwise as seen from in front of the paper (y is up)."""
+    """Returns the corners from the top-left one on, clockwise as seen from in front of the paper (y is up)."""
     right, bottom = left + width, top - height
     return np.array([(left, top, 0.0), (right, top, 0.0), (right, bottom, 0.0), (left, bottom, 0.0)])
 
 
 def load_board_yaml(path: Path) -> BoardSpec:
-    """Read a board description; a custom marker's picture is read from beside it and converted to bits.
+    """Reads a board description; a custom marker's picture is read from beside it and converted to bits.
 
     Raises:
         DeltalightError: the file, a key or the marker's picture is missing or wrong.
@@ -334,7 +334,7 @@ def load_board_yaml(path: Path) -> BoardSpec:
 
 
 def save_board_yaml(path: Path, board: BoardSpec) -> None:
-    """Write a board description in the form that `load_board_yaml` reads."""
+    """Writes a board description in the form that `load_board_yaml` reads."""
     data = board.model_dump(mode="json", exclude_none=True)
     path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None), encoding="utf-8")
 

@@ -23,14 +23,14 @@ _log = structlog.get_logger(__name__)
 
 
 def cache_folder(kind: str) -> Path:
-    """Return the folder of one kind of cached files, in DELTALIGHT_CACHE, else in the user's cache folder."""
+    """Returns the folder of one kind of cached files, in DELTALIGHT_CACHE, else in the user's cache folder."""
     given = os.environ.get(FOLDER_VARIABLE)
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return (Path(given) if given else user / "deltalight") / kind
 
 
 def cache_limit_bytes() -> int:
-    """Return what the cached files of one kind may take: DELTALIGHT_CACHE_MB.
+    """Returns what the cached files of one kind may take: DELTALIGHT_CACHE_MB.
 
     Raises:
         DeltalightError: it is no number above zero.
@@ -42,7 +42,7 @@ def cache_limit_bytes() -> int:
 
 
 def write_cached(path: Path, content: bytes) -> None:
-    """Write a file and its hash, each atomically; make their folder.
+    """Writes a file and its hash, each atomically; makes their folder.
 
     Raises:
         DeltalightError: the disk refuses.
@@ -54,7 +54,7 @@ def write_cached(path: Path, content: bytes) -> None:
 
 
 def read_cached(path: Path) -> bytes | None:
-    """Return the content of a file that was written so; None if there is none or it is damaged."""
+    """Returns the content of a file that was written so; None if there is none or it is damaged."""
     try:
         content, told = path.read_bytes(), _sum_path(path).read_bytes()
     except OSError:
@@ -66,13 +66,13 @@ def read_cached(path: Path) -> bytes | None:
 
 
 def mark_used(path: Path) -> None:
-    """Have `prune` take a file or folder for the most recently used one."""
+    """Has `prune` take a file or folder for the most recently used one."""
     with suppress(OSError):  # a cache that only others may write
         os.utime(path)
 
 
 def prune(folder: Path, limit_bytes: int, keep: Path) -> None:
-    """Remove the least recently used files and folders in a folder until all take at most the limit, never `keep`."""
+    """Removes the least recently used files and folders in a folder until all fit into the limit, never `keep`."""
     found = []
     for path in _entries(folder):
         with suppress(OSError):  # another process removed it
@@ -87,7 +87,7 @@ def prune(folder: Path, limit_bytes: int, keep: Path) -> None:
 
 
 def _entries(folder: Path) -> Iterator[Path]:
-    """Yield what may be removed by itself: no hash, and nothing that is being made."""
+    """Yields what may be removed by itself: no hash, and nothing that is being made."""
     for path in folder.iterdir():
         if path.suffix != _SUM and not path.name.startswith("."):
             yield path

@@ -27,13 +27,13 @@ class Extrinsics:
     world_from_fisheye: Float64[np.ndarray, "4 4"] | None = None
 
     def to_dict(self) -> dict[str, list[list[float]]]:
-        """Return the known transforms as plain rows."""
+        """Returns the known transforms as plain rows."""
         known = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: matrix.tolist() for name, matrix in known.items() if matrix is not None}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], name: str) -> Self:
-        """Validate the transforms of a document called `name`.
+        """Validates the transforms of a document called `name`.
 
         Raises:
             DeltalightError: a key is unknown, or a transform is not rigid.
@@ -53,7 +53,7 @@ def _matrix(value: Any) -> Any:  # noqa: ANN401 - whatever the document holds
 
 
 def load_extrinsics_yaml(path: Path) -> Extrinsics:
-    """Read calibration/extrinsics.yaml (matrices as rows, flat, or `{rows, cols, data}`).
+    """Reads calibration/extrinsics.yaml (matrices as rows, flat, or `{rows, cols, data}`).
 
     Raises:
         DeltalightError: the file or one of its transforms is wrong.
@@ -62,5 +62,5 @@ def load_extrinsics_yaml(path: Path) -> Extrinsics:
 
 
 def save_extrinsics_yaml(path: Path, extrinsics: Extrinsics) -> None:
-    """Write the known transforms as rows."""
+    """Writes the known transforms as rows."""
     path.write_text(yaml.safe_dump(extrinsics.to_dict(), default_flow_style=None), encoding="utf-8")

@@ -77,7 +77,7 @@ class CameraModel:
             )
 
     def __eq__(self, other: object) -> bool:
-        """Compare by value."""
+        """Compares by value."""
         return isinstance(other, CameraModel) and self._values == other._values
 
     def __hash__(self) -> int:
@@ -100,7 +100,7 @@ class CameraModel:
         return self.distortion_model == "equidistant" or bool(self._coefficients.any())
 
     def rays(self) -> Float32[np.ndarray, "h w 2"]:
-        """Return (x/z, y/z) of the ray through every pixel centre, by the full lens model.
+        """Returns (x/z, y/z) of the ray through every pixel centre, by the full lens model.
 
         The array is computed once, as long as any camera of these values keeps it, and is read-only.
 
@@ -134,7 +134,7 @@ class CameraModel:
         return result
 
     def unproject(self, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
-        """Return (x/z, y/z) of the rays through `pixels` (x, y); the inverse of `project`."""
+        """Returns (x/z, y/z) of the rays through `pixels` (x, y); the inverse of `project`."""
         points = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
         if not self.has_distortion:
             focal, centre = self.matrix[[0, 1], [0, 1]], self.matrix[:2, 2]
@@ -154,7 +154,7 @@ class CameraModel:
         return np.asarray(rays, np.float64).reshape(-1, 2)
 
     def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-        """Return the pixels (x, y) of points in the optical frame; NaN for points not in front (z <= 0)."""
+        """Returns the pixels (x, y) of points in the optical frame; NaN for points not in front (z <= 0)."""
         in_front = points[:, 2] > 0
         if len(points) and in_front.all():
             return self._project_in_front(np.asarray(points, np.float64))
@@ -183,7 +183,7 @@ class CameraModel:
         return self._coefficients if self._coefficients.size else np.zeros(4)
 
     def resized(self, width: int, height: int) -> "CameraModel":
-        """Return the camera of the same picture resampled to another size (pixel centres stay correct)."""
+        """Returns the camera of the same picture resampled to another size (pixel centres stay correct)."""
         scale = np.array([width / self.width, height / self.height])
         matrix = self.matrix.copy()
         matrix[[0, 1], [0, 1]] *= scale
@@ -191,7 +191,7 @@ class CameraModel:
         return CameraModel(width, height, matrix, self.distortion_model, self._coefficients)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values that msgpack, JSON and YAML can hold."""
+        """Returns plain values that msgpack, JSON and YAML can hold."""
         return {
             "width": self.width,
             "height": self.height,
@@ -202,7 +202,7 @@ class CameraModel:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Create the camera from the data of `to_dict`.
+        """Creates the camera from the data of `to_dict`.
 
         Raises:
             DeltalightError: a key is missing or has an impossible value.
@@ -229,7 +229,7 @@ def _frozen_array(values: object, name: str) -> Float64[np.ndarray, "..."]:
 
 
 def load_camera_yaml(path: Path) -> CameraModel:
-    """Read a ROS camera_info YAML file (matrices as `{rows, cols, data}` or as plain lists).
+    """Reads a ROS camera_info YAML file (matrices as `{rows, cols, data}` or as plain lists).
 
     Raises:
         DeltalightError: the file or one of its keys is missing or wrong.
@@ -238,7 +238,7 @@ def load_camera_yaml(path: Path) -> CameraModel:
 
 
 def camera_from_info(info: Mapping[str, Any], path: Path) -> CameraModel:
-    """Create a camera from the keys of a ROS camera_info file; `path` names the file in errors."""
+    """Creates a camera from the keys of a ROS camera_info file; `path` names the file in errors."""
     try:
         width, height = int(info["image_width"]), int(info["image_height"])
         matrix = _info_values(info["camera_matrix"]).reshape(3, 3)
@@ -262,7 +262,7 @@ def _info_values(value: Any) -> Float64[np.ndarray, " n"]:  # noqa: ANN401 - wha
 def save_camera_yaml(
     path: Path, model: CameraModel, name: str, extra: Mapping[str, object] | None = None
 ) -> None:
-    """Write a ROS camera_info YAML file; `extra` adds keys (such as `depth_scale`) at its end."""
+    """Writes a ROS camera_info YAML file; `extra` adds keys (such as `depth_scale`) at its end."""
     described = model.to_dict()
     distortion = described["distortion"]
     info = {

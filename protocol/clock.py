@@ -36,7 +36,7 @@ class ClockSample:
 
 
 def sample_from_stamps(t0: int, t1: int, t2: int, t3: int) -> ClockSample:
-    """Compute offset and bound of one exchange from its four stamps in nanoseconds (see the module).
+    """Computes offset and bound of one exchange from its four stamps in nanoseconds (see the module).
 
     Raises:
         DeltalightError: the stamps run backwards, because a clock was set meanwhile.
@@ -49,7 +49,7 @@ def sample_from_stamps(t0: int, t1: int, t2: int, t3: int) -> ClockSample:
 
 
 def measure_offset(exchange: Exchange, rounds: int = 8, now: Clock = time.time_ns) -> ClockSample:
-    """Return the best of several exchanges: the one with the shortest round trip.
+    """Returns the best of several exchanges: the one with the shortest round trip.
 
     `exchange()` asks the remote side and returns its stamps (t1, t2).
 
@@ -79,7 +79,7 @@ class ClockEstimator:
         self._samples: deque[ClockSample] = deque(maxlen=window)
 
     def add(self, sample: ClockSample) -> int:
-        """Add a measurement; return by how much a clock was set meanwhile, ns, 0 = not at all.
+        """Adds a measurement; returns by how much a clock was set meanwhile, ns, 0 = not at all.
 
         A measurement that contradicts earlier ones (a clock was set) discards them.
         """
@@ -93,11 +93,11 @@ class ClockEstimator:
         return jump_ns
 
     def forget(self) -> None:
-        """Discard all measurements, because a clock was set."""
+        """Discards all measurements, because a clock was set."""
         self._samples.clear()
 
     def at(self, local_ns: int) -> ClockSample | None:
-        """Return offset and bound at a local time, None before the first measurement."""
+        """Returns offset and bound at a local time, None before the first measurement."""
         if not self._samples:
             return None
         best = min(self._samples, key=lambda sample: self._grown(sample, local_ns))
@@ -111,14 +111,14 @@ class ClockEstimator:
 
 
 def clock_payload(received_ns: int, now: Clock = time.time_ns) -> dict[str, object]:
-    """Return the payload of a reply to the op `clock`: when the request arrived, and now."""
+    """Returns the payload of a reply to the op `clock`: when the request arrived, and now."""
     return {"received_ns": received_ns, "sent_ns": now()}
 
 
 def clock_exchange(
     request: Callable[[ControlRequest, float], ControlReply], node: str, timeout_s: float = 1.0
 ) -> Exchange:
-    """Return an exchange by control requests, for `measure_offset`; `request` is `RequestClient.request`.
+    """Returns an exchange by control requests, for `measure_offset`; `request` is `RequestClient.request`.
 
     The exchange raises DeltalightError if the server does not answer or does not know the op.
     """

@@ -29,7 +29,7 @@ _JPEG_OTHER_FRAMES = (0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF
 def encode_color(
     pixels: UInt8[np.ndarray, "h w 3"], encoding: Literal["jpeg", "raw"] = "jpeg", quality: int = JPEG_QUALITY
 ) -> bytes:
-    """Encode a picture; `quality` (1 to 100) applies to jpeg only.
+    """Encodes a picture; `quality` (1 to 100) applies to jpeg only.
 
     Raises:
         EnvelopeError: not an 8-bit RGB picture.
@@ -48,7 +48,7 @@ def encode_color(
 def decode_color(
     part: Buffer, encoding: Literal["jpeg", "raw"], shape: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode a part to an RGB picture; a raw part gives a read-only view.
+    """Decodes a part to an RGB picture; a raw part gives a read-only view.
 
     Raises:
         EnvelopeError: not a complete jpeg, or its size is not `shape`.
@@ -75,7 +75,7 @@ def encode_depth(
     encoding: Literal["blosc2", "raw"] = "blosc2",
     depth_scale_m: float = DEFAULT_DEPTH_SCALE_M,
 ) -> bytes:
-    """Encode depth in steps of `depth_scale_m` metres.
+    """Encodes depth in steps of `depth_scale_m` metres.
 
     Pixels that are invalid, or do not fit 1..65535 steps, become unknown (0).
 
@@ -93,7 +93,7 @@ def encode_depth(
 def decode_depth(
     part: Buffer, encoding: Literal["blosc2", "raw"], shape: tuple[int, int], depth_scale_m: float
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Decode a part to depth in metres (0 where unknown) and its validity mask.
+    """Decodes a part to depth in metres (0 where unknown) and its validity mask.
 
     Raises:
         EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or its size is not `shape`.
@@ -103,7 +103,7 @@ def decode_depth(
 
 
 def encode_array(values: Shaped[np.ndarray, "..."], encoding: Literal["blosc2", "raw"]) -> bytes:
-    """Encode an array of uint8, uint16 or float32, without loss."""
+    """Encodes an array of uint8, uint16 or float32, without loss."""
     stored = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     return stored.tobytes() if encoding == "raw" else _compress(stored)
 
@@ -111,7 +111,7 @@ def encode_array(values: Shaped[np.ndarray, "..."], encoding: Literal["blosc2", 
 def decode_array(
     part: Buffer, encoding: Literal["blosc2", "raw"], shape: tuple[int, ...], dtype: DType
 ) -> Shaped[np.ndarray, "..."]:
-    """Decode a part to an array; a raw part gives a read-only view.
+    """Decodes a part to an array; a raw part gives a read-only view.
 
     Raises:
         EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or its size is not `shape`.
@@ -120,7 +120,7 @@ def decode_array(
 
 
 def decode_response(part: Buffer) -> Float32[np.ndarray, "256 3"]:
-    """Decode the camera response of a colour message: linear value of each 8-bit code and channel.
+    """Decodes the camera response of a colour message: linear value of each 8-bit code and channel.
 
     Raises:
         EnvelopeError: its size is wrong, or values are negative or not finite.
@@ -132,7 +132,7 @@ def decode_response(part: Buffer) -> Float32[np.ndarray, "256 3"]:
 
 
 def decode_raw(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np.ndarray, "..."]:
-    """Return a read-only array view of an uncompressed part (little-endian, C order).
+    """Returns a read-only array view of an uncompressed part (little-endian, C order).
 
     Raises:
         EnvelopeError: its length is not that of `shape`.
@@ -149,7 +149,7 @@ def decode_raw(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np.
 
 
 def jpeg_size(part: Buffer) -> tuple[int, int]:
-    """Return height and width from the markers of a jpeg, without decoding it.
+    """Returns height and width from the markers of a jpeg, without decoding it.
 
     Raises:
         EnvelopeError: not a complete 8-bit jpeg.
@@ -164,7 +164,7 @@ def jpeg_size(part: Buffer) -> tuple[int, int]:
 
 
 def stated_jpeg_size(part: Buffer) -> tuple[int, int] | None:
-    """Return height and width that the beginning of an 8-bit jpeg states; None if it states none."""
+    """Returns height and width that the beginning of an 8-bit jpeg states; None if it states none."""
     data = memoryview(part).cast("B")
     place = 2
     while place + 9 <= len(data) and data[place] == 0xFF:
@@ -213,7 +213,7 @@ def _decompress(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np
 
 
 def _check_chunk(data: memoryview, expected: int, expected_item: int) -> None:
-    """Refuse a chunk whose 32-byte header states a size, codec or filter that SPEC.md does not allow."""
+    """Refuses a chunk whose 32-byte header states a size, codec or filter that SPEC.md does not allow."""
     if len(data) < _BLOSC2_HEADER_BYTES:
         raise EnvelopeError(
             f"a blosc2 chunk has at least 32 bytes and the part has {len(data)}: send it whole"

@@ -31,7 +31,7 @@ def uses_keys(endpoint: Endpoint, keys: Keys | None) -> bool:
 
 
 def secure(socket: zmq.Socket[bytes], endpoint: Endpoint, keys: Keys | None, *, bind: bool) -> None:
-    """Set the keys, or none, for the next bind or connect of a socket.
+    """Sets the keys, or none, for the next bind or connect of a socket.
 
     Raises:
         DeltalightError: the key of the host behind the endpoint is unknown.
@@ -49,7 +49,7 @@ def secure(socket: zmq.Socket[bytes], endpoint: Endpoint, keys: Keys | None, *, 
 
 
 def sender_key(frame: zmq.Frame) -> bytes | None:
-    """Return the public key (Z85) of who sent a message to a bound socket; None without keys."""
+    """Returns the public key (Z85) of who sent a message to a bound socket; None without keys."""
     try:
         return str(frame.get("User-Id")).encode()  # as the authenticator told libzmq
     except zmq.ZMQError:
@@ -89,7 +89,7 @@ class Guard:
         return key in self._keys.trusted().values()
 
     def close(self) -> None:
-        """Stop watching; nobody else is let in."""
+        """Stops watching; nobody else is let in."""
         self._closing.set()
         self._thread.join(STOP_S)
         if self._authenticator is not None:
@@ -129,5 +129,5 @@ class Guard:
 
 
 def guard(context: Context, socket: zmq.Socket[bytes], keys: Keys | None, *, bind: bool) -> Guard | None:
-    """Return the guard of a socket, None without keys."""
+    """Returns the guard of a socket, None without keys."""
     return None if keys is None else Guard(context, socket, keys, bind=bind)

@@ -49,7 +49,7 @@ class DepthCalibration:
 
 
 def open_dataset(path: Path, board: BoardSpec | None = None) -> "DatasetReader":
-    """Open a dataset folder; `board` replaces calibration/board.yaml.
+    """Opens a dataset folder; `board` replaces calibration/board.yaml.
 
     Raises:
         DeltalightError: something in the folder is missing or wrong.
@@ -93,11 +93,11 @@ class DatasetReader:
         return len(self._colors)
 
     def __iter__(self) -> Iterator[SensorFrame]:
-        """Yield every frame in order."""
+        """Yields every frame in order."""
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> SensorFrame:
-        """Decode one frame; `index` is the zero-based line of rgb.txt.
+        """Decodes one frame; `index` is the zero-based line of rgb.txt.
 
         Raises:
             IndexError: there is no such frame.
@@ -145,7 +145,7 @@ class DatasetReader:
         return None if path is None else read_bytes(path)
 
     def _check_first_pictures(self) -> None:
-        """Detect a folder with wrong sizes before anybody has begun to write results."""
+        """Detects a folder with wrong sizes before anybody has begun to write results."""
         first = self._colors[0]
         self._decode_color(first, read_bytes(first.path))
         if self._depths:
@@ -281,7 +281,7 @@ def _require_size(picture: np.ndarray, camera: CameraModel, path: Path, calibrat
 
 
 def _instead_of_list(folder: Path) -> str:
-    """Return a sentence about a folder without rgb.txt, by what else it holds."""
+    """Returns a sentence about a folder without rgb.txt, by what else it holds."""
     if (folder / BAG_METADATA).is_file():
         return f"{folder} is a ROS 2 bag; make a recording of it with `deltalight recordings import`."
     bags = sorted(path.name for path in folder.glob(f"*{BAG_DATABASE}"))

@@ -23,7 +23,7 @@ LIST_HEADER = "# timestamp filename [exposure_s]"
 
 
 def load_fisheye_calibration(folder: Path) -> FisheyeCalibration | None:
-    """Read calibration/fisheye.yaml of a dataset folder, None without it.
+    """Reads calibration/fisheye.yaml of a dataset folder, None without it.
 
     Fisheye_response.txt overrides its response.
 
@@ -48,7 +48,7 @@ class FisheyeFolder:
         self._kept: tuple[int, FisheyePictures] | None = None
 
     def at(self, timestamp_ns: int) -> FisheyePictures:
-        """Return the newest pictures not later than a time, else the first ones.
+        """Returns the newest pictures not later than a time, else the first ones.
 
         The same object while they are current.
 
@@ -94,7 +94,7 @@ class FisheyeFolderWriter:
         self._count = 0
 
     def add(self, pictures: FisheyePictures) -> None:
-        """Append pictures; the last ones written are recognised by their time and not written again.
+        """Appends pictures; the last ones written are recognised by their time and not written again.
 
         Raises:
             DeltalightError: they are earlier than the last ones or of another calibration, or a bracket lacks

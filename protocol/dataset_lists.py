@@ -47,7 +47,7 @@ class PoseEntry:
 
 
 def read_list(path: Path) -> list[ListEntry]:
-    """Read `timestamp filename [exposure_s]` lines; times must not run backwards, files must exist.
+    """Reads `timestamp filename [exposure_s]` lines; times must not run backwards, files must exist.
 
     Raises:
         DeltalightError: the file is missing, or the first line that is wrong.
@@ -74,7 +74,7 @@ def read_list(path: Path) -> list[ListEntry]:
 
 
 def require_increasing(entries: Sequence[ListEntry], path: Path) -> None:
-    """Refuse two pictures of one time, because frames are identified by their time.
+    """Refuses two pictures of one time, because frames are identified by their time.
 
     Raises:
         DeltalightError: names the first picture that repeats a time.
@@ -87,7 +87,7 @@ def require_increasing(entries: Sequence[ListEntry], path: Path) -> None:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield (place, words) of every line that is neither empty nor a comment."""
+    """Yields (place, words) of every line that is neither empty nor a comment."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -117,7 +117,7 @@ def _exposure(word: str) -> float | None:
 
 
 def parse_timestamp(place: str, word: str) -> int:
-    """Parse seconds as text into nanoseconds, exactly.
+    """Parses seconds as text into nanoseconds, exactly.
 
     Raises:
         DeltalightError: not a number, negative, or beyond 64 bits.
@@ -133,12 +133,12 @@ def parse_timestamp(place: str, word: str) -> int:
 
 
 def format_timestamp(timestamp_ns: int) -> str:
-    """Format nanoseconds as seconds, exactly."""
+    """Formats nanoseconds as seconds, exactly."""
     return f"{timestamp_ns // 10**9}.{timestamp_ns % 10**9:09d}"
 
 
 def default_tolerance_ns(timestamps_ns: Sequence[int]) -> int:
-    """Return the largest time difference of a pair: half the median colour period, at most 20 ms."""
+    """Returns the largest time difference of a pair: half the median colour period, at most 20 ms."""
     if len(timestamps_ns) < 2:
         return MAX_PAIRING_NS
     periods = [after - before for before, after in pairwise(timestamps_ns)]
@@ -146,7 +146,7 @@ def default_tolerance_ns(timestamps_ns: Sequence[int]) -> int:
 
 
 def nearest_index(timestamps_ns: Sequence[int], wanted_ns: int, tolerance_ns: int) -> int | None:
-    """Return the index of the nearest of the sorted times, or None if none is within the tolerance."""
+    """Returns the index of the nearest of the sorted times, or None if none is within the tolerance."""
     right = bisect_left(timestamps_ns, wanted_ns)
     candidates = [index for index in (right - 1, right) if 0 <= index < len(timestamps_ns)]
     best = min(candidates, key=lambda index: abs(timestamps_ns[index] - wanted_ns), default=None)
@@ -154,7 +154,7 @@ def nearest_index(timestamps_ns: Sequence[int], wanted_ns: int, tolerance_ns: in
 
 
 def read_fisheye_list(path: Path) -> list[FisheyeEntry]:
-    """Read fisheye.txt; lines of one timestamp are an exposure bracket.
+    """Reads fisheye.txt; lines of one timestamp are an exposure bracket.
 
     Raises:
         DeltalightError: as `read_list`, or a bracket without exposures.
@@ -174,7 +174,7 @@ def read_fisheye_list(path: Path) -> list[FisheyeEntry]:
 
 
 def read_poses(path: Path) -> list[PoseEntry]:
-    """Read groundtruth.txt: `timestamp tx ty tz qx qy qz qw` = world_from_camera, sorted by time.
+    """Reads groundtruth.txt: `timestamp tx ty tz qx qy qz qw` = world_from_camera, sorted by time.
 
     Raises:
         DeltalightError: names the first line that is wrong.
@@ -199,7 +199,7 @@ def _pose_entry(place: str, words: list[str]) -> PoseEntry:
 def pose_at(
     poses: Sequence[PoseEntry], times_ns: Sequence[int], wanted_ns: int, tolerance_ns: int
 ) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the pose at a time, or None if unknown.
+    """Returns the pose at a time, or None if unknown.
 
     It is interpolated between two poses at most 0.2 s apart, else the nearest one within the tolerance.
     """

@@ -56,7 +56,7 @@ class DatasetWriter:
         self._last_ns = -1
 
     def __enter__(self) -> Self:
-        """Make the folder."""
+        """Makes the folder."""
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             raise DeltalightError(f"{self.path} already exists; choose another folder.")
         (self.path / "rgb").mkdir(parents=True, exist_ok=True)
@@ -66,10 +66,10 @@ class DatasetWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Do nothing: every frame is complete when `add` returns."""
+        """Does nothing: every frame is complete when `add` returns."""
 
     def add(self, frame: SensorFrame) -> None:
-        """Append a frame; its line number becomes its frame_id."""
+        """Appends a frame; its line number becomes its frame_id."""
         if frame.timestamp_ns <= self._last_ns:
             raise DeltalightError(
                 f"frame {frame.frame_id} is not later than the one before; write frames in order."

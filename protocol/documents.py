@@ -20,7 +20,7 @@ LONGEST_WORD = 200  # characters of a word that are compared and shown: longer t
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word most similar to `word`, or None if none is similar."""
+    """Returns the known word most similar to `word`, or None if none is similar."""
     by_lower = {name.lower(): name for name in known}
     found = difflib.get_close_matches(word[:LONGEST_WORD].lower(), by_lower, n=1, cutoff=0.4)
     return by_lower[found[0]] if found else None
@@ -46,7 +46,7 @@ class StrictModel(BaseModel):
         return data
 
     def replaced(self, **changes: object) -> Self:
-        """Return a validated copy with some fields changed.
+        """Returns a validated copy with some fields changed.
 
         Raises:
             DeltalightError: there is no such field, or a value does not fit.
@@ -55,7 +55,7 @@ class StrictModel(BaseModel):
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Read a JSON (`.json`) or YAML document whose top level is a mapping.
+    """Reads a JSON (`.json`) or YAML document whose top level is a mapping.
 
     Raises:
         DeltalightError: the file is missing, unreadable, malformed or no mapping, or has a key twice in one place.
@@ -73,7 +73,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
-    """Parse the text of a document called `name` whose top level is a mapping.
+    """Parses the text of a document called `name` whose top level is a mapping.
 
     Raises:
         DeltalightError: the text is malformed or not a mapping, or has a key twice in one place.
@@ -97,7 +97,7 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
 
 
 def beyond_limits(error: ValueError | RecursionError) -> str | None:
-    """Return what is too much about a text that Python refused to parse; None: it is malformed."""
+    """Returns what is too much about a text that Python refused to parse; None: it is malformed."""
     if isinstance(error, RecursionError):
         return "is nested too deeply; give the keys that a document has"
     if str(error).startswith("Exceeds the limit"):  # json.JSONDecodeError has other words
@@ -114,7 +114,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: bool = False) -> Model:
-    """Validate a document called `name` against a model.
+    """Validates a document called `name` against a model.
 
     `strict`: strings and booleans are not numbers, as in the model's JSON schema; otherwise `"2"` and `true` count as
     numbers too, which is how they come from the environment.
@@ -138,7 +138,7 @@ def _first_fault(error: ValidationError, document: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:  # noqa: ANN401 - JSON
-    """Convert JSON for strict models: arrays become tuples and 2.0 the integer 2, as JSON has one kind of number.
+    """Converts JSON for strict models: arrays become tuples and 2.0 the integer 2, as JSON has one kind of number.
 
     A shared part is converted once: YAML can alias a part many times, which must not become as many copies.
     """
@@ -175,7 +175,7 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
 
 
 def wrong_in_words(fault: ErrorDetails) -> str:
-    """Say what is wrong with a value, in JSON's words, without a full stop; places and values are the caller's."""
+    """Says what is wrong with a value, in JSON's words, without a full stop; places and values are the caller's."""
     context = fault.get("ctx", {})
     match fault["type"]:
         case "value_error":
@@ -201,7 +201,7 @@ def _given(value: object) -> str:
 
 
 def _place(fault: ErrorDetails, document: Any) -> str:  # noqa: ANN401 - whatever the document holds
-    """Format a fault's location as `a.b[0].c`, without the union tags that pydantic inserts."""
+    """Formats a fault's location as `a.b[0].c`, without the union tags that pydantic inserts."""
     place, here = "", document
     for index, step in enumerate(fault["loc"]):
         is_last_missing = fault["type"] == "missing" and index == len(fault["loc"]) - 1

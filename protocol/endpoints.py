@@ -43,7 +43,7 @@ class Endpoint:
 
 
 def parse_endpoint(endpoint: str) -> Endpoint:
-    """Parse an endpoint.
+    """Parses an endpoint.
 
     Raises:
         DeltalightError: its transport or form is not supported.

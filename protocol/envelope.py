@@ -34,7 +34,7 @@ class EnvelopeError(DeltalightError):
 
 
 def encode(message: Message, parts: Sequence[Part] = ()) -> list[bytes]:
-    """Return the multipart of a message and its raw parts: [topic, header, part...].
+    """Returns the multipart of a message and its raw parts: [topic, header, part...].
 
     Arrays must have the dtype and shape that the message states; they are sent in C order.
 
@@ -50,7 +50,7 @@ def encode(message: Message, parts: Sequence[Part] = ()) -> list[bytes]:
 
 
 def decode(multipart: Sequence[Buffer]) -> tuple[Message, list[memoryview]]:
-    """Return message and raw parts (read-only views, not copied) of a multipart [topic, header, part...].
+    """Returns message and raw parts (read-only views, not copied) of a multipart [topic, header, part...].
 
     Raises:
         EnvelopeError: it is malformed in any way.
@@ -71,7 +71,7 @@ def decode(multipart: Sequence[Buffer]) -> tuple[Message, list[memoryview]]:
 
 
 def pack_header(message: Message) -> bytes:
-    """Return the header of a message: msgpack map of its fields, in the order of the model.
+    """Returns the header of a message: msgpack map of its fields, in the order of the model.
 
     Raises:
         EnvelopeError: the header is larger than 64 kB or holds an integer of more than 64 bits.
@@ -88,7 +88,7 @@ def pack_header(message: Message) -> bytes:
 
 
 def unpack_header(header: Buffer) -> Message:
-    """Return the message of a msgpack header.
+    """Returns the message of a msgpack header.
 
     Raises:
         EnvelopeError: not a header, a schema version that is not read (all are named), or a field out of its range.
@@ -111,7 +111,7 @@ def unpack_header(header: Buffer) -> Message:
 
 @contextmanager
 def refusing(stream: str) -> Iterator[None]:
-    """Turn what is wrong with the fields of a message that is made within the block into `EnvelopeError`."""
+    """Turns what is wrong with the fields of a message that is made within the block into `EnvelopeError`."""
     try:
         yield
     except ValidationError as error:

@@ -73,12 +73,12 @@ class EquidistantLens(RadialLens):
         return self._curve.value(angle)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values that msgpack, JSON and YAML can hold."""
+        """Returns plain values that msgpack, JSON and YAML can hold."""
         return {**self.camera.to_dict(), "image_circle": self.image_circle}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Create the lens from the data of `to_dict`.
+        """Creates the lens from the data of `to_dict`.
 
         Raises:
             DeltalightError: a key is missing or has an impossible value.

@@ -20,10 +20,10 @@ class DeltalightError(Exception):
 
 
 def unreachable(path: Path, reason: str | None) -> DeltalightError:
-    """Return the fault that the system does not let a path be used, to be raised."""
+    """Returns the fault that the system does not let a path be used, to be raised."""
     return DeltalightError(f"'{path}' cannot be reached ({reason}); correct the path, or its permissions.")
 
 
 def install_command(*requirements: str) -> str:
-    """Return the command that adds packages or extras to the Python that runs, which need not be the shell's."""
+    """Returns the command that adds packages or extras to the Python that runs, which need not be the shell's."""
     return shlex.join([sys.executable, "-m", "pip", "install", *requirements])

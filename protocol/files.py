@@ -18,7 +18,7 @@ PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame tak
 
 
 def require_path(value: object, what: str) -> Path:
-    """Return a program's argument as a path; `what` says in a sentence which one is needed.
+    """Returns a program's argument as a path; `what` says in a sentence which one is needed.
 
     Raises:
         DeltalightError: it is no path.
@@ -52,7 +52,7 @@ def exists(path: Path) -> bool:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; move it into place at the end, remove it on an error.
+    """Yields a temporary path beside `path`; moves it into place at the end, removes it on an error.
 
     The suffix stays, because encoders choose their format by it.
 
@@ -73,14 +73,14 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def unwritable(path: Path, reason: str | None) -> DeltalightError:
-    """Return the fault that a file cannot be written, to be raised."""
+    """Returns the fault that a file cannot be written, to be raised."""
     return DeltalightError(
         f"'{path}' cannot be written ({reason}); free some space or choose another folder."
     )
 
 
 def append_whole(file: FileIO, content: bytes) -> None:
-    """Append `content` to an unbuffered file; all of it, or nothing where the disk refuses.
+    """Appends `content` to an unbuffered file; all of it, or nothing where the disk refuses.
 
     Raises:
         DeltalightError: the disk refuses.
@@ -97,20 +97,20 @@ def append_whole(file: FileIO, content: bytes) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write `content` to `path` atomically."""
+    """Writes `content` to `path` atomically."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def write_secret(path: Path, content: bytes) -> None:
-    """Write `content` to `path` atomically; nobody but the owner can read it at any time."""
+    """Writes `content` to `path` atomically; nobody but the owner can read it at any time."""
     with replacing(path) as temporary:
         temporary.touch(mode=0o600, exist_ok=False)
         temporary.write_bytes(content)
 
 
 def write_png(path: Path, color: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write an RGB picture losslessly, at a low compression level."""
+    """Writes an RGB picture losslessly, at a low compression level."""
     bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
     _, encoded = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
     write_bytes(path, encoded.tobytes())

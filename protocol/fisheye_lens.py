@@ -68,18 +68,18 @@ class FisheyeCalibration:
         return float(a[seen].max(initial=0.0))
 
     def transmission(self, angle: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
-        """Return the vignetting at angles from the axis (radians): 1 on the axis."""
+        """Returns the vignetting at angles from the axis (radians): 1 on the axis."""
         return np.asarray(polyval(np.square(angle), np.array([1.0, *self.vignetting])))
 
     def __eq__(self, other: object) -> bool:
-        """Compare by value."""
+        """Compares by value."""
         return isinstance(other, FisheyeCalibration) and self.to_dict() == other.to_dict()
 
     def __hash__(self) -> int:
         return hash((repr(self.lens.to_dict()), self.vignetting))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values that msgpack, JSON and YAML can hold."""
+        """Returns plain values that msgpack, JSON and YAML can hold."""
         return {
             "lens": self.lens.to_dict(),
             "vignetting": list(self.vignetting),
@@ -88,7 +88,7 @@ class FisheyeCalibration:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Create the calibration from the data of `to_dict`.
+        """Creates the calibration from the data of `to_dict`.
 
         Raises:
             DeltalightError: a key is missing or has an impossible value.
@@ -119,7 +119,7 @@ def _coefficients(values: object) -> tuple[float, ...]:
 
 
 def load_fisheye_yaml(path: Path) -> FisheyeCalibration:
-    """Read calibration/fisheye.yaml: the keys of ROS camera_info with `distortion_model` equidistant or ocam.
+    """Reads calibration/fisheye.yaml: the keys of ROS camera_info with `distortion_model` equidistant or ocam.
 
     Instead of `camera_matrix` and `distortion_coefficients`, an ocam lens has `ocam: {polynomial, center [x, y],
     affine [c, d, e]}` or the name of OCamCalib's calib_results.txt beside this file. Optional: `image_circle` (radius
@@ -159,7 +159,7 @@ def _response(info: Mapping[str, Any], path: Path) -> Float32[np.ndarray, "256 3
 
 
 def save_fisheye_yaml(path: Path, calibration: FisheyeCalibration) -> None:
-    """Write calibration/fisheye.yaml, which `load_fisheye_yaml` reads back to an equal calibration."""
+    """Writes calibration/fisheye.yaml, which `load_fisheye_yaml` reads back to an equal calibration."""
     lens, described = calibration.lens, calibration.to_dict()
     extra: dict[str, object] = {}
     if lens.image_circle is not None:
@@ -180,7 +180,7 @@ def save_fisheye_yaml(path: Path, calibration: FisheyeCalibration) -> None:
 
 
 def describe_calibration(calibration: FisheyeCalibration) -> tuple[dict[str, object], bytes | None]:
-    """Return the calibration without its response as plain data, and the response (None = sRGB).
+    """Returns the calibration without its response as plain data, and the response (None = sRGB).
 
     The response is 256 x 3 little-endian 32-bit floats.
     """
@@ -190,7 +190,7 @@ def describe_calibration(calibration: FisheyeCalibration) -> tuple[dict[str, obj
 
 
 def calibration_of(description: Mapping[str, object], response: bytes | None) -> FisheyeCalibration:
-    """Create the calibration from the data of `describe_calibration`; equal data give the same object.
+    """Creates the calibration from the data of `describe_calibration`; equal data give the same object.
 
     Raises:
         DeltalightError: a value is impossible.

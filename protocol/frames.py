@@ -42,7 +42,7 @@ class DepthImage:
     noise_sigma_m: float | None = None
 
     def resized(self, width: int, height: int) -> "DepthImage":
-        """Return each pixel of another size from the pixel that its centre lies in.
+        """Returns each pixel of another size from the pixel that its centre lies in.
 
         A mean over an edge would be a surface where there is none.
         """
@@ -151,12 +151,12 @@ class ViewFrame:
 
 
 def decode_lut(response: Float32[np.ndarray, "256 3"] | None) -> Float32[np.ndarray, "256 3"]:
-    """Return the table camera code -> linear R G B (1.0 = sensor white); None: sRGB (IEC 61966-2-1)."""
+    """Returns the table camera code -> linear R G B (1.0 = sensor white); None: sRGB (IEC 61966-2-1)."""
     return _srgb_lut() if response is None else response
 
 
 def linear_color(frame: ViewFrame, color: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Return a camera-coded picture of a frame in linear camera units (1.0 = sensor white, reference exposure)."""
+    """Returns a camera-coded picture of a frame in linear camera units (1.0 = sensor white, reference exposure)."""
     lut = decode_lut(frame.response) / np.float32(frame.exposure_scale)
     return np.stack([lut[color[..., channel], channel] for channel in range(3)], axis=-1)
 
@@ -171,6 +171,6 @@ def _srgb_lut() -> Float32[np.ndarray, "256 3"]:
 
 
 def srgb_code(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return the code of sRGB (IEC 61966-2-1), 0..1, of linear values; those outside of 0..1 are clipped."""
+    """Returns the code of sRGB (IEC 61966-2-1), 0..1, of linear values; those outside of 0..1 are clipped."""
     clipped = np.clip(linear, 0, 1)
     return np.asarray(np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055))

@@ -31,20 +31,20 @@ class GrowingFile:
         self._lock = Lock()
 
     def write(self, data: bytes) -> int:
-        """Append to what the next `commit` hands to the system."""
+        """Appends to what the next `commit` hands to the system."""
         with self._lock:
             self._unsynced += data
         return len(data)
 
     def tell(self) -> int:
-        """Return the size with all that was written, in bytes."""
+        """Returns the size with all that was written, in bytes."""
         return self._synced + len(self._unsynced)
 
     def flush(self) -> None:
-        """Do nothing: only the caller knows what belongs together, and commits it."""
+        """Does nothing: only the caller knows what belongs together, and commits it."""
 
     def commit(self) -> None:
-        """Hand all that was written to the system; if this fails, nothing of it, and the next call tries it again.
+        """Hands all that was written to the system; if this fails, nothing of it, and the next call tries it again.
 
         Raises:
             OSError: the disk refuses.
@@ -64,7 +64,7 @@ class GrowingFile:
                 self._forget_until(end)
 
     def sync(self) -> None:
-        """Bring what was committed to the disk, while the other thread goes on writing.
+        """Brings what was committed to the disk, while the other thread goes on writing.
 
         Raises:
             OSError: the disk refuses; the next `commit` repeats what may be lost.
@@ -87,7 +87,7 @@ class GrowingFile:
             self._forget_until(end)
 
     def close(self) -> None:
-        """Close the file; idempotent."""
+        """Closes the file; idempotent."""
         with self._lock:
             if self._file is not None:
                 self._file.close()
@@ -108,7 +108,7 @@ class GrowingFile:
             position += os.pwrite(file.fileno(), piece, position)  # a limit may cut a piece short
 
     def _withdraw(self, file: FileIO) -> None:
-        """Leave only what was committed, and close the file; a disk that is read-only keeps the piece of a chunk."""
+        """Leaves only what was committed, and closes the file; a read-only disk keeps the piece of a chunk."""
         with suppress(OSError):
             os.ftruncate(file.fileno(), min(self._committed, os.fstat(file.fileno()).st_size))
         with suppress(OSError):

@@ -12,13 +12,13 @@ from jaxtyping import Float, Float32, Float64
 
 
 def hemisphere_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Return the unit direction (z >= 0) of map coordinates in 0..1."""
+    """Returns the unit direction (z >= 0) of map coordinates in 0..1."""
     point = _octahedron_point(uv)
     return np.asarray(point / np.linalg.norm(point, axis=-1, keepdims=True))
 
 
 def hemisphere_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
-    """Return the map coordinates of directions of any length; meaningless where z < 0."""
+    """Returns the map coordinates of directions of any length; meaningless where z < 0."""
     d = np.asarray(direction)
     x, y, z = np.moveaxis(d, -1, 0)
     scale = np.abs(x) + np.abs(y) + z
@@ -27,13 +27,13 @@ def hemisphere_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray,
 
 @cache
 def texel_directions(size: int) -> Float32[np.ndarray, "n n 3"]:
-    """Return the unit direction through every texel's centre (read-only)."""
+    """Returns the unit direction through every texel's centre (read-only)."""
     return _frozen(hemisphere_direction(_grid(size)))
 
 
 @cache
 def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
-    """Return the solid angle of every texel, sr (read-only); they add up to 2 pi.
+    """Returns the solid angle of every texel, sr (read-only); they add up to 2 pi.
 
     A patch dA of the octahedron seen from the centre at distance r has dA cos / r^2, proportional to r^-3.
     """

@@ -35,7 +35,7 @@ class HemisphereMap:
 
     @classmethod
     def of(cls, radiance_map: RadianceMap) -> Self:
-        """Build from a fish-eye camera's radiance map."""
+        """Builds from a fish-eye camera's radiance map."""
         radiance = radiance_map.radiance * radiance_map.seen[..., None]
         return cls(radiance, radiance_map.seen, np.asarray(radiance_map.world_from_fisheye[:3, :3]))
 
@@ -50,7 +50,7 @@ class HemisphereMap:
         return float(self.grid.solid_angles[self.seen].sum(dtype=np.float64))
 
     def with_radiance(self, radiance: Float32[np.ndarray, "n n 3"]) -> Self:
-        """Return the map with other radiance."""
+        """Returns the map with other radiance."""
         return replace(self, radiance=radiance)
 
 
@@ -67,12 +67,12 @@ class WorldSky:
     seen: Float32[np.ndarray, "m m 1"]
 
     def filled(self) -> Float32[np.ndarray, "m m 3"]:
-        """Return radiance in all directions; unseen ones get the weighted mean of nearby seen ones."""
+        """Returns radiance in all directions; unseen ones get the weighted mean of nearby seen ones."""
         return np.asarray(self.radiance + (1 - self.seen) * _nearby_mean(self.radiance, self.seen))
 
 
 def to_world(sky: HemisphereMap, size: int) -> WorldSky:
-    """Average a map over the texels of an octahedral grid in world axes."""
+    """Averages a map over the texels of an octahedral grid in world axes."""
     place, weight = _sampling(sky.world_from_map.astype(np.float64).tobytes(), len(sky.radiance), size)
     rgbs = np.dstack([sky.radiance, sky.seen.astype(np.float32)])
     samples = cv2.remap(rgbs, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -85,7 +85,7 @@ def to_world(sky: HemisphereMap, size: int) -> WorldSky:
 def _sampling(
     rotation: bytes, map_size: int, size: int
 ) -> tuple[Float32[np.ndarray, "k k 2"], Float32[np.ndarray, "k k"]]:
-    """Return where to read a map for each sample of the octahedral grid, and the sample's weight (0 behind).
+    """Returns where to read a map for each sample of the octahedral grid, and the sample's weight (0 behind).
 
     Samples are half as far apart as the map's texels, with at least 2x2 per texel of the grid.
     """
@@ -101,7 +101,7 @@ def _sampling(
 def _nearby_mean(
     radiance: Float32[np.ndarray, "m m 3"], seen: Float32[np.ndarray, "m m 1"]
 ) -> Float32[np.ndarray, "m m 3"]:
-    """Return the mean seen radiance around each direction, weighted by a power of the cosine."""
+    """Returns the mean seen radiance around each direction, weighted by a power of the cosine."""
     size = len(radiance)
     coarse = min(size, COARSE_SIZE)
     both = np.dstack([radiance, seen]) * texel_weights(coarse, size // coarse)[..., None]
@@ -113,7 +113,7 @@ def _nearby_mean(
 
 @cache
 def _coarse_coordinates(size: int, coarse: int) -> Float32[np.ndarray, "m m 2"]:
-    """Return where to read a coarse map for the texels of a finer one."""
+    """Returns where to read a coarse map for the texels of a finer one."""
     return texel_coordinates(octahedral_grid(size), coarse)
 
 

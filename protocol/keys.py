@@ -46,11 +46,11 @@ class Keys:
     on_loopback: bool = False
 
     def trusted(self) -> dict[str, bytes]:
-        """Return the trusted public keys and the own one, by name."""
+        """Returns the trusted public keys and the own one, by name."""
         return {**trusted_keys(self.folder), self.name: self.public}
 
     def peer(self, endpoint: Endpoint) -> bytes:
-        """Return the public key of the host behind an endpoint.
+        """Returns the public key of the host behind an endpoint.
 
         That is the one that the endpoint names; without a name, the own key on loopback, else the only other one.
 
@@ -94,7 +94,7 @@ class KeySettings(StrictModel):
     )
 
     def load(self, endpoints: Iterable[str]) -> Keys | None:
-        """Return the keys that a process with these endpoints uses, None if it needs none.
+        """Returns the keys that a process with these endpoints uses, None if it needs none.
 
         Raises:
             DeltalightError: keys are required but missing, or they cannot be used.
@@ -108,17 +108,17 @@ class KeySettings(StrictModel):
 
 
 def config_home() -> Path:
-    """Return the user's configuration folder of Deltalight (XDG base directory specification)."""
+    """Returns the user's configuration folder of Deltalight (XDG base directory specification)."""
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "deltalight"
 
 
 def key_folder() -> Path:
-    """Return the default folder of keys."""
+    """Returns the default folder of keys."""
     return config_home() / "keys"
 
 
 def create_keys(name: str, folder: Path) -> tuple[Path, Path]:
-    """Create a key pair; return the public and the secret file.
+    """Creates a key pair; returns the public and the secret file.
 
     Raises:
         DeltalightError: the name is wrong or taken, or the folder cannot be written.
@@ -146,7 +146,7 @@ def create_keys(name: str, folder: Path) -> tuple[Path, Path]:
 
 
 def load_keys(name: str | None, folder: Path, *, purpose: str = "this", on_loopback: bool = False) -> Keys:
-    """Read a key pair of this host: the one called `name`, or the only one.
+    """Reads a key pair of this host: the one called `name`, or the only one.
 
     Raises:
         DeltalightError: there is none or several, or others can read the secret file.
@@ -171,7 +171,7 @@ def load_keys(name: str | None, folder: Path, *, purpose: str = "this", on_loopb
 
 
 def trust(file: Path, folder: Path, name: str | None = None) -> Path:
-    """Trust another host's public key; return the path where it is stored.
+    """Trusts another host's public key; returns the path where it is stored.
 
     Raises:
         DeltalightError: the file holds no public key or a secret one, or another key has the name.
@@ -195,12 +195,12 @@ def trust(file: Path, folder: Path, name: str | None = None) -> Path:
 
 
 def own_keys(folder: Path) -> list[str]:
-    """Return the names of the key pairs in a folder."""
+    """Returns the names of the key pairs in a folder."""
     return sorted(path.name.removesuffix(SECRET) for path in folder.glob(f"*{SECRET}"))
 
 
 def trusted_keys(folder: Path) -> dict[str, bytes]:
-    """Return the trusted public keys of a folder by name; files without one are left out."""
+    """Returns the trusted public keys of a folder by name; files without one are left out."""
     found = {}
     for path in sorted((folder / TRUSTED).glob(f"*{PUBLIC}")):
         try:
@@ -211,7 +211,7 @@ def trusted_keys(folder: Path) -> dict[str, bytes]:
 
 
 def _read(path: Path) -> tuple[bytes, bytes | None]:
-    """Return public and secret key of a file in pyzmq's form."""
+    """Returns public and secret key of a file in pyzmq's form."""
     try:
         return zmq.auth.load_certificate(path)
     except (OSError, ValueError) as error:

@@ -17,7 +17,7 @@ Parts = Sequence[memoryview]
 
 
 def fisheye_pictures(message: FisheyeMessage, parts: Parts) -> FisheyePictures:
-    """Return the pictures of a message; their time is its capture time.
+    """Returns the pictures of a message; their time is its capture time.
 
     Raises:
         DeltalightError: a picture cannot be decoded, or the calibration is invalid.
@@ -27,7 +27,7 @@ def fisheye_pictures(message: FisheyeMessage, parts: Parts) -> FisheyePictures:
 
 
 def radiance_map(message: RadianceMessage, parts: Parts) -> RadianceMap:
-    """Return the map of a message; its time is its capture time.
+    """Returns the map of a message; its time is its capture time.
 
     Raises:
         DeltalightError: a part cannot be decoded or holds impossible values, or the calibration is invalid.
@@ -49,7 +49,7 @@ def radiance_map(message: RadianceMessage, parts: Parts) -> RadianceMap:
 
 
 def sky_lights(message: LightsMessage, parts: Parts) -> SkyLights:
-    """Return the lights of a message.
+    """Returns the lights of a message.
 
     Raises:
         DeltalightError: a part cannot be decoded or holds impossible values.
@@ -80,7 +80,7 @@ def sky_lights(message: LightsMessage, parts: Parts) -> SkyLights:
 
 
 def lamp_poses(message: LampsMessage) -> tuple[LampPose, ...]:
-    """Return the lamps of a message."""
+    """Returns the lamps of a message."""
     return tuple(LampPose(lamp.marker, np.array(lamp.world_from_marker)) for lamp in message.lamps)
 
 

@@ -28,7 +28,7 @@ class LightCutter:
         self._newest: tuple[RadianceMap, Split[HemisphereMap], WorldSky] | None = None
 
     def update(self, frame: ViewFrame) -> SkyLights | None:
-        """Return the lights of a frame; None where they did not change, and until a frame brings the first map."""
+        """Returns the lights of a frame; None where they did not change, and until a frame brings the first map."""
         newest, seen = self._newest, frame.radiance_map
         if seen is not None and (newest is None or seen is not newest[0]):
             newest = self._newest = self._split(frame, seen)
@@ -48,7 +48,7 @@ class LightCutter:
     def _split(
         self, frame: ViewFrame, seen: RadianceMap
     ) -> tuple[RadianceMap, Split[HemisphereMap], WorldSky]:
-        """Cut a new map and make it the tracker's target."""
+        """Cuts a new map and makes it the tracker's target."""
         split = split_map(
             HemisphereMap.of(seen),
             self._cut.count,

@@ -42,7 +42,7 @@ class LightTracker:
     def set_target(
         self, timestamp_ns: int, lights: tuple[RegionLight, ...], residual: Float32[np.ndarray, "n n 3"]
     ) -> None:
-        """Set the split of a new map as the target from this time on."""
+        """Sets the split of a new map as the target from this time on."""
         self.advance(timestamp_ns, at_once=True)
         self._clock_ns = timestamp_ns
         self._target = self._identified(lights)
@@ -56,7 +56,7 @@ class LightTracker:
             self._settle()
 
     def advance(self, timestamp_ns: int, *, at_once: bool = False) -> bool:
-        """Advance the filter; returns whether lights changed. Small steps are accumulated unless `at_once`."""
+        """Advances the filter; returns whether lights changed. Small steps are accumulated unless `at_once`."""
         self._clock_ns = min(self._clock_ns, timestamp_ns)
         passed_s = (timestamp_ns - self._clock_ns) * NS
         least_s = 0.0 if at_once else self._smoothing_s / STEPS_PER_CONSTANT
@@ -74,7 +74,7 @@ class LightTracker:
         self.lights, self.residual, self._to_settle_s = self._target, self._target_residual, 0.0
 
     def _approach(self, fraction: float) -> None:
-        """Move this fraction of the way to the target; lights without a target fade out."""
+        """Moves this fraction of the way to the target; lights without a target fade out."""
         target = {light.identity: light for light in self._target}
         assert self.residual is not None
         assert self._target_residual is not None
@@ -84,7 +84,7 @@ class LightTracker:
         self.residual = self.residual + np.float32(fraction) * (self._target_residual - self.residual)
 
     def _without_faint(self, lights: tuple[TrackedLight, ...]) -> tuple[TrackedLight, ...]:
-        """Drop fading lights that are too faint to matter, and the faintest of too many."""
+        """Drops fading lights that are too faint to matter, and the faintest of too many."""
         target = self._target_identities
         faintest = FORGOTTEN_FRACTION * sum(_strength(light) for light in lights)
         fading = sorted((_strength(light) for light in lights if light.identity not in target), reverse=True)
@@ -94,7 +94,7 @@ class LightTracker:
         return tuple(light for light in lights if light.identity in target or _strength(light) > faintest)
 
     def _identified(self, lights: tuple[RegionLight, ...]) -> tuple[TrackedLight, ...]:
-        """Give each new light the identity of the light that it continues, or a new one."""
+        """Gives each new light the identity of the light that it continues, or a new one."""
         old = self._matched(lights)
         numbered = []
         for index, light in enumerate(lights):
@@ -107,7 +107,7 @@ class LightTracker:
         return tuple(numbered)
 
     def _matched(self, lights: tuple[RegionLight, ...]) -> dict[int, int]:
-        """Match new lights (by index) to identities of old ones: pairs close in direction and energy."""
+        """Matches new lights (by index) to identities of old ones: pairs close in direction and energy."""
         # Fading lights may come back; of two at the same distance, the shining one is likelier.
         old = [
             *self._target,
@@ -139,7 +139,7 @@ def _strength(light: TrackedLight | RegionLight) -> float:
 
 
 def _blended(light: TrackedLight, target: TrackedLight | None, fraction: float) -> TrackedLight:
-    """Interpolate between a light and its target."""
+    """Interpolates between a light and its target."""
     if target is None:
         return replace(light, irradiance=(1 - fraction) * light.irradiance)
     to_light = light.to_light + fraction * (target.to_light - light.to_light)

@@ -59,7 +59,7 @@ class SkyMap(Protocol):
         ...
 
     def with_radiance(self, radiance: Float32[np.ndarray, "h w 3"]) -> Self:
-        """Return the map with other radiance."""
+        """Returns the map with other radiance."""
         ...
 
 
@@ -95,7 +95,7 @@ def split_map(
     whole_map: bool = False,
     is_occluded: OcclusionTest | None = None,
 ) -> Split[MapT]:
-    """Split a map into at most `count` lights and a residual (docs/method.md 2).
+    """Splits a map into at most `count` lights and a residual (docs/method.md 2).
 
     What is brighter than c, `threshold` times the solid-angle mean of what is known, is cut into regions. Each
     becomes a light, and leaves the mean of everything darker in the residual; one wider than 15 degrees, which is no
@@ -126,12 +126,12 @@ def split_map(
 
 
 def luminance_of(radiance: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Return the luminance of every pixel (ITU-R BT.709)."""
+    """Returns the luminance of every pixel (ITU-R BT.709)."""
     return np.asarray(cv2.transform(radiance, LUMINANCE[None]), np.float32)
 
 
 def _mean_below(sky: SkyMap, luminance: Float32[np.ndarray, "h w"], limit: float) -> float:
-    """Return the mean luminance of the known directions that are not above the limit; 0 if there are none."""
+    """Returns the mean luminance of the known directions that are not above the limit; 0 if there are none."""
     above = (luminance > np.float32(limit)).astype(np.float32)
     solid_angles = sky.grid.solid_angles
     known = sky.known_solid_angle - float(np.vdot(above, solid_angles))
@@ -142,7 +142,7 @@ def _mean_below(sky: SkyMap, luminance: Float32[np.ndarray, "h w"], limit: float
 def _peaks(
     sky: SkyMap, luminance: Float32[np.ndarray, "h w"], region: Region, limit: float, left: float
 ) -> Float32[np.ndarray, "a b 3"]:
-    """Return the radiance of a region's pixels above the limit without the luminance that is left there."""
+    """Returns the radiance of a region's pixels above the limit without the luminance that is left there."""
     bright = luminance[region.window]
     taken = np.where(bright > np.float32(limit), bright - np.float32(left), 0)
     return np.asarray(
@@ -151,7 +151,7 @@ def _peaks(
 
 
 def _bounding(luminance: Float32[np.ndarray, "h w"], limit: float, region: Region) -> Region:
-    """Return the least rectangle around a region's pixels above the limit; empty if there are none."""
+    """Returns the least rectangle around a region's pixels above the limit; empty if there are none."""
     above = cv2.compare(luminance[region.window], limit, cv2.CMP_GT)
     left, top, width, height = cv2.boundingRect(above)
     return _moved(Region(top, top + height, left, left + width), region)
@@ -163,7 +163,7 @@ def _moved(region: Region, origin: Region) -> Region:
 
 
 def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3"]) -> RegionLight:
-    """Integrate a region: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
+    """Integrates a region: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
     directions = sky.grid.directions[region.window]
     solid_angles = sky.grid.solid_angles[region.window]
     weight = (luminance_of(peaks) * solid_angles).ravel()
@@ -218,14 +218,14 @@ class _Table:
         return np.asarray(lower[region.right] - lower[region.left] - upper[region.right] + upper[region.left])
 
     def spread(self, region: Region) -> float:
-        """Return the spread of a region that is worth cutting, else 0."""
+        """Returns the spread of a region that is worth cutting, else 0."""
         sums = self.sums(region)
         spread = float(_spread(sums))
         # Radius as of a light: sqrt(2 mean squared angle).
         return 0.0 if 2 * spread <= MIN_RADIUS_RAD**2 * sums[0] else spread
 
     def halves(self, region: Region) -> tuple[Region, Region] | None:
-        """Cut a region where the sum of both sides' spreads is least; None for a single pixel."""
+        """Cuts a region where the sum of both sides' spreads is least; None for a single pixel."""
         top, bottom, left, right = region.top, region.bottom, region.left, region.right
         row = _best_cut(self.values[top : bottom + 1, right] - self.values[top : bottom + 1, left])
         column = _best_cut(self.values[bottom, left : right + 1] - self.values[top, left : right + 1])
@@ -240,7 +240,7 @@ class _Table:
 
 
 def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
-    """Return where to cut a row of running sums, and the spread of both sides; None if it cannot be cut."""
+    """Returns where to cut a row of running sums, and the spread of both sides; None if it cannot be cut."""
     if len(running) < 3:
         return None
     before = running[1:-1] - running[0]
@@ -250,7 +250,7 @@ def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
 
 
 def _spread(moments: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n"]:
-    """Return the weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
+    """Returns the weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
     weight = moments[..., 0]
     pull = np.einsum("...i,...i", moments[..., 1:], moments[..., 1:])
     return np.asarray(np.maximum(weight - pull / np.maximum(weight, 1e-300), 0))

@@ -24,7 +24,7 @@ LENGTH_TOLERANCE = 1e-2
 
 
 def _plain(value: object, depth: int = 0) -> object:
-    """Refuse what JSON cannot express: other types, numbers that are not finite, deep nesting."""
+    """Refuses what JSON cannot express: other types, numbers that are not finite, deep nesting."""
     if depth > MAX_PLAIN_DEPTH:
         raise ValueError(f"is nested deeper than {MAX_PLAIN_DEPTH} levels")
     if isinstance(value, dict):
@@ -47,7 +47,7 @@ def _plain(value: object, depth: int = 0) -> object:
 
 
 def _encodable(text: str) -> None:
-    """Refuse lone surrogates, which JSON can escape and no message can carry."""
+    """Refuses lone surrogates, which JSON can escape and no message can carry."""
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -55,12 +55,12 @@ def _encodable(text: str) -> None:
 
 
 def as_sentence(text: str) -> str:
-    """Return any text as a `Sentence`: cut to its length, with question marks for lone surrogates."""
+    """Returns any text as a `Sentence`: cuts to its length, with question marks for lone surrogates."""
     return text[:MAX_SENTENCE].encode("utf-8", "replace").decode()
 
 
 def as_counts(counts: Mapping[str, int]) -> dict[str, int]:
-    """Return any counts as `Counts`: labels cut to their length, those beyond the first 127 as one sum `others`."""
+    """Returns any counts as `Counts`: labels cut to their length, those beyond the first 127 as one sum `others`."""
     kept: dict[str, int] = {}
     for label, count in counts.items():
         name = label[:MAX_LABEL]

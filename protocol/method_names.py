@@ -13,7 +13,7 @@ METHODS = ("dvct", "exact", "paper", "dlpv", "dlpv-paper", "aroof", "differentia
 
 
 def require_method(name: str) -> str:
-    """Return the name if there is such a method, the project's or an installed plugin's.
+    """Returns the name if there is such a method, the project's or an installed plugin's.
 
     Raises:
         DeltalightError: there is none, or it comes from a plugin that cannot be used.
@@ -31,7 +31,7 @@ def require_method(name: str) -> str:
 
 
 def with_method(scene: "SceneDocument", method: str) -> "SceneDocument":
-    """Return the scene with a method: `exact` or `paper` (operators of dvct), or NAME[-OPERATOR].
+    """Returns the scene with a method: `exact` or `paper` (operators of dvct), or NAME[-OPERATOR].
 
     An installed plugin's, too. A method that the scene has keeps its settings.
 

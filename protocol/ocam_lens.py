@@ -97,7 +97,7 @@ class OcamLens(RadialLens):
         return self._curve.inverse(angle)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values that msgpack, JSON and YAML can hold."""
+        """Returns plain values that msgpack, JSON and YAML can hold."""
         return {
             "width": self.width,
             "height": self.height,
@@ -110,7 +110,7 @@ class OcamLens(RadialLens):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Create the lens from the data of `to_dict`; a polynomial with OCamCalib's sign is negated.
+        """Creates the lens from the data of `to_dict`; a polynomial with OCamCalib's sign is negated.
 
         Raises:
             DeltalightError: a key is missing or has an impossible value.
@@ -130,7 +130,7 @@ class OcamLens(RadialLens):
 
 
 def load_ocam_results(path: Path) -> OcamLens:
-    """Read OCamCalib's calib_results.txt.
+    """Reads OCamCalib's calib_results.txt.
 
     Its five number lines are the polynomial (count first; its axis points backwards), the inverse polynomial (unused:
     the exact inverse is computed), the centre as row and column counted from 0, c d e, and height and width. So a

@@ -39,7 +39,7 @@ def are_occluded(
     directions: Float[np.ndarray, "r 3"],
     along: Float[np.ndarray, " s"],
 ) -> Bool[np.ndarray, " r"]:
-    """Return which rays pass through a surface of the depth image between two of the distances `along` them, m.
+    """Returns which rays pass through a surface of the depth image between two of the distances `along` them, m.
 
     Passing behind something near the camera is no hit: the ray must enter a surface from the front and lie close
     behind it.

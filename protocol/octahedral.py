@@ -17,13 +17,13 @@ SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"
 
 
 def octahedral_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Return the unit direction of map coordinates in 0..1."""
+    """Returns the unit direction of map coordinates in 0..1."""
     folded = _folded_direction(uv)
     return np.asarray(folded / np.linalg.norm(folded, axis=-1, keepdims=True))
 
 
 def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Return the point of the octahedron |x| + |y| + |z| = 1."""
+    """Returns the point of the octahedron |x| + |y| + |z| = 1."""
     p = 2 * np.asarray(uv, np.float64) - 1
     z = 1 - np.abs(p).sum(axis=-1)
     below = np.maximum(-z, 0)[..., None]
@@ -31,7 +31,7 @@ def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, 
 
 
 def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
-    """Return the map coordinates in 0..1 of directions of any length.
+    """Returns the map coordinates in 0..1 of directions of any length.
 
     Components apart take numpy half the time that vectors of three do.
     """
@@ -48,7 +48,7 @@ def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray,
 
 @cache
 def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
-    """Return the unit directions of the texel centres of a size x size map (read-only)."""
+    """Returns the unit directions of the texel centres of a size x size map (read-only)."""
     directions = octahedral_direction(_grid_uv(size))
     directions.flags.writeable = False
     return directions
@@ -56,7 +56,7 @@ def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
 
 @cache
 def texel_weights(size: int, supersampling: int) -> Float32[np.ndarray, "k k"]:
-    """Return the solid angles of supersampling^2 samples per texel, relative to the mean of their texel."""
+    """Returns the solid angles of supersampling^2 samples per texel, relative to the mean of their texel."""
     weight = np.linalg.norm(_folded_direction(_grid_uv(size * supersampling)), axis=-1) ** -3
     mean = weight.reshape(size, supersampling, size, supersampling).mean(axis=(1, 3))
     return np.asarray(weight / mean.repeat(supersampling, 0).repeat(supersampling, 1), np.float32)
@@ -69,7 +69,7 @@ def _grid_uv(size: int) -> Float64[np.ndarray, "n n 2"]:
 
 @cache
 def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
-    """Return the solid angle of every texel, sr; they add up to 4 pi.
+    """Returns the solid angle of every texel, sr; they add up to 4 pi.
 
     A patch dA of the octahedron seen from the centre at distance r has dA cos / r^2, proportional to r^-3.
     """
@@ -82,7 +82,7 @@ def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
 
 
 def resample_to_octahedral(sample: SampleMap, size: int) -> np.ndarray:
-    """Average a radiance function over the texels of an octahedral map, weighted by solid angle.
+    """Averages a radiance function over the texels of an octahedral map, weighted by solid angle.
 
     `sample` maps directions (n, m, 3) to radiance (n, m, c); every texel takes SUPERSAMPLING^2 of them.
     """
@@ -98,17 +98,17 @@ def resample_to_octahedral(sample: SampleMap, size: int) -> np.ndarray:
 def sample_octahedral(
     radiance: Float32[np.ndarray, "n n 3"], directions: Float[np.ndarray, "a b 3"]
 ) -> Float32[np.ndarray, "a b 3"]:
-    """Read a map bilinearly; interpolation continues across the map's border."""
+    """Reads a map bilinearly; interpolation continues across the map's border."""
     return sample_at(radiance, texel_coordinates(directions, len(radiance)))
 
 
 def texel_coordinates(directions: Float[np.ndarray, "a b 3"], size: int) -> Float32[np.ndarray, "a b 2"]:
-    """Return where `sample_at` reads a map of this size for directions."""
+    """Returns where `sample_at` reads a map of this size for directions."""
     return (octahedral_uv(directions) * size + 0.5).astype(np.float32)
 
 
 def resize_octahedral(radiance: Float32[np.ndarray, "n n 3"], size: int) -> Float32[np.ndarray, "m m 3"]:
-    """Read a map bilinearly at the texel centres of one of another size."""
+    """Reads a map bilinearly at the texel centres of one of another size."""
     return sample_at(radiance, _grid_coordinates(size, len(radiance)))
 
 
@@ -122,12 +122,12 @@ def _grid_coordinates(size: int, source_size: int) -> Float32[np.ndarray, "n n 2
 def sample_at(
     radiance: Float32[np.ndarray, "n n 3"], coordinates: Float32[np.ndarray, "a b 2"]
 ) -> Float32[np.ndarray, "a b 3"]:
-    """Read a map bilinearly at coordinates that `texel_coordinates` returned."""
+    """Reads a map bilinearly at coordinates that `texel_coordinates` returned."""
     return np.asarray(cv2.remap(_bordered(radiance), coordinates, None, cv2.INTER_LINEAR))
 
 
 def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
-    """Add a border of one texel: across an edge of the map lies the same edge, mirrored about its middle."""
+    """Adds a border of one texel: across an edge of the map lies the same edge, mirrored about its middle."""
     rows = np.concatenate([radiance[:1, ::-1], radiance, radiance[-1:, ::-1]])
     left, right = rows[::-1, :1].copy(), rows[::-1, -1:].copy()
     return np.ascontiguousarray(np.concatenate([left, rows, right], axis=1))

@@ -23,7 +23,7 @@ Control = TypeVar("Control", ControlRequest, ControlReply)
 
 
 def encode_control(message: ControlRequest | ControlReply) -> list[bytes]:
-    """Return the multipart of a request or reply, with a long payload in a part.
+    """Returns the multipart of a request or reply, with a long payload in a part.
 
     Raises:
         EnvelopeError: the payload takes more than 4 MB, or holds an integer of more than 64 bits.
@@ -39,7 +39,7 @@ def encode_control(message: ControlRequest | ControlReply) -> list[bytes]:
 
 
 def decode_control(multipart: Sequence[Buffer], kind: type[Control]) -> Control:
-    """Return the request or reply of a multipart, with its payload in place.
+    """Returns the request or reply of a multipart, with its payload in place.
 
     Raises:
         EnvelopeError: it is malformed in any way, or a message of another kind.

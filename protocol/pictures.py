@@ -30,7 +30,7 @@ def is_jpeg(data: bytes) -> bool:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a picture file.
+    """Reads a picture file.
 
     Raises:
         DeltalightError: the file is missing or unreadable.
@@ -42,7 +42,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def decode_rgb(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode a picture file's bytes to RGB; `name` names the picture in errors.
+    """Decodes a picture file's bytes to RGB; `name` names the picture in errors.
 
     Raises:
         DeltalightError: OpenCV cannot read the bytes as a picture.
@@ -54,7 +54,7 @@ def decode_rgb(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def decode_depth_png(data: bytes, name: str) -> UInt16[np.ndarray, "h w"]:
-    """Decode a 16-bit depth picture.
+    """Decodes a 16-bit depth picture.
 
     Raises:
         DeltalightError: the bytes are damaged, or not a 16-bit picture of one channel.
@@ -70,7 +70,7 @@ def decode_depth_png(data: bytes, name: str) -> UInt16[np.ndarray, "h w"]:
 
 
 def _decode(data: bytes, flags: int) -> np.ndarray | None:
-    """Decode a PNG or JPEG; None for others, and for those that state more than their bytes can hold."""
+    """Decodes a PNG or JPEG; None for others, and for those that state more than their bytes can hold."""
     if _stated_bytes(data) > _MOST_PER_BYTE * len(data):
         return None
     try:
@@ -81,7 +81,7 @@ def _decode(data: bytes, flags: int) -> np.ndarray | None:
 
 
 def _stated_bytes(data: bytes) -> float:
-    """Return what a picture would take unpacked, by what it states; infinite if it is none, or not whole."""
+    """Returns what a picture would take unpacked, by what it states; infinite if it is none, or not whole."""
     if data.startswith(_PNG):
         return _stated_png_bytes(data)
     size = stated_jpeg_size(data) if is_jpeg(data) else None
@@ -103,7 +103,7 @@ def _stated_png_bytes(data: bytes) -> float:
 
 
 def encode_png(picture: np.ndarray) -> bytes:
-    """Encode an RGB (h, w, 3) or 16-bit (h, w) picture as PNG, without loss."""
+    """Encodes an RGB (h, w, 3) or 16-bit (h, w) picture as PNG, without loss."""
     stored = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
     # Level 1 is four times faster than the default and costs a tenth in size.
     return bytes(cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
@@ -112,14 +112,14 @@ def encode_png(picture: np.ndarray) -> bytes:
 def depth_from_steps(
     steps: UInt16[np.ndarray, "h w"], scale: float, camera: CameraModel, noise_sigma_m: float | None
 ) -> DepthImage:
-    """Return the depth image of stored steps of `scale` metres; 0 and 65535 are unknown."""
+    """Returns the depth image of stored steps of `scale` metres; 0 and 65535 are unknown."""
     valid = (steps != INVALID_CODES[0]) & (steps != INVALID_CODES[1])
     depth_m = np.where(valid, steps.astype(np.float32) * np.float32(scale), np.float32(0))
     return DepthImage(depth_m, valid, camera, noise_sigma_m)
 
 
 def steps_from_depth(depth: DepthImage, scale: float) -> UInt16[np.ndarray, "h w"]:
-    """Round depth to steps of `scale` metres; unknown depth, or too far for 16 bits, becomes 0."""
+    """Rounds depth to steps of `scale` metres; unknown depth, or too far for 16 bits, becomes 0."""
     with np.errstate(invalid="ignore"):
         steps = np.rint(depth.depth_m / np.float32(scale))
         known = depth.valid & (steps > INVALID_CODES[0]) & (steps < INVALID_CODES[1])
@@ -127,7 +127,7 @@ def steps_from_depth(depth: DepthImage, scale: float) -> UInt16[np.ndarray, "h w
 
 
 def exact_depth_scale(depth: DepthImage, hint: float | None) -> float | None:
-    """Return a step (metres) that stores the depth without loss: the hint, a usual one, or None."""
+    """Returns a step (metres) that stores the depth without loss: the hint, a usual one, or None."""
     for scale in (hint, *KNOWN_DEPTH_SCALES):
         if scale is not None and _is_exact(depth, scale):
             return scale
@@ -140,5 +140,5 @@ def _is_exact(depth: DepthImage, scale: float) -> bool:
 
 
 def known_depth(depth: DepthImage) -> Float32[np.ndarray, "h w"]:
-    """Return the depth in metres, 0 where the mask says unknown."""
+    """Returns the depth in metres, 0 where the mask says unknown."""
     return np.where(depth.valid, depth.depth_m, np.float32(0)).astype(np.float32)

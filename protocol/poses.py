@@ -11,7 +11,7 @@ from deltalight.protocol.errors import DeltalightError
 
 
 def rotation_from_wxyz(quaternion: Sequence[float]) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation matrix of a quaternion (w, x, y, z) of any length but zero."""
+    """Returns the rotation matrix of a quaternion (w, x, y, z) of any length but zero."""
     length = math.sqrt(sum(part * part for part in quaternion))
     w, x, y, z = (float(part) / length for part in quaternion)
     return np.array(
@@ -24,7 +24,7 @@ def rotation_from_wxyz(quaternion: Sequence[float]) -> Float64[np.ndarray, "3 3"
 
 
 def wxyz_from_rotation(rotation: Float64[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
+    """Returns the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
 
     The quaternion is the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix (Bar-Itzhack 2000),
     which is stable at every angle.
@@ -46,7 +46,7 @@ def wxyz_from_rotation(rotation: Float64[np.ndarray, "3 3"]) -> tuple[float, flo
 def rigid_matrix(
     rotation: Float64[np.ndarray, "3 3"], translation: Sequence[float] | Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return the 4x4 matrix of a rotation followed by a translation."""
+    """Returns the 4x4 matrix of a rotation followed by a translation."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = translation
@@ -54,7 +54,7 @@ def rigid_matrix(
 
 
 def require_rigid(matrix: object, name: str) -> Float64[np.ndarray, "4 4"]:
-    """Return a 4x4 matrix after checking that it is a proper rigid transform (orthonormal, determinant +1).
+    """Returns a 4x4 matrix after checking that it is a proper rigid transform (orthonormal, determinant +1).
 
     Raises:
         DeltalightError: it is not; `name` names the transform in the sentence.
@@ -80,7 +80,7 @@ def require_rigid(matrix: object, name: str) -> Float64[np.ndarray, "4 4"]:
 def interpolate_pose(
     start: Float64[np.ndarray, "4 4"], end: Float64[np.ndarray, "4 4"], fraction: float
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return the pose at `fraction` (0..1) of the path, rotating at constant speed about one axis."""
+    """Returns the pose at `fraction` (0..1) of the path, rotating at constant speed about one axis."""
     step, _ = cv2.Rodrigues(start[:3, :3].T @ end[:3, :3])
     turn, _ = cv2.Rodrigues(step * fraction)
     return rigid_matrix(start[:3, :3] @ turn, (1 - fraction) * start[:3, 3] + fraction * end[:3, 3])

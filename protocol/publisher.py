@@ -46,7 +46,7 @@ class Publisher:
         return 0 if self._guard is None else self._guard.refused
 
     def send(self, multipart: Sequence[bytes | memoryview]) -> None:
-        """Send one multipart [topic, header, part...]; its bytes are copied before this returns.
+        """Sends one multipart [topic, header, part...]; its bytes are copied before this returns.
 
         Raises:
             DeltalightError: a piece is too large for the receivers, or the publisher is closed.
@@ -62,7 +62,7 @@ class Publisher:
             self._socket.send_multipart(multipart)
 
     def close(self, linger_ms: int = 0) -> None:
-        """Close the socket; discard what is still queued after `linger_ms`."""
+        """Closes the socket; discards what is still queued after `linger_ms`."""
         if self._guard is not None:
             self._guard.close()
         with self._lock:

@@ -9,7 +9,7 @@ Quality = Literal["live", "balanced", "best"]
 
 
 def require_quality(name: Quality) -> Quality:
-    """Return the name if there is such a quality.
+    """Returns the name if there is such a quality.
 
     Raises:
         DeltalightError: there is none.

@@ -29,7 +29,7 @@ class RisingCurve:
         return x, self.value(x)
 
     def inverse(self, y: Values) -> Values:
-        """Return x of y; y outside the curve's range gives the nearer end."""
+        """Returns x of y; y outside the curve's range gives the nearer end."""
         xs, ys = self._table
         cell = np.clip(np.searchsorted(ys, y), 1, len(xs) - 1)
         low, high = xs[cell - 1], xs[cell]
@@ -71,7 +71,7 @@ class RadialLens(ABC):
     def _radius(self, angle: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]: ...
 
     def directions(self, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
-        """Return unit directions in the optical frame; NaN outside the image circle or the picture."""
+        """Returns unit directions in the optical frame; NaN outside the image circle or the picture."""
         pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
         plane = self._plane(pixels)
         radius = np.linalg.norm(plane, axis=1)
@@ -88,7 +88,7 @@ class RadialLens(ABC):
         return np.asarray(self._is_inside(pixels) & (radius <= self.largest_radius))
 
     def project(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-        """Return the pixels (x, y) of directions of any length; NaN outside the lens or the picture."""
+        """Returns the pixels (x, y) of directions of any length; NaN outside the lens or the picture."""
         d = np.asarray(directions, np.float64).reshape(-1, 3)
         across = np.hypot(d[:, 0], d[:, 1])
         angle = np.arctan2(across, d[:, 2])
@@ -99,7 +99,7 @@ class RadialLens(ABC):
         return pixels
 
     def _require_range(self) -> None:
-        """Compute the range of the model, which fails for impossible numbers.
+        """Computes the range of the model, which fails for impossible numbers.
 
         Raises:
             DeltalightError: the polynomial overflows or does not rise at all.
@@ -125,7 +125,7 @@ class RadialLens(ABC):
 
 
 def require_image_circle(value: object) -> float | None:
-    """Return an image circle's radius in pixels, or None if none is given.
+    """Returns an image circle's radius in pixels, or None if none is given.
 
     Raises:
         DeltalightError: it is not a positive number.
@@ -138,7 +138,7 @@ def require_image_circle(value: object) -> float | None:
 
 
 def first_root(polynomial: Float64[np.ndarray, " k"], end: float) -> float:
-    """Return a polynomial's smallest root above 0 (coefficients from power 0 up), or `end` if none is below it."""
+    """Returns a polynomial's smallest root above 0 (coefficients from power 0 up), or `end` if none is below it."""
     roots = np.polynomial.Polynomial(np.trim_zeros(polynomial, "b")).roots()
     real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
     return float(min([end, *real[real > 0]]))

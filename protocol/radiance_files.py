@@ -17,7 +17,7 @@ LINEAR_SUFFIXES = (".hdr", ".exr")
 
 
 def read_linear(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Read a .hdr or .exr picture as linear R G B; negative values (lossy compression leaves some) become 0.
+    """Reads a .hdr or .exr picture as linear R G B; negative values (lossy compression leaves some) become 0.
 
     Raises:
         DeltalightError: it cannot be read, holds values that are not finite, or is .exr and the package OpenEXR
@@ -34,7 +34,7 @@ def write_exr(
     linear: Float32[np.ndarray, "h w c"],
     layers: Mapping[str, Float32[np.ndarray, "h w ..."]] | None = None,
 ) -> None:
-    """Write linear RGB or RGBA as an OpenEXR file of 32-bit floats, without loss.
+    """Writes linear RGB or RGBA as an OpenEXR file of 32-bit floats, without loss.
 
     `layers` by name: further ones with R G B of their own, or with one value, such as `Z`.
 
@@ -54,7 +54,7 @@ def write_exr(
 
 
 def require_openexr(purpose: str) -> ModuleType:
-    """Return the OpenEXR package; `purpose` begins the error sentence by naming what needs it.
+    """Returns the OpenEXR package; `purpose` begins the error sentence by naming what needs it.
 
     Raises:
         DeltalightError: it is not installed.

@@ -36,7 +36,7 @@ class Receiver(Subscriber):
         super().__init__(endpoints, self._topics or ("",), bind=bind, keys=keys)
 
     def latest(self, timeout_s: float) -> dict[str, ReceivedMultipart] | None:
-        """Take the newest message of every topic that has one, by topic.
+        """Takes the newest message of every topic that has one, by topic.
 
         Waits for a message; returns None after `timeout_s` seconds without any, or when the receiver is closed.
         """

@@ -34,7 +34,7 @@ Messages = Sequence[tuple[str, bytes]]
 
 
 def fisheye_messages(pictures: FisheyePictures) -> Iterator[tuple[str, bytes]]:
-    """Yield the group (topic, message) of fish-eye pictures in its order."""
+    """Yields the group (topic, message) of fish-eye pictures in its order."""
     for picture in pictures.pictures:
         yield _picture_message(picture, pictures.timestamp_ns)
     camera = _camera_message(pictures.calibration.lens, pictures.timestamp_ns)
@@ -100,7 +100,7 @@ class FisheyeTrack:
         self._kept: tuple[int, FisheyePictures] | None = None
 
     def at(self, time_ns: int) -> FisheyePictures | None:
-        """Return the newest complete pictures recorded up to a log time, else the first ones (docs/formats.md 1).
+        """Returns the newest complete pictures recorded up to a log time, else the first ones (docs/formats.md 1).
 
         Raises:
             DeltalightError: a group was not written by `fisheye_messages`.

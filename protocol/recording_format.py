@@ -70,12 +70,12 @@ class _Record(BaseModel):
     schema_version: int = SCHEMA_VERSION
 
     def packed(self) -> bytes:
-        """Return the message as msgpack."""
+        """Returns the message as msgpack."""
         return bytes(msgpack.packb(self.model_dump()))
 
     @classmethod
     def unpacked(cls, data: bytes, name: str) -> Self:
-        """Read the message of a recording called `name`.
+        """Reads the message of a recording called `name`.
 
         Raises:
             DeltalightError: another schema version, or a malformed message.
@@ -146,12 +146,12 @@ OWN_TOPICS: dict[str, type[_Record]] = {
 
 
 def timestamp_fields(timestamp_ns: int) -> dict[str, int]:
-    """Return the fields of a protobuf timestamp."""
+    """Returns the fields of a protobuf timestamp."""
     return {"seconds": timestamp_ns // 10**9, "nanos": timestamp_ns % 10**9}
 
 
 def calibration_message(camera: CameraModel, frame: str, timestamp_ns: int) -> CameraCalibration:
-    """Describe a camera for Foxglove; unsupported lens models become a pinhole."""
+    """Describes a camera for Foxglove; unsupported lens models become a pinhole."""
     name, coefficients = _foxglove_lens(camera)
     matrix = camera.matrix
     return CameraCalibration(
@@ -179,7 +179,7 @@ def _foxglove_lens(camera: CameraModel) -> tuple[str, list[float]]:
 def transform_message(
     parent_from_child: Float64[np.ndarray, "4 4"], parent: str, child: str, timestamp_ns: int
 ) -> FrameTransform:
-    """Describe a rigid transform for Foxglove."""
+    """Describes a rigid transform for Foxglove."""
     message = FrameTransform(
         timestamp=timestamp_fields(timestamp_ns), parent_frame_id=parent, child_frame_id=child
     )
@@ -191,7 +191,7 @@ def transform_message(
 
 
 def matrix_of(message: FrameTransform) -> Float64[np.ndarray, "4 4"]:
-    """Return the transform that a message of `transform_message` describes: parent_from_child."""
+    """Returns the transform that a message of `transform_message` describes: parent_from_child."""
     place, turn = message.translation, message.rotation
     rotation = rotation_from_wxyz((turn.w, turn.x, turn.y, turn.z))
     return rigid_matrix(rotation, np.array([place.x, place.y, place.z]))

@@ -109,11 +109,11 @@ class RecordingReader:
         return len(self.timestamps_ns)
 
     def __iter__(self) -> Iterator[SensorFrame]:
-        """Yield every frame in order."""
+        """Yields every frame in order."""
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> SensorFrame:
-        """Decode one frame.
+        """Decodes one frame.
 
         Raises:
             IndexError: no such frame.
@@ -149,12 +149,12 @@ class RecordingReader:
         )
 
     def _camera(self, record: FrameRecord) -> CameraModel:
-        """Return the camera, the same instance while it does not change, so that its rays are computed once."""
+        """Returns the camera, the same instance while it does not change, so that its rays are computed once."""
         camera = CameraModel.from_dict(record.camera)
         return self.camera if camera == self.camera else camera
 
     def _open(self) -> Times:
-        """Find the chunks and the times of all records: by the index if there is one, else by a scan."""
+        """Finds the chunks and the times of all records: by the index if there is one, else by a scan."""
         try:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -220,7 +220,7 @@ class RecordingReader:
         self._spans.append(_Span(offset, record.message_start_time, record.message_end_time))
 
     def _parts(self, time_ns: int) -> list[tuple[str, bytes]]:
-        """Return the readable messages (topic, data) of a time in their order."""
+        """Returns the readable messages (topic, data) of a time in their order."""
         near = np.flatnonzero((self._starts_ns <= time_ns) & (time_ns <= self._ends_ns))
         messages = (message for index in near for message in self._messages(self._spans[index].offset))
         return [
@@ -230,7 +230,7 @@ class RecordingReader:
         ]
 
     def _messages(self, offset: int) -> list[Message]:
-        """Return the messages of a chunk, none of a damaged one.
+        """Returns the messages of a chunk, none of a damaged one.
 
         Caches the last, as frames are mostly read in order.
         """
@@ -281,7 +281,7 @@ class RecordingReader:
 
 
 def _summary(file: IO[bytes]) -> Summary | None:
-    """Return the index at the end of the file; None if the file was truncated."""
+    """Returns the index at the end of the file; None if the file was truncated."""
     file.seek(0, 2)
     if file.tell() < 2 * len(MCAP0_MAGIC):
         return None
@@ -293,7 +293,7 @@ def _summary(file: IO[bytes]) -> Summary | None:
 
 
 def _walk(file: IO[bytes]) -> Iterator[tuple[int, int]]:
-    """Yield (opcode, offset) of every complete record, up to where the file was truncated (or filled with zeros)."""
+    """Yields (opcode, offset) of every complete record, up to where the file was truncated (or filled with zeros)."""
     file.seek(0, 2)
     size, offset = file.tell(), len(MCAP0_MAGIC)
     while offset + RECORD_HEAD.size <= size:
@@ -338,7 +338,7 @@ def _depth_image(record: DepthRecord, data: bytes) -> DepthImage:
 
 
 def _found_pose(data: bytes | None) -> np.ndarray | None:
-    """Return the pose among a frame's transforms, whose last it is."""
+    """Returns the pose among a frame's transforms, whose last it is."""
     try:
         message = FrameTransform.FromString(data or b"")
     except DecodeError:

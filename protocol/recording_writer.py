@@ -90,21 +90,21 @@ class RecordingWriter:
         self._syncing.start()
 
     def __enter__(self) -> Self:
-        """Return the writer."""
+        """Returns the writer."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Finish the file; after an exception it keeps its `.active` name."""
+        """Finishes the file; after an exception it keeps its `.active` name."""
         self._finish(rename=error is None)
 
     def close(self) -> None:
-        """Write the index and rename the file; idempotent."""
+        """Writes the index and renames the file; idempotent."""
         self._finish(rename=True)
 
     def add(self, frame: SensorFrame) -> None:
-        """Append a frame, later than the one before."""
+        """Appends a frame, later than the one before."""
         if not self._is_open:
             raise DeltalightError(f"{self.path} is already finished; start another recording.")
         if frame.timestamp_ns <= self._last_ns:
@@ -124,12 +124,12 @@ class RecordingWriter:
         self._commit()
 
     def add_composite(self, timestamp_ns: int, picture: bytes) -> None:
-        """Append the relit picture, JPEG or PNG, of a frame that was added before without one."""
+        """Appends the relit picture, JPEG or PNG, of a frame that was added before without one."""
         self._write(COMPOSITE_TOPIC, timestamp_ns, composite_message(picture, timestamp_ns))
         self._commit()
 
     def resume(self) -> None:
-        """Write what the disk refused.
+        """Writes what the disk refused.
 
         Raises:
             DiskRefusesError: it still refuses.
@@ -139,7 +139,7 @@ class RecordingWriter:
             self._file.commit()
 
     def _commit(self) -> None:
-        """End the chunk in progress, so that frames are whole, and hand it to the system."""
+        """Ends the chunk in progress, so that frames are whole, and hands it to the system."""
         self._writer.flush()
         with self._disk_errors():
             self._file.commit()
@@ -196,7 +196,7 @@ class RecordingWriter:
         self._writer.add_message(self._channels[topic], timestamp_ns, data, timestamp_ns)
 
     def _sync_each_second(self) -> None:
-        """Synchronise in a separate thread, so that a slow disk does not delay the frames."""
+        """Synchronises in a separate thread, so that a slow disk does not delay the frames."""
         while not self._stop.wait(SYNC_PERIOD_S):
             with suppress(
                 OSError

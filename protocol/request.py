@@ -50,7 +50,7 @@ class ReplyMemory:
         self._applied: dict[str, _Applied] = {}
 
     def find(self, request: ControlRequest) -> ControlReply | None:
-        """Return the reply to an earlier request that this one repeats.
+        """Returns the reply to an earlier request that this one repeats.
 
         Raises:
             DeltalightError: its revision is older than the applied one, or is the same with other content.
@@ -70,7 +70,7 @@ class ReplyMemory:
         return last.reply.model_copy(update={"id": request.id})
 
     def remember(self, request: ControlRequest, reply: ControlReply, length: int) -> None:
-        """Remember a reply of `length` bytes; a refused request may come again with the same revision."""
+        """Remembers a reply of `length` bytes; a refused request may come again with the same revision."""
         self._by_id[request.id] = reply, length
         self._bytes += length
         while len(self._by_id) > self._size or self._bytes > REMEMBERED_BYTES:
@@ -125,7 +125,7 @@ class ReplyServer:
         return 0 if self._rights is None else self._rights.refused
 
     def close(self) -> None:
-        """Stop the thread after the reply to the current request was sent."""
+        """Stops the thread after the reply to the current request was sent."""
         with self._answering:
             pass
         if self._guard is not None:
@@ -225,7 +225,7 @@ class RequestClient:
             raise
 
     def request(self, control: ControlRequest, timeout_s: float) -> ControlReply:
-        """Send `control` and return the reply; check its `ok` and `error`.
+        """Sends `control` and returns the reply; check its `ok` and `error`.
 
         Raises:
             DeltalightError: there was no answer within `timeout_s` seconds, or the server could not read the request.
@@ -246,7 +246,7 @@ class RequestClient:
             self._lock.release()
 
     def _asked(self, control: ControlRequest, deadline: float, timeout_s: float) -> ControlReply:
-        """Send `control` in the server's version, and return what comes back."""
+        """Sends `control` in the server's version, and returns what comes back."""
         socket = self._connected()
         if not _exchange(
             socket, encode_control(_in_version(control, self._version)), deadline, self._abandoned
@@ -258,11 +258,11 @@ class RequestClient:
         return decode_control(socket.recv_multipart(), ControlReply)
 
     def abandon(self) -> None:
-        """Wait for no answers any more: the server is gone; requests end soon, without one (any thread)."""
+        """Waits for no answers any more: the server is gone; requests end soon, without one (any thread)."""
         self._abandoned.set()
 
     def close(self) -> None:
-        """Close the socket."""
+        """Closes the socket."""
         with self._lock:
             self._context.destroy(0)
 
@@ -275,7 +275,7 @@ class RequestClient:
         return self._socket
 
     def _drop(self) -> None:
-        """Replace the socket, so that the next request meets neither a late answer nor a dead server's queue."""
+        """Replaces the socket, so that the next request meets neither a late answer nor a dead server's queue."""
         if self._socket is not None:
             self._socket.close(0)
             self._socket = None
@@ -285,7 +285,7 @@ class RequestClient:
 def _exchange(
     socket: "zmq.Socket[bytes]", multipart: list[bytes], deadline: float, abandoned: threading.Event
 ) -> bool:
-    """Send a request; return whether an answer arrived before `deadline` (`time.monotonic`), or it was abandoned."""
+    """Sends a request; returns whether an answer came before `deadline` (`time.monotonic`), or it was abandoned."""
     # If the other end refused the connection no pipe is left, and a plain send would block forever.
     socket.sndtimeo = _left_ms(deadline)
     try:
@@ -306,7 +306,7 @@ def _left_ms(deadline: float) -> int:
 
 
 def _in_version(message: Control, version: int) -> Control:
-    """Return a request or reply as an older version writes it: none has changed since the oldest that is read."""
+    """Returns a request or reply as an older version writes it: none has changed since the oldest that is read."""
     return message.model_copy(update={"schema_version": version})
 
 

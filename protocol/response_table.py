@@ -9,7 +9,7 @@ from deltalight.protocol.errors import DeltalightError
 
 
 def load_response_table(path: Path) -> Float32[np.ndarray, "256 3"]:
-    """Read a response from a text file; `#` begins a comment.
+    """Reads a response from a text file; `#` begins a comment.
 
     Raises:
         DeltalightError: the file is missing or does not hold such a table.
@@ -22,7 +22,7 @@ def load_response_table(path: Path) -> Float32[np.ndarray, "256 3"]:
 
 
 def require_response(values: object, name: str) -> Float32[np.ndarray, "256 3"]:
-    """Return a validated response table, read-only; `name` names it in errors.
+    """Returns a validated response table, read-only; `name` names it in errors.
 
     Raises:
         DeltalightError: it is not 256 rows of three finite numbers, zero or more.

@@ -28,7 +28,7 @@ _log = structlog.get_logger(__name__)
 
 
 def allow(folder: Path, name: str, words: Collection[str] | None) -> None:
-    """Limit what the host of the trusted key `name` may send to these streams, topics and `control`; None: no limit.
+    """Limits what the host of the trusted key `name` may send to these streams, topics and `control`; None: no limit.
 
     Raises:
         DeltalightError: a word is none of them, or the disk refuses.
@@ -44,7 +44,7 @@ def allow(folder: Path, name: str, words: Collection[str] | None) -> None:
 
 
 def allowed(folder: Path, name: str) -> frozenset[str] | None:
-    """Return what the host of a trusted key may send; None: everything, empty if the list cannot be read."""
+    """Returns what the host of a trusted key may send; None: everything, empty if the list cannot be read."""
     try:
         return frozenset((folder / TRUSTED / f"{name}{ALLOW}").read_text(encoding="ascii").split())
     except FileNotFoundError:
@@ -75,7 +75,7 @@ class Rights:
         return False
 
     def name_of(self, key: bytes) -> str:
-        """Return the name under which a key is trusted."""
+        """Returns the name under which a key is trusted."""
         return self._of(key)[0]
 
     def _of(self, key: bytes) -> tuple[str, frozenset[str] | None]:
@@ -86,7 +86,7 @@ class Rights:
         return name, words
 
     def _read(self, key: bytes) -> tuple[str, frozenset[str] | None]:
-        """Return name and rights of a key; a key that is trusted no more may send nothing."""
+        """Returns name and rights of a key; a key that is trusted no more may send nothing."""
         if key == self._keys.public:
             return self._keys.name, None
         names = [name for name, public in trusted_keys(self._keys.folder).items() if public == key]
@@ -98,7 +98,7 @@ class Rights:
 
 
 def refusal(name: str, word: str) -> str:
-    """Return the sentence that refuses a topic, or commands."""
+    """Returns the sentence that refuses a topic, or commands."""
     what = word.partition(".")[0]
     return (
         f"the key `{name}` does not allow {word:.130}; if it should, add {what} to "

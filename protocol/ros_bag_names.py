@@ -9,7 +9,7 @@ BAG_METADATA, BAG_DATABASE = "metadata.yaml", ".db3"  # of a ROS 2 bag
 
 
 def refuse_bag(path: Path) -> None:
-    """Refuse a ROS 1 bag where a recording or a dataset folder is needed.
+    """Refuses a ROS 1 bag where a recording or a dataset folder is needed.
 
     Raises:
         DeltalightError: it is one, by its name.

@@ -58,13 +58,13 @@ class SceneDocument(StrictModel):
         return self
 
     def canonical_json(self) -> str:
-        """Return the document as JSON with sorted keys and no spaces: equal documents give equal text."""
+        """Returns the document as JSON with sorted keys and no spaces: equal documents give equal text."""
         return json.dumps(
             self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=False
         )
 
     def with_assets(self, rename: Callable[[str, str], str]) -> "SceneDocument":
-        """Return the document with every asset replaced by `rename(place, asset)`, e.g. to resolve paths."""
+        """Returns the document with every asset replaced by `rename(place, asset)`, e.g. to resolve paths."""
         real, environment = self.real, self.lights.environment
         if isinstance(real.geometry, ModelGeometry):
             model = rename("real.geometry.model", real.geometry.model)
@@ -86,7 +86,7 @@ def _with_object_assets(place: str, item: SceneObject, rename: Callable[[str, st
 
 
 def parse_scene(data: Mapping[str, Any], name: str = "the scene document") -> SceneDocument:
-    """Validate a scene document; assets stay as written.
+    """Validates a scene document; assets stay as written.
 
     Raises:
         DeltalightError: the first fault, with its place in the document.
@@ -95,7 +95,7 @@ def parse_scene(data: Mapping[str, Any], name: str = "the scene document") -> Sc
 
 
 def load_scene(path: Path) -> SceneDocument:
-    """Read a scene document (JSON or YAML) and make its asset paths absolute, relative to the document.
+    """Reads a scene document (JSON or YAML) and makes its asset paths absolute, relative to the document.
 
     Raises:
         DeltalightError: the file, a key or an asset is missing or wrong.
@@ -112,7 +112,7 @@ def load_scene(path: Path) -> SceneDocument:
 
 
 def resolve_asset(asset: str, folder: Path) -> str:
-    """Return an asset's absolute path, read relative to `folder`; a `sha256:` name stays.
+    """Returns an asset's absolute path, read relative to `folder`; a `sha256:` name stays.
 
     Raises:
         DeltalightError: it is no name that a file can have.
@@ -126,5 +126,5 @@ def resolve_asset(asset: str, folder: Path) -> str:
 
 
 def scene_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of the scene document."""
+    """Returns the JSON Schema of the scene document."""
     return SceneDocument.model_json_schema()

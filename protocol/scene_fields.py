@@ -18,7 +18,7 @@ ShownView = Literal[
 
 
 def _unit(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Normalise a vector; a unit vector keeps its bits."""
+    """Normalises a vector; a unit vector keeps its bits."""
     length = math.sqrt(sum(value * value for value in values))
     if length < 1e-9:
         raise ValueError("its length must not be zero")
@@ -36,7 +36,7 @@ def _unit_quaternion(values: tuple[float, float, float, float]) -> tuple[float, 
 
 
 def _without_nul(text: str) -> str:
-    """Refuse what no text in PostgreSQL can hold, and no file name."""
+    """Refuses what no text in PostgreSQL can hold, and no file name."""
     if "\0" in text:
         raise ValueError("must not hold a NUL character; leave it out")
     return text

@@ -275,6 +275,6 @@ class Lights(StrictModel):
 
 
 def default_lights() -> Lights:
-    """Return the default lights: one from above and weak ambient light."""
+    """Returns the default lights: one from above and weak ambient light."""
     above = DirectionalLight(direction=(0.3, 0.2, -1.0), irradiance=1.5, angular_radius_deg=5.0)
     return Lights(manual=(above, AmbientLight(radiance=0.2)))

@@ -53,7 +53,7 @@ class MethodSettings(StrictModel):
         return TIERS[self.quality]
 
     def limited(self) -> Self:
-        """Return the settings within the limits of their tier."""
+        """Returns the settings within the limits of their tier."""
         given = {
             name: getattr(self, name) for name in ("cone_count", "shadow_samples") if hasattr(self, name)
         }

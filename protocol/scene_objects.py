@@ -52,7 +52,7 @@ class Pose(StrictModel):
     )
 
     def matrix(self) -> Float64[np.ndarray, "4 4"]:
-        """Return the 4x4 matrix frame_from_object, scale included."""
+        """Returns the 4x4 matrix frame_from_object, scale included."""
         return rigid_matrix(self.scale * rotation_from_wxyz(self.rotation_wxyz), self.translation_m)
 
 
@@ -135,7 +135,7 @@ class Animation(StrictModel):
     )
 
     def time_s(self, capture_ns: int, duration_s: float) -> float:
-        """Return the clip time, s, 0..duration, of a frame captured at `capture_ns`."""
+        """Returns the clip time, s, 0..duration, of a frame captured at `capture_ns`."""
         time_s = capture_ns / 1e9 * self.speed + self.offset_s
         if self.loop and duration_s > 0:
             return time_s % duration_s
@@ -143,7 +143,7 @@ class Animation(StrictModel):
 
 
 def _addressable(name: str) -> str:
-    """Refuse the names that browsers and HTTP clients take out of addresses: `objects/..` is the scene itself."""
+    """Refuses the names that browsers and HTTP clients take out of addresses: `objects/..` is the scene itself."""
     if name in (".", ".."):
         raise ValueError("`.` and `..` cannot be part of an address, so choose another name")
     return name
@@ -195,7 +195,7 @@ class SceneObject(StrictModel):
         return Animation() if self.animation is None and not self.rigid else self.animation
 
     def world_from_object(self) -> Float64[np.ndarray, "4 4"]:
-        """Return the 4x4 matrix from asset coordinates to `frame` (the world unless it is a marker).
+        """Returns the 4x4 matrix from asset coordinates to `frame` (the world unless it is a marker).
 
         The asset is first rotated so that its up axis is z (+90 degrees about x if it is y), then scaled, rotated and
         moved by the pose.

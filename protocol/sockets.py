@@ -25,7 +25,7 @@ _contexts_lock = threading.Lock()
 
 
 def open_context() -> Context:
-    """Create a context, and keep it until it is ended.
+    """Creates a context, and keeps it until it is ended.
 
     One that is forgotten stays. Its finalizer would stop whatever thread collects garbage for ever: it waits for the
     context's sockets, which are collected with it and of which it no longer knows.
@@ -38,7 +38,7 @@ def open_context() -> Context:
 
 
 def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
-    """Parse an endpoint: without keys, `tcp://` on loopback or `ipc://`; with keys any `tcp://`.
+    """Parses an endpoint: without keys, `tcp://` on loopback or `ipc://`; with keys any `tcp://`.
 
     Raises:
         DeltalightError: another transport, or it leaves the host and there are no keys.
@@ -58,7 +58,7 @@ def open_socket(
     high_water_mark: int = HIGH_WATER_MARK,
     max_bytes: int = MAX_PART_BYTES,
 ) -> zmq.Socket[bytes]:
-    """Create a socket with queues of `high_water_mark` messages, pieces up to `max_bytes`, no linger, keepalive."""
+    """Creates a socket with queues of `high_water_mark` messages, pieces up to `max_bytes`, no linger, keepalive."""
     socket = context.socket(kind)
     socket.linger = 0
     if kind == zmq.PUB:
@@ -78,7 +78,7 @@ def open_socket(
 
 
 def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool, keys: Keys | None = None) -> str:
-    """Bind or connect; return the endpoint with its actual port (port 0 lets the system choose).
+    """Binds or connects; returns the endpoint with its actual port (port 0 lets the system choose).
 
     Raises:
         DeltalightError: the endpoint leaves the host without keys, is taken, or is malformed.

@@ -49,7 +49,7 @@ class Source(Protocol):
 
     @property
     def timestamps_ns(self) -> list[int]:
-        """Capture time of every frame."""
+        """Captures time of every frame."""
 
     def __len__(self) -> int: ...
 
@@ -64,7 +64,7 @@ def is_recording_name(name: str) -> bool:
 
 
 def open_source(path: Path, board: BoardSpec | None = None) -> Source:
-    """Open a dataset folder or a recording (`.mcap`, or one still named `.mcap.active`).
+    """Opens a dataset folder or a recording (`.mcap`, or one still named `.mcap.active`).
 
     `board` replaces the board that the source describes.
 

@@ -63,7 +63,7 @@ class Subscriber(ABC):
 
     @abstractmethod
     def _store(self, message: ReceivedMultipart) -> None:
-        """Store a message or count it; called by the thread."""
+        """Stores a message or counts it; called by the thread."""
 
     @property
     def not_allowed(self) -> int:
@@ -71,13 +71,13 @@ class Subscriber(ABC):
         return 0 if self._rights is None else self._rights.refused
 
     def close(self) -> None:
-        """Stop the thread and wake all waiters; stored messages can still be taken."""
+        """Stops the thread and wakes all waiters; stored messages can still be taken."""
         self._close_guards()
         self._context.term()  # interrupts the thread, which closes its own sockets
         self._thread.join()
 
     def _attach(self, endpoint: str, shared: "zmq.Socket[bytes]", *, bind: bool) -> str:
-        """Attach an endpoint; a host with a key has a socket of its own, which tells whose messages come."""
+        """Attaches an endpoint; a host with a key has a socket of its own, which tells whose messages come."""
         parts, keys = check_endpoint(endpoint, self._keys), self._keys
         if bind or keys is None or not uses_keys(parts, keys):
             return attach(shared, endpoint, bind=bind, keys=keys)

@@ -34,7 +34,7 @@ for _kind in (_Loader, _Dumper):
 
 
 def parse_yaml(text: str) -> Any:  # noqa: ANN401 - whatever the text holds
-    """Return the data of a YAML document.
+    """Returns the data of a YAML document.
 
     Raises:
         ValueError: the text is no YAML, takes more than a document may, or has a key twice in one mapping.
@@ -74,12 +74,12 @@ _Loader.add_constructor("tag:yaml.org,2002:map", _unique_mapping)
 
 
 def yaml_text(data: Mapping[str, Any]) -> str:
-    """Return the YAML of a document with its keys in order, which `parse_yaml` reads back."""
+    """Returns the YAML of a document with its keys in order, which `parse_yaml` reads back."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 def _require_limits(text: str) -> None:
-    """Refuse what is too much before anything is built; an alias counts as all that it stands for."""
+    """Refuses what is too much before anything is built; an alias counts as all that it stands for."""
     ends_s = time.monotonic() + MAX_SECONDS
     count = 0
     sizes: dict[str | None, int] = {}  # of what has an anchor and is complete

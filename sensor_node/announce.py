@@ -21,7 +21,7 @@ _log = structlog.get_logger(__name__)
 def service_info(
     name: str, endpoint: Endpoint, streams: Sequence[str], keys: Keys | None, addresses: Sequence[str]
 ) -> "ServiceInfo":
-    """Return the announcement of a node.
+    """Returns the announcement of a node.
 
     The TXT record holds `name`, `streams` (with commas), `schema` (version of the wire), `curve` (1 with keys, else
     0) and, with keys, the public `key`.
@@ -54,7 +54,7 @@ def announced(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> Iterator[None]:
-    """Announce a node for the duration of the context; a node that only this host can reach is not announced.
+    """Announces a node for the duration of the context; a node that only this host can reach is not announced.
 
     Args:
         name: of the node.
@@ -85,14 +85,14 @@ def announced(
 
 
 def _addresses(endpoint: Endpoint) -> list[str]:
-    """Return the addresses by which other hosts reach a bound endpoint; none if they cannot."""
+    """Returns the addresses by which other hosts reach a bound endpoint; none if they cannot."""
     if endpoint.host is None or not endpoint.leaves_host:
         return []
     return _own_addresses() if endpoint.host in EVERY_ADDRESS else [endpoint.host]
 
 
 def _own_addresses() -> list[str]:
-    """Return the IPv4 addresses of this host except loopback."""
+    """Returns the IPv4 addresses of this host except loopback."""
     import ifaddr
 
     ips = [str(ip.ip) for adapter in ifaddr.get_adapters() for ip in adapter.ips if ip.is_IPv4]

@@ -33,7 +33,7 @@ class BoardTracker:
         self._reused = 0
 
     def detect(self, color: UInt8[np.ndarray, "h w 3"]) -> BoardPose | None:
-        """Return the pose in the next picture (RGB), or None if the board is not visible.
+        """Returns the pose in the next picture (RGB), or None if the board is not visible.
 
         Raises:
             DeltalightError: the picture has not the camera's size.
@@ -49,7 +49,7 @@ class BoardTracker:
         return self._last
 
     def _detected(self, color: UInt8[np.ndarray, "h w 3"]) -> BoardPose | None:
-        """Search around the last place, and in the whole picture unless all of the board lies well within."""
+        """Searches around the last place, and in the whole picture unless all of the board lies well within."""
         if self._last is not None:
             region = _Region.around(self._corners(self._last), color.shape, MARGIN_PX, MARGIN_FRACTION)
             pose = self._detector.detect(color, region.slices)
@@ -79,7 +79,7 @@ class _Region(NamedTuple):
         margin_px: float,
         fraction: float = 0.0,
     ) -> Self:
-        """Return what a picture of a shape shows around points; all of it around points that it cannot show."""
+        """Returns what a picture of a shape shows around points; all of it around points that it cannot show."""
         height, width = shape[:2]
         if not np.isfinite(corners).all():
             return cls(0, height, 0, width)

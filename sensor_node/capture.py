@@ -47,14 +47,14 @@ class CaptureThread:
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
     def __enter__(self) -> Self:
-        """Start reading."""
+        """Starts reading."""
         self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop reading."""
+        """Stops reading."""
         self._closing.set()
         self._camera.interrupt()
         self._thread.join()
@@ -65,7 +65,7 @@ class CaptureThread:
         return not self._thread.is_alive() and self._slot.empty()
 
     def take(self, timeout_s: float) -> CapturedFrame | None:
-        """Take the newest frame; None if there is none in time."""
+        """Takes the newest frame; None if there is none in time."""
         try:
             return self._slot.get(timeout=timeout_s)
         except queue.Empty:
@@ -116,7 +116,7 @@ class ServerClock:
         self._thread.start()
 
     def at(self, local_ns: int) -> tuple[int, int | None]:
-        """Return the offset to the server's clock and its bound in ns; 0 and None if never compared."""
+        """Returns the offset to the server's clock and its bound in ns; 0 and None if never compared."""
         with self._lock:
             self._check_own_clock()
             sample = self._estimator.at(local_ns)
@@ -124,12 +124,12 @@ class ServerClock:
 
     @property
     def remark(self) -> str:
-        """Return a sentence about a clock that was set recently, else nothing."""
+        """Returns a sentence about a clock that was set recently, else nothing."""
         with self._lock:
             return self._remark if time.monotonic() < self._remark_until_s else ""
 
     def close(self) -> None:
-        """Stop the thread."""
+        """Stops the thread."""
         self._closing.set()
         self._is_due.set()
         self._thread.join()

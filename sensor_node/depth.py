@@ -73,7 +73,7 @@ class DepthSettings(StrictModel):
 def clean_depth(
     depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], settings: DepthSettings | None = None
 ) -> DepthImage:
-    """Return smoothed depth with small holes filled and depth edges completed, guided by `color` (RGB).
+    """Returns smoothed depth with small holes filled and depth edges completed, guided by `color` (RGB).
 
     Known pixels move only if a smooth surface explains them: at depth steps larger than `edge_sigmas` standard
     deviations they stay as measured. Depth 0 is unknown, never near.
@@ -122,7 +122,7 @@ def _replaced(
     filled: Bool[np.ndarray, "h w"],
     settings: DepthSettings,
 ) -> Float32[np.ndarray, "h w"]:
-    """Return inverse depth, smoothed in `filled` holes and where a smooth surface explains what was measured."""
+    """Returns inverse depth, smoothed in `filled` holes and where a smooth surface explains what was measured."""
     taken = filled
     if settings.filter_radius_px:
         smooth = smoothed.explains(inverse, SMOOTH_CONFIDENCE, settings.edge_sigmas)
@@ -131,7 +131,7 @@ def _replaced(
 
 
 def estimate_noise_sigma(depth: DepthImage) -> float:
-    """Estimate the depth noise at 1 m, in metres: scaled MAD of the residuals of local plane fits.
+    """Estimates the depth noise at 1 m, in metres: scaled MAD of the residuals of local plane fits.
 
     Fits run on inverse depth, where noise that grows with z^2 is constant. Only windows without holes or edges count;
     if too few are left, a typical sensor's value is returned.
@@ -155,14 +155,14 @@ def estimate_noise_sigma(depth: DepthImage) -> float:
 
 
 def known_pixels(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of pixels whose depth is known: valid and positive (0 and infinity are unknown)."""
+    """Returns the mask of pixels whose depth is known: valid and positive (0 and infinity are unknown)."""
     return depth.valid & (depth.depth_m > 0) & (depth.depth_m < np.inf)
 
 
 def _inverse(
     values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Return 1/values, 0 where unknown."""
+    """Returns 1/values, 0 where unknown."""
     beyond = np.full(values.shape, np.inf, np.float32)
     return np.asarray(np.reciprocal(cv2.copyTo(values, known.view(np.uint8), beyond)))
 
@@ -170,7 +170,7 @@ def _inverse(
 def _fillable(
     valid: Bool[np.ndarray, "h w"], smoothed: SmoothedDepth, noise: NoiseModel, settings: DepthSettings
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels of small holes about which the windows agree.
+    """Returns the pixels of small holes about which the windows agree.
 
     If surfaces of different depth reach a hole it stays open rather than being bridged in mid-air.
     """
@@ -186,7 +186,7 @@ def _fillable(
 def _small_holes(
     valid: Bool[np.ndarray, "h w"], area_px: int
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
-    """Return rows and columns of the unknown pixels whose connected area is at most `area_px`."""
+    """Returns rows and columns of the unknown pixels whose connected area is at most `area_px`."""
     unknown = ~valid
     _, labels = cv2.connectedComponents(unknown.view(np.uint8), connectivity=4)
     places = np.flatnonzero(unknown)

@@ -90,7 +90,7 @@ def assign_edges(
     contrast: float,
     reach_px: int,
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return inverse depth and mask with the clear pixels along depth edges added; known ones stay unchanged.
+    """Returns inverse depth and mask with the clear pixels along depth edges added; known ones stay unchanged.
 
     Args:
         inverse_depth: 1/m; anything where not known.
@@ -117,7 +117,7 @@ def assign_edges(
 
 
 def _without_own(picture: _Padded, seen: _Surfaces) -> _Surfaces:
-    """Drop the pixels of areas in a colour of their own, unless such pixels form only a thin line."""
+    """Drops the pixels of areas in a colour of their own, unless such pixels form only a thin line."""
     own = np.zeros(len(picture.inverse_depth), np.uint8)
     own[seen.places] = seen.own
     window = np.ones((OWN_WIDTH_PX,) * 2, np.uint8)
@@ -127,7 +127,7 @@ def _without_own(picture: _Padded, seen: _Surfaces) -> _Surfaces:
 
 
 def _assign(picture: _Padded, seen: _Surfaces, reach_px: int) -> None:
-    """Write the decided pixels into the picture: the clear ones, then those between both surfaces.
+    """Writes the decided pixels into the picture: the clear ones, then those between both surfaces.
 
     A pixel with both surfaces beside it is on the edge itself, where colours mix: the likelier surface is good enough
     there, as at most that pixel is wrong.
@@ -146,7 +146,7 @@ def _assign(picture: _Padded, seen: _Surfaces, reach_px: int) -> None:
 def _grow(
     picture: _Padded, places: Int64[np.ndarray, " n"], value: PerPixel, near_by: PerPixel, reach_px: int
 ) -> None:
-    """Write pixels that touch their own surface (depth within `near_by`), then those that touch these.
+    """Writes pixels that touch their own surface (depth within `near_by`), then those that touch these.
 
     Spots with the colour of a surface but no connection to it stay unknown, and no pixel is farther than the reach
     from known ones of its surface.
@@ -161,13 +161,13 @@ def _grow(
 
 
 def _rim(known: Bool[np.ndarray, "h w"], reach_px: int) -> Int64[np.ndarray, " n"]:
-    """Return flat positions of the unknown pixels within reach of known ones."""
+    """Returns flat positions of the unknown pixels within reach of known ones."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1,) * 2)
     return np.flatnonzero(cv2.dilate(known.view(np.uint8), disc).view(bool) & ~known)
 
 
 def _spiral(reach_px: int) -> _Offsets:
-    """Return samples from one pixel away to the end of sight, weighted by inverse distance."""
+    """Returns samples from one pixel away to the end of sight, weighted by inverse distance."""
     step = np.arange(SAMPLE_COUNT)
     radius = (SIGHT_PER_REACH * reach_px) ** (step / (SAMPLE_COUNT - 1))
     x, y = (np.rint(radius * f(GOLDEN_ANGLE * step)) for f in (np.cos, np.sin))
@@ -178,7 +178,7 @@ def _spiral(reach_px: int) -> _Offsets:
 def _pad(
     inverse_depth: Float32[np.ndarray, "h w"], color: UInt8[np.ndarray, "h w 3"], margin: int, contrast: float
 ) -> _Padded:
-    """Pad the picture; colour is in units of the contrast, so that a distance of 1 is one contrast."""
+    """Pads the picture; colour is in units of the contrast, so that a distance of 1 is one contrast."""
     padded = cv2.copyMakeBorder(inverse_depth, *(margin,) * 4, cv2.BORDER_CONSTANT)
     four = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2RGBA)
     colors = cv2.copyMakeBorder(four, *(margin,) * 4, cv2.BORDER_REPLICATE).astype(np.float32)
@@ -194,7 +194,7 @@ def _chunks(places: Int64[np.ndarray, " n"]) -> Iterator[Int64[np.ndarray, " m"]
 def _seen(
     picture: _Padded, places: Int64[np.ndarray, " n"], offsets: _Offsets, noise: NoiseModel, sigmas: float
 ) -> _Surfaces:
-    """Split the samples around pixels into two surfaces and compare colours; drop pixels without two."""
+    """Splits the samples around pixels into two surfaces and compares colours; drops pixels without two."""
     shifts = (offsets.y * picture.stride + offsets.x).astype(np.int64)[:, None]
     samples = picture.inverse_depth.take(places + shifts)
     unknown = (samples == 0).astype(np.float32)
@@ -220,7 +220,7 @@ def _seen(
 
 
 def _split(samples: Samples, known: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
-    """Return the inverse depth between nearer and farther samples: the mean of both means, starting half-way."""
+    """Returns the inverse depth between nearer and farther samples: the mean of both means, starting half-way."""
     least = (samples + (1 - known) * np.finfo(np.float32).max).min(axis=0)
     most = samples.max(axis=0)
     split = np.asarray((np.minimum(least, most) + most) / 2)
@@ -231,12 +231,12 @@ def _split(samples: Samples, known: Samples, weight: Float32[np.ndarray, " sampl
 
 
 def _mean(values: Samples, taken: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
-    """Return the weighted mean of the values taken (0..1 each); 0 of none."""
+    """Returns the weighted mean of the values taken (0..1 each); 0 of none."""
     return np.asarray((weight @ (values * taken)) / np.maximum(weight @ taken, EMPTY))
 
 
 def _continued(values: Samples, taken: Samples, offsets: _Offsets) -> tuple[PerPixel, PerPixel]:
-    """Return the value at the pixel of the plane through the samples taken, and their rms distance from it."""
+    """Returns the value at the pixel of the plane through the samples taken, and their rms distance from it."""
     x, y, weight = offsets
     linear = np.stack([np.ones_like(x), x, y])
     total, sum_x, sum_y, sum_xx, sum_xy, sum_yy = (
@@ -261,7 +261,7 @@ def _match(
     around: Int64[np.ndarray, "samples n"],
     places: Int64[np.ndarray, " n"],
 ) -> Samples:
-    """Return the similarity of colours: 1 the same, 1/4 one contrast apart.
+    """Returns the similarity of colours: 1 the same, 1/4 one contrast apart.
 
     The long tail still tells which of two colours a mixture of them, far from both, is closer to.
     """
@@ -276,7 +276,7 @@ def _match(
 
 
 def _voted(picture: _Padded, seen: _Surfaces) -> PerPixel:
-    """Return the mean log odds of a pixel and its unknown neighbours of similar colour."""
+    """Returns the mean log odds of a pixel and its unknown neighbours of similar colour."""
     log_odds, votes = np.zeros((2, len(picture.inverse_depth)), np.float32)
     log_odds[seen.places] = np.clip(seen.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS)
     votes[seen.places] = 1
@@ -290,6 +290,6 @@ def _voted(picture: _Padded, seen: _Surfaces) -> PerPixel:
 
 
 def _square(stride: int, radius_px: int) -> Int64[np.ndarray, "pixels 1"]:
-    """Return the shifts to the pixels of a square around one in the flat picture."""
+    """Returns the shifts to the pixels of a square around one in the flat picture."""
     y, x = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
     return np.asarray((y * stride + x).reshape(-1, 1), np.int64)

@@ -28,7 +28,7 @@ class NoiseModel(NamedTuple):
     floor_m: float
 
     def of_inverse_depth(self, inverse_depth: Float32[np.ndarray, "*size"]) -> Float32[np.ndarray, "*size"]:
-        """Return the standard deviation of 1/z at 1/z, in 1/m (d(1/z) = dz / z^2)."""
+        """Returns the standard deviation of 1/z at 1/z, in 1/m (d(1/z) = dz / z^2)."""
         step = self.floor_m * inverse_depth * inverse_depth
         return np.asarray(np.sqrt(self.sigma_m**2 + step * step), np.float32)
 
@@ -79,7 +79,7 @@ class SmoothedDepth:
     def explains(
         self, inverse_depth: Float32[np.ndarray, "h w"], confidence: float, sigmas: float
     ) -> Bool[np.ndarray, "h w"]:
-        """Return where the cell is more confident than `confidence` or the fit within `sigmas` of a value."""
+        """Returns where the cell is more confident than `confidence` or the fit within `sigmas` of a value."""
         tolerance = sigmas * self._noise.of_inverse_depth(self._cells.depth)
         tolerance[self.confidence > confidence] = np.inf
         size = 2 * tolerance.shape[1], 2 * tolerance.shape[0]
@@ -90,7 +90,7 @@ class SmoothedDepth:
     def spread(
         self, rows: Int64[np.ndarray, " n"], columns: Int64[np.ndarray, " n"]
     ) -> Float32[np.ndarray, " n"]:
-        """Return the standard deviation between nine windows that contain a pixel, in 1/m.
+        """Returns the standard deviation between nine windows that contain a pixel, in 1/m.
 
         Large where surfaces of different depth reach the pixel.
         """
@@ -119,7 +119,7 @@ def smooth_inverse_depth(
     radius_px: int,
     guide_contrast: float,
 ) -> SmoothedDepth:
-    """Fit local models to inverse depth and evaluate them at every pixel.
+    """Fits local models to inverse depth and evaluates them at every pixel.
 
     Args:
         inverse_depth: 1/m; anything where not valid.
@@ -144,7 +144,7 @@ def smooth_inverse_depth(
 
 
 def _quarters(image: Float32[np.ndarray, "h w"]) -> list[Grid]:
-    """Return views of the four pixels of every cell: top-left, top-right, bottom-left, bottom-right."""
+    """Returns views of the four pixels of every cell: top-left, top-right, bottom-left, bottom-right."""
     return [image[row::2, column::2] for row in (0, 1) for column in (0, 1)]
 
 
@@ -174,7 +174,7 @@ def _window_sum(image: Grid, size: int) -> Grid:
 
 
 def _depth_variance(cells: _Cells, size: int) -> Grid:
-    """Return the variance of the inverse depth in every window; in double precision, because means cancel."""
+    """Returns the variance of the inverse depth in every window; in double precision, because means cancel."""
     count, depth = cells.count.astype(np.float64), cells.depth.astype(np.float64)
     weighted: Float64[np.ndarray, "rows columns"] = count * depth
     total = np.maximum(_window_sum(count, size), EMPTY)
@@ -183,7 +183,7 @@ def _depth_variance(cells: _Cells, size: int) -> Grid:
 
 
 def _fit_windows(cells: _Cells, size: int, ridge: float) -> _Fits:
-    """Fit depth on (x, y, guide) in every window by weighted least squares: elimination of the 3x3 system."""
+    """Fits depth on (x, y, guide) in every window by weighted least squares: elimination of the 3x3 system."""
     count = _window_sum(cells.count, size)
     norm = 1 / np.maximum(count, EMPTY)
 
@@ -218,7 +218,7 @@ def _fit_windows(cells: _Cells, size: int, ridge: float) -> _Fits:
 def _blend(
     cells: _Cells, fits: _Fits, weight: Grid, size: int, guide: Float32[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "h w"], Grid]:
-    """Average the models of all windows that hold a cell; evaluate them at its pixels, with confidence."""
+    """Averages the models of all windows that hold a cell; evaluates them at its pixels, with confidence."""
     total = _window_sum(weight, size)
     norm = 1 / np.maximum(total, EMPTY)
 

@@ -16,7 +16,7 @@ MAX_FOOTPRINT_PX = 8
 def register_depth(
     depth: DepthImage, color_camera: CameraModel, color_from_depth: Float64[np.ndarray, "4 4"]
 ) -> DepthImage:
-    """Return the depth as the colour camera would see it; unknown where no depth pixel lands.
+    """Returns the depth as the colour camera would see it; unknown where no depth pixel lands.
 
     Every known pixel is a square that keeps its size under projection (so that a colour camera of higher resolution
     gets no pinholes); if several land on one colour pixel the nearest counts.
@@ -43,7 +43,7 @@ def register_depth(
 def _splat(
     camera: CameraModel, points: Float64[np.ndarray, "n 3"], half: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "h w"]:
-    """Write every point's z into the pixels whose centres its square of `half` the side covers."""
+    """Writes every point's z into the pixels whose centres its square of `half` the side covers."""
     pixels = camera.project(points)
     seen = np.isfinite(pixels).all(axis=1)
     seen[seen] = (np.abs(pixels[seen]) < 2 * max(camera.width, camera.height)).all(axis=1)

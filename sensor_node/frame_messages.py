@@ -52,7 +52,7 @@ class Stamps(TypedDict):
 def depth_multipart(
     depth: DepthImage, stamps: Stamps, stream: Literal["depth", "clean_depth"], step_m: float | None = None
 ) -> list[bytes]:
-    """Return the depth message; `step_m` is the step of the stored depth, None = as fine as its range allows."""
+    """Returns the depth message; `step_m` is the step of the stored depth, None = as fine as its range allows."""
     step_m = step_m or fitting_step_m(depth)
     height, width = depth.depth_m.shape
     with refusing(stream):
@@ -69,14 +69,14 @@ def depth_multipart(
 
 
 def fitting_step_m(depth: DepthImage) -> float:
-    """Return the finest step in metres in which 16 bits hold the farthest known depth."""
+    """Returns the finest step in metres in which 16 bits hold the farthest known depth."""
     farthest = float(depth.depth_m.max(initial=0.0, where=depth.valid & np.isfinite(depth.depth_m)))
     octaves = math.ceil(math.log2(max(farthest / (FINEST_DEPTH_STEP_M * DEPTH_STEPS), 1.0)))
     return FINEST_DEPTH_STEP_M * 2.0**octaves
 
 
 def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stamps) -> list[bytes]:
-    """Return the pose message, which states if no pose is known."""
+    """Returns the pose message, which states if no pose is known."""
     described = None if board is None else _described(board)
     if pose is None:
         return encode(PoseMessage(**stamps, status="no_board", board=described))
@@ -93,14 +93,14 @@ def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stam
 
 @lru_cache(maxsize=1)
 def _described(board: BoardSpec) -> dict[str, object]:
-    """Return a board's fields; a node sends the same with each frame."""
+    """Returns a board's fields; a node sends the same with each frame."""
     return board.model_dump(mode="json", exclude_none=True)
 
 
 def color_multipart(
     frame: SensorFrame, stamps: Stamps, encoding: Literal["jpeg", "raw"], jpeg_quality: int
 ) -> list[bytes]:
-    """Return the colour message; JPEG bytes of the frame are sent unchanged.
+    """Returns the colour message; JPEG bytes of the frame are sent unchanged.
 
     Raises:
         EnvelopeError: the picture is too large for a message.
@@ -123,7 +123,7 @@ def color_multipart(
 def fisheye_multipart(
     fisheye: FisheyePictures, stamps: Stamps, encoding: Literal["jpeg", "raw"], jpeg_quality: int
 ) -> list[bytes]:
-    """Return the message of fish-eye pictures; linear ones are sent raw. The stamps are those of their own capture.
+    """Returns the message of fish-eye pictures; linear ones are sent raw. The stamps are those of their own capture.
 
     Raises:
         EnvelopeError: the pictures differ in size or kind, or are too many or too large for a message.
@@ -153,7 +153,7 @@ def fisheye_multipart(
 
 
 def radiance_multipart(radiance: RadianceMap, stamps: Stamps, jpeg_quality: int) -> list[bytes]:
-    """Return the message of a radiance map.
+    """Returns the message of a radiance map.
 
     The stamps are those of the map's first frame, even when it is repeated for late subscribers: by them a receiver
     recognises a map that it already has.
@@ -179,7 +179,7 @@ def radiance_multipart(radiance: RadianceMap, stamps: Stamps, jpeg_quality: int)
 
 
 def lights_multipart(sky: SkyLights, stamps: Stamps, radiance: Stamps) -> list[bytes]:
-    """Return the message of lights; `radiance` are the stamps of the map that was cut last.
+    """Returns the message of lights; `radiance` are the stamps of the map that was cut last.
 
     The stamps are those of the first frame with these lights, even when they are repeated for late subscribers.
     """
@@ -209,7 +209,7 @@ def _light_entry(light: TrackedLight) -> LightEntry:
 
 
 def lamps_multipart(lamps: Sequence[LampPose], stamps: Stamps) -> list[bytes]:
-    """Return the message of the lamps that one colour frame shows."""
+    """Returns the message of the lamps that one colour frame shows."""
     entries = (
         LampEntry(marker=int(lamp.marker), world_from_marker=_rows(lamp.world_from_marker)) for lamp in lamps
     )

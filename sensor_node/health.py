@@ -34,13 +34,13 @@ class Health:
         self._newest_s: float | None = None
 
     def note(self, pose: BoardPose | None) -> None:
-        """Record that a frame was published, with its pose."""
+        """Records that a frame was published, with its pose."""
         self._newest_s = self._now_s()
         if pose is not None:
             self._posed_s = self._newest_s
 
     def state(self, remarks: Sequence[str] = ()) -> tuple[State, str]:
-        """Return the state on the wire and its sentences: first live, stale or lost, then everything else.
+        """Returns the state on the wire and its sentences: first live, stale or lost, then everything else.
 
         Args:
             remarks: of others; empty ones are left out.
@@ -52,7 +52,7 @@ class Health:
         return state, "; ".join([sentence, *faults])
 
     def _stream(self) -> tuple[State, str]:
-        """Return the camera's own state, else that of the newest frame's age."""
+        """Returns the camera's own state, else that of the newest frame's age."""
         newest_s = self._started_s if self._newest_s is None else self._newest_s
         state, age_s = self._camera.state, self._now_s() - newest_s
         if state is not None and state.name != "live":

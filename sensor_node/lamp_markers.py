@@ -31,7 +31,7 @@ def detect_lamps(
     *,
     previous: Sequence[LampPose] = (),
 ) -> tuple[LampPose, ...]:
-    """Return the poses of the board's lamp markers that a picture shows, in the board's order.
+    """Returns the poses of the board's lamp markers that a picture shows, in the board's order.
 
     A square has two poses that fit nearly equally well if it is small or seen from the front. The smaller
     reprojection error decides; if that is inconclusive, the pose nearer to the lamp's previous one.
@@ -68,7 +68,7 @@ def detect_lamps(
 
 
 def _solve(lamp: LampMarker, camera: CameraModel, pixels: Float64[np.ndarray, "4 2"]) -> list[_Solution]:
-    """Return both poses of a square that show its printed side, refined, the better one first."""
+    """Returns both poses of a square that show its printed side, refined, the better one first."""
     points, solutions = lamp.corner_points(), []
     for matrix in planar_poses(points, camera.unproject(pixels), is_square=True):
         misses = camera.project(points @ matrix[:3, :3].T + matrix[:3, 3]) - pixels
@@ -81,7 +81,7 @@ def _solve(lamp: LampMarker, camera: CameraModel, pixels: Float64[np.ndarray, "4
 def _choose(
     solutions: list[_Solution], expected: Float64[np.ndarray, "4 4"] | None
 ) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the solution with the smaller error; if that is inconclusive, the one rotated least from `expected`."""
+    """Returns the solution with the smaller error; if that is inconclusive, the one rotated least from `expected`."""
     if not solutions:
         return None
     limit = AMBIGUOUS_RATIO * (solutions[0].error_px + CORNER_NOISE_PX)

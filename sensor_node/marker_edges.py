@@ -31,7 +31,7 @@ def refine_corners(
     corners: Float64[np.ndarray, "m 4 2"],
     reach_fraction: float,
 ) -> Float64[np.ndarray, "m 4 2"]:
-    """Return the refined corners (pixels) of dark markers on white paper.
+    """Returns the refined corners (pixels) of dark markers on white paper.
 
     Edges are straight as a pinhole camera of the same focal length would see them; lines are fitted there.
 
@@ -94,7 +94,7 @@ def _edge_offsets(
     outward: Float64[np.ndarray, "m 4 2"],
     reach_px: Float64[np.ndarray, " m"],
 ) -> tuple[Float64[np.ndarray, "m 4 k"], Float64[np.ndarray, "m 4 k"]]:
-    """Return the outward distance of the true edge from the assumed one, in pixels, and the contrast found there."""
+    """Returns the outward distance of the true edge from the assumed one, in pixels, and the contrast found there."""
     places = []
     across_px = ACROSS * reach_px[:, None, None, None]
     for axis in (0, 1):  # each by itself: NumPy is slow along rows of two
@@ -110,7 +110,7 @@ def _edge_offsets(
 def _fit_lines(
     offsets: Float64[np.ndarray, "m 4 k"], contrast: Float64[np.ndarray, "m 4 k"]
 ) -> tuple[Float64[np.ndarray, "m 4"], Float64[np.ndarray, "m 4"]]:
-    """Fit a robust straight line to each edge's offsets; return its value at the start, and its rise to the end."""
+    """Fits a robust straight line to each edge's offsets; returns its value at the start, and its rise to the end."""
     trust = contrast / np.maximum(contrast.max(axis=-1, keepdims=True), TINY)
     weight = trust
     for _ in range(LINE_ITERATIONS):

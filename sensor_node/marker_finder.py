@@ -42,7 +42,7 @@ class MarkerFinder:
         self._board = board
 
     def quads(self, gray: UInt8[np.ndarray, "h w"], wanted: Collection[int]) -> Quads:
-        """Return the corners of every wanted marker that is large enough to be read, by id."""
+        """Returns the corners of every wanted marker that is large enough to be read, by id."""
         return self.seen(gray, wanted).quads
 
     def seen(
@@ -51,7 +51,7 @@ class MarkerFinder:
         wanted: Collection[int],
         region: tuple[slice, slice] | None = None,
     ) -> FoundMarkers:
-        """Return the wanted markers that are large enough to be read, and what may be others, of the same size.
+        """Returns the wanted markers that are large enough to be read, and what may be others, of the same size.
 
         With a `region` (rows, columns), only what lies there, as the search of the whole picture finds it.
         """
@@ -73,7 +73,7 @@ class MarkerFinder:
     def refined(
         self, light: Float32[np.ndarray, "h w"], camera: CameraModel, corners: Float64[np.ndarray, "n 4 2"]
     ) -> Float64[np.ndarray, "n 4 2"]:
-        """Return the corners of the board's markers: intersections of lines fitted to their edges (linear light)."""
+        """Returns the corners of the board's markers: intersections of lines fitted to their edges (linear light)."""
         board = self._board
         thin = min(self.border_fraction, board.separation_m / board.marker_length_m or 1.0)
         return refine_corners(light, camera, corners, REACH_FRACTION * thin)
@@ -87,7 +87,7 @@ class MarkerFinder:
     def inner_corners(
         self, gray: UInt8[np.ndarray, "h w"], light: np.ndarray, quads: Quads
     ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 2"]]:
-        """Return indices and pixels of a ChArUco board's inner corners, refined on `light`."""
+        """Returns indices and pixels of a ChArUco board's inner corners, refined on `light`."""
         markers = [quad[None].astype(np.float32) for quad in quads.values()]
         names = np.array([[name] for name in quads], np.int32)
         corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)
@@ -127,14 +127,14 @@ def _stacked(found: Sequence[np.ndarray]) -> Float64[np.ndarray, "n 4 2"]:
 
 
 def shortest_sides(quads: Float64[np.ndarray, "*n 4 2"]) -> Float64[np.ndarray, " *n"]:
-    """Return the shortest side of each quad, in pixels."""
+    """Returns the shortest side of each quad, in pixels."""
     return np.asarray(np.linalg.norm(quads - np.roll(quads, 1, axis=-2), axis=-1).min(axis=-1))
 
 
 def linear_luminance(
     color: UInt8[np.ndarray, "h w 3"], response: Float32[np.ndarray, "256 3"] | None
 ) -> Float32[np.ndarray, "h w"]:
-    """Return the linear luminance of a coded picture: a sum of three look-ups."""
+    """Returns the linear luminance of a coded picture: a sum of three look-ups."""
     table = (decode_lut(response) * LUMINANCE).astype(np.float32)
     planes = cv2.split(color)
     red, green, blue = (cv2.LUT(plane, table[:, channel]) for channel, plane in enumerate(planes))
@@ -144,7 +144,7 @@ def linear_luminance(
 def planar_poses(
     points: Float64[np.ndarray, "n 3"], rays: Float64[np.ndarray, "n 2"], *, is_square: bool
 ) -> list[Float64[np.ndarray, "4 4"]]:
-    """Return both poses (camera from target) of the planar ambiguity, refined, that show the printed side.
+    """Returns both poses (camera from target) of the planar ambiguity, refined, that show the printed side.
 
     Args:
         points: in the plane z = 0 of the target, whose printed side is towards +z; about the origin.

@@ -74,7 +74,7 @@ class BoardDetector:
     def detect(
         self, color: UInt8[np.ndarray, "h w 3"], region: tuple[slice, slice] | None = None
     ) -> BoardPose | None:
-        """Return the pose in a picture (RGB), or None if the board is not visible.
+        """Returns the pose in a picture (RGB), or None if the board is not visible.
 
         `reprojection_error_px` is the mean distance between the corners found and the board's corners.
 
@@ -96,7 +96,7 @@ class BoardDetector:
         return BoardPose(self._previous, best.error_px, alternative)
 
     def require_size(self, color: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Check that a picture is of the camera's size.
+        """Checks that a picture is of the camera's size.
 
         Raises:
             DeltalightError: it is not.
@@ -108,7 +108,7 @@ class BoardDetector:
             )
 
     def corners_at(self, world_from_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "n 2"]:
-        """Return where a camera sees the corners of all markers, in the picture or not; NaN behind it."""
+        """Returns where a camera sees the corners of all markers, in the picture or not; NaN behind it."""
         world = np.concatenate(list(self._corners.values()))
         return self._projected(np.linalg.inv(world_from_camera), world)
 
@@ -130,14 +130,14 @@ class BoardDetector:
         return matches.with_(self._matched(light, others)) if others else matches
 
     def _matched(self, light: Float32[np.ndarray, "h w"], quads: Quads) -> _Matches:
-        """Match markers' corners, refined."""
+        """Matches markers' corners, refined."""
         world = np.concatenate([self._corners[name] for name in quads])
         corners = np.array(list(quads.values()))
         pixels = self._finder.refined(light, self._camera, corners).reshape(-1, 2)
         return _Matches(world, pixels, self._camera.unproject(pixels))
 
     def _recognized(self, matches: _Matches, quads: Quads, unread: Float64[np.ndarray, "n 4 2"]) -> Quads:
-        """Return the quads that lie where the markers that were read place one of the others.
+        """Returns the quads that lie where the markers that were read place one of the others.
 
         A small marker is read in some pictures and not in the next: with and without it, a resting camera's pose
         would jump by a pixel.
@@ -160,7 +160,7 @@ class BoardDetector:
         return found
 
     def _solve_seen(self, matches: _Matches) -> list[_Solution]:
-        """Return the poses by the corners that are not occluded."""
+        """Returns the poses by the corners that are not occluded."""
         solutions = self._solve(matches)
         if not solutions:
             return []
@@ -175,7 +175,7 @@ class BoardDetector:
         return [solution for solution in solutions if solution.error_px <= MAX_ERROR_PX]
 
     def _solve(self, matches: _Matches) -> list[_Solution]:
-        """Return both poses of the planar ambiguity, refined, that see the sheet from its printed side."""
+        """Returns both poses of the planar ambiguity, refined, that see the sheet from its printed side."""
         centre = matches.world.mean(axis=0)
         is_square = len(matches.world) == 4 and self._board.type != "charuco"
         solutions = []
@@ -193,12 +193,12 @@ class BoardDetector:
     def _projected(
         self, camera_from_world: Float64[np.ndarray, "4 4"], world: Float64[np.ndarray, "*n 3"]
     ) -> Float64[np.ndarray, "*n 2"]:
-        """Return where points of the world are seen, pixels; NaN behind the camera."""
+        """Returns where points of the world are seen, pixels; NaN behind the camera."""
         points = world.reshape(-1, 3) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         return self._camera.project(points).reshape(*world.shape[:-1], 2)
 
     def _choose(self, solutions: list[_Solution]) -> tuple[_Solution, _Solution | None]:
-        """Return the solution with the smaller error; if that is inconclusive, the one nearer to the last pose."""
+        """Returns the solution with the smaller error; if that is inconclusive, the one nearer to the last pose."""
         best, other = solutions[0], solutions[1] if len(solutions) > 1 else None
         if other is None or self._previous is None:
             return best, other
@@ -209,5 +209,5 @@ class BoardDetector:
 
 
 def _turn(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> float:
-    """Return the angle between two orientations in radians."""
+    """Returns the angle between two orientations in radians."""
     return float(np.linalg.norm(cv2.Rodrigues(first[:3, :3].T @ second[:3, :3])[0]))

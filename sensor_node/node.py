@@ -125,7 +125,7 @@ class NodeConfig(StrictModel):
 
 
 def node_camera(config: NodeConfig) -> Camera:
-    """Return the camera that a configuration names, with its fish-eye camera, not opened yet.
+    """Returns the camera that a configuration names, with its fish-eye camera, not opened yet.
 
     Raises:
         DeltalightError: there is no such source, it cannot be read, or its calibration is missing.
@@ -144,7 +144,7 @@ def node_camera(config: NodeConfig) -> Camera:
 def run_node(
     config: NodeConfig, stop: threading.Event, keys: Keys | None = None, camera: Camera | None = None
 ) -> None:
-    """Publish frames until `stop` is set or the source ends; return within a second of `stop`.
+    """Publishes frames until `stop` is set or the source ends; returns within a second of `stop`.
 
     For each frame: fish-eye pictures if new, raw depth, radiance and lights if new, clean depth, lamps, pose, then
     colour, all with its `frame_id` and capture time; so a receiver of the colour has received the rest. Statistics
@@ -186,7 +186,7 @@ class Repeater(Generic[Item]):
         *,
         now: bool = False,
     ) -> bool:
-        """Send the message of `item`, created by `made`, if it is due or has to be sent `now`; whether it was."""
+        """Sends the message of `item`, created by `made`, if it is due or has to be sent `now`; whether it was."""
         now_s = time.monotonic()
         if item is not self._item:
             self._item, self._multipart = item, made()
@@ -217,7 +217,7 @@ class _Node:
         self._frames = self._without_board = 0
 
     def run(self, capture: CaptureThread, stop: threading.Event) -> None:
-        """Publish captured frames until `stop` or the end."""
+        """Publishes captured frames until `stop` or the end."""
         while not stop.is_set() and not capture.ended:
             captured = capture.take(POLL_S)
             if captured is not None:
@@ -257,13 +257,13 @@ class _Node:
         )
 
     def _filtered(self, view: ViewFrame, frame: SensorFrame) -> ViewFrame:
-        """Smooth a pose that came from the board; one given with the frame is the truth."""
+        """Smooths a pose that came from the board; one given with the frame is the truth."""
         if self._filter is None or frame.world_from_camera is not None:
             return view
         return replace(view, pose=self._filter(view.pose, frame.timestamp_ns))
 
     def _send_fisheye(self, frame: SensorFrame, stamps: Stamps) -> None:
-        """Send fish-eye pictures once, and repeat them for late subscribers."""
+        """Sends fish-eye pictures once, and repeats them for late subscribers."""
         config, pictures = self._config, frame.fisheye
         if pictures is None:
             return
@@ -277,7 +277,7 @@ class _Node:
         self._fisheye.send(pictures, made, self._publisher.send)
 
     def _send_light(self, view: ViewFrame, stamps: Stamps) -> None:
-        """Send a radiance map once and its lights whenever they changed; repeat both for late subscribers."""
+        """Sends a radiance map once and its lights whenever they changed; repeats both for late subscribers."""
         radiance = view.radiance_map
         if radiance is None:
             return
@@ -324,7 +324,7 @@ class _Node:
         self._period_s, self._frames, self._without_board = time.monotonic(), 0, 0
 
     def _log_state(self, state: str, detail: str) -> None:
-        """Log the state once two statistics agree on it and it differs in more than its numbers."""
+        """Logs the state once two statistics agree on it and it differs in more than its numbers."""
         words = re.sub(r"[\d.]+", "", detail)
         if words == self._heard != self._logged:
             self._logged = words

@@ -56,7 +56,7 @@ class PoseFilter:
         self._state: _State | None = None
 
     def __call__(self, pose: BoardPose | None, timestamp_ns: int) -> BoardPose | None:
-        """Return the smoothed pose, with error and alternative of the input pose.
+        """Returns the smoothed pose, with error and alternative of the input pose.
 
         Args:
             pose: as found; None (no board in sight) is returned and changes nothing.
@@ -95,16 +95,16 @@ class PoseFilter:
 
 
 def _smoothing(cutoff_hz: float, period_s: float) -> float:
-    """Return the weight of the new value in an exponential low-pass filter."""
+    """Returns the weight of the new value in an exponential low-pass filter."""
     return 1 / (1 + 1 / (2 * np.pi * cutoff_hz * period_s))
 
 
 def _turn(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "3"]:
-    """Return the rotation vector from one orientation to another, radians."""
+    """Returns the rotation vector from one orientation to another, radians."""
     return np.asarray(cv2.Rodrigues(first[:3, :3].T @ second[:3, :3])[0]).ravel()
 
 
 def _orthonormal(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return the nearest rotation: products of thousands of small rotations drift."""
+    """Returns the nearest rotation: products of thousands of small rotations drift."""
     left, _, right = np.linalg.svd(rotation)
     return np.asarray(left @ right)

@@ -99,7 +99,7 @@ class RestingBoard:
         return _Fit(pixels, changes, inverse, displacements, np.sqrt(variance))
 
     def _windows(self) -> UInt8[np.ndarray, "h w"]:
-        """Return the mask of the pixels around corners."""
+        """Returns the mask of the pixels around corners."""
         windows = np.zeros(self._seen.shape, np.uint8)
         columns, rows = np.rint(self._corners).astype(np.int64).T
         windows[rows, columns] = 1
@@ -107,7 +107,7 @@ class RestingBoard:
         return np.asarray(cv2.dilate(windows, np.ones((edge, edge), np.uint8)))
 
     def _displacements(self) -> Float64[np.ndarray, "corners 2 10"]:
-        """Return the displacement of each corner by each unknown; gain and offset displace nothing."""
+        """Returns the displacement of each corner by each unknown; gain and offset displace nothing."""
         u, v = self._centred(*self._corners.T)
         one, none = np.ones_like(u), np.zeros_like(u)
         along_x = [one, u, v, none, none, none, u * u, u * v, none, none]
@@ -115,14 +115,14 @@ class RestingBoard:
         return np.stack([np.stack(along_x, axis=-1), np.stack(along_y, axis=-1)], axis=1)
 
     def _centred(self, x: np.ndarray, y: np.ndarray) -> list[Float64[np.ndarray, " n"]]:
-        """Return coordinates from the board's middle, -1..1 on it."""
+        """Returns coordinates from the board's middle, -1..1 on it."""
         middle = self._corners.mean(axis=0)
         reach = np.abs(self._corners - middle).max()
         return [(values - centre) / reach for values, centre in zip((x, y), middle, strict=True)]
 
 
 def _blocks_around(corners: Float64[np.ndarray, "n 2"], width: int, height: int) -> tuple[slice, slice]:
-    """Return rows and columns of the whole blocks of a picture that hold the corners, and some around them."""
+    """Returns rows and columns of the whole blocks of a picture that hold the corners, and some around them."""
     slices = []
     for axis, size in ((1, height), (0, width)):
         low, high = (corners[:, axis].min(), corners[:, axis].max()) if len(corners) else (0, 0)

@@ -73,7 +73,7 @@ class ViewFrameBuilder:
             self._check_depth(self._reference)
 
     def __call__(self, frame: SensorFrame) -> ViewFrame:
-        """Return the renderer's input for a frame.
+        """Returns the renderer's input for a frame.
 
         `pose` is None if the board is not visible. `depth` is None if the source has no depth; a single frame without
         has a depth image that is unknown everywhere. Of a picture that is repeated nothing is computed again.
@@ -131,7 +131,7 @@ class ViewFrameBuilder:
         return self._detector.detect(frame.color)
 
     def _pose_alone(self, frame: SensorFrame) -> BoardPose | None:
-        """Return the pose of a frame out of sequence, without affecting the detector's memory."""
+        """Returns the pose of a frame out of sequence, without affecting the detector's memory."""
         detector, self._detector = self._detector, None
         try:
             return self._pose(frame)
@@ -180,5 +180,5 @@ def _unknown(frame: SensorFrame) -> DepthImage:
 
 
 def _exposure_scale(exposure_s: float | None, reference_s: float | None) -> float:
-    """Return the frame's exposure over the reference (an unreported exposure is the reference)."""
+    """Returns the frame's exposure over the reference (an unreported exposure is the reference)."""
     return 1.0 if exposure_s is None or reference_s is None else exposure_s / reference_s

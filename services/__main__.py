@@ -7,7 +7,7 @@ from deltalight.services.signals import Terminated, raise_signals
 
 
 def main() -> None:
-    """Run the command line of this process and exit with its code."""
+    """Runs the command line of this process and exit with its code."""
     raise_signals()
     try:
         from deltalight.services import cli

@@ -24,7 +24,7 @@ COLORS = 192  # beside the line's white; GIF has 256
 def divided(
     before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"], position: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return `before` left of a white line at this fraction of the width, and `after` right of it."""
+    """Returns `before` left of a white line at this fraction of the width, and `after` right of it."""
     column = round(position * before.shape[1])
     picture = after.copy()
     picture[:, :column] = before[:, :column]
@@ -33,7 +33,7 @@ def divided(
 
 
 def before_after_gif(before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Return a GIF that repeats for ever, in the size of `after` and at most WIDTH wide."""
+    """Returns a GIF that repeats for ever, in the size of `after` and at most WIDTH wide."""
     after = _small(after)
     before = _resized(before, (after.shape[1], after.shape[0]))
     # One palette, without dithering, lets pictures share what does not change: half the size.
@@ -50,7 +50,7 @@ def before_after_gif(before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray
 def write_before_after_video(
     path: Path, before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"]
 ) -> None:
-    """Write the same as a video (H.264) of ROUNDS rounds, in the whole size of `after`.
+    """Writes the same as a video (H.264) of ROUNDS rounds, in the whole size of `after`.
 
     Raises:
         DeltalightError: PyAV is missing, the name is taken, or the disk refuses.
@@ -66,13 +66,13 @@ def write_before_after_video(
 def _round(
     before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"]
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Yield pictures in which the line goes there and back."""
+    """Yields pictures in which the line goes there and back."""
     for step in range(PICTURES):
         yield divided(before, after, 0.5 + REACH * math.cos(2 * math.pi * step / PICTURES))
 
 
 def _palette(picture: UInt8[np.ndarray, "h w 3"]) -> Image.Image:
-    """Return an image whose palette is that of a picture, and white."""
+    """Returns an image whose palette is that of a picture, and white."""
     colors = Image.fromarray(picture).quantize(COLORS, dither=Image.Dither.NONE).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*colors[: 3 * COLORS], 255, 255, 255])

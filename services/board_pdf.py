@@ -34,7 +34,7 @@ class Page(NamedTuple):
 
 
 def choose_page(board: BoardSpec, paper: str) -> Page:
-    """Return the paper in portrait, or in landscape if the board fits only so.
+    """Returns the paper in portrait, or in landscape if the board fits only so.
 
     Raises:
         DeltalightError: the board does not fit; the sentence names what does.
@@ -58,7 +58,7 @@ def choose_page(board: BoardSpec, paper: str) -> Page:
 
 
 def margins_m(board: BoardSpec, page: Page) -> tuple[float, float, float, float]:
-    """Return the paper left of, above, right of and below the printed board, in metres (BoardSpec.margins_m)."""
+    """Returns the paper left of, above, right of and below the printed board, in metres (BoardSpec.margins_m)."""
     width, height = _board_mm(board)
     left, top, right, bottom = _margins_mm(width, height, page)
     return left / 1e3, top / 1e3, right / 1e3, bottom / 1e3
@@ -86,7 +86,7 @@ def _board_mm(board: BoardSpec) -> tuple[float, float]:
 
 
 def write_board_pdf(path: Path, board: BoardSpec, paper: str) -> None:
-    """Write the board, and the markers for lamps on further pages.
+    """Writes the board, and the markers for lamps on further pages.
 
     Raises:
         DeltalightError: the board or a lamp's marker does not fit on the paper, or reportlab is not installed.
@@ -134,7 +134,7 @@ class _Sheet:
         self._write()
 
     def _draw_squares(self) -> None:
-        """Draw the black squares of a chessboard, as one path so that they meet without a seam."""
+        """Draws the black squares of a chessboard, as one path so that they meet without a seam."""
         board, path = self._board, self._canvas.beginPath()
         edge = 1e3 * (board.marker_length_m + board.separation_m)
         for row in range(board.rows):
@@ -149,7 +149,7 @@ class _Sheet:
         self._canvas.drawPath(path, stroke=0, fill=1)
 
     def _draw_axes(self) -> None:
-        """Draw the world axes beside the print; the lines through them cross at the origin."""
+        """Draws the world axes beside the print; the lines through them cross at the origin."""
         canvas, above, beside = self._canvas, self._top + AXES_GAP_MM, self._left - AXES_GAP_MM
         _draw_arrow(canvas, (0, above), (AXES_MM, above), RED, "x")
         _draw_arrow(canvas, (beside, 0), (beside, AXES_MM), GREEN, "y")
@@ -179,7 +179,7 @@ class _Sheet:
 
 
 def marker_cells(board: BoardSpec) -> dict[int, Bool[np.ndarray, "n n"]]:
-    """Return the white cells of the board's and its lamps' markers, with the black border, by id."""
+    """Returns the white cells of the board's and its lamps' markers, with the black border, by id."""
     dictionary, border = board.opencv_dictionary(), board.border_bits
     size = dictionary.markerSize
     names = [*board.marker_ids, *(lamp.id for lamp in board.lamp_markers)]
@@ -190,7 +190,7 @@ def marker_cells(board: BoardSpec) -> dict[int, Bool[np.ndarray, "n n"]]:
 
 
 def _draw_marker(canvas: Any, cells: Bool[np.ndarray, "n n"], x: float, y: float, length: float) -> None:  # noqa: ANN401
-    """Draw a marker with its top-left corner at (x, y) mm: a black square, its white cells as one path."""
+    """Draws a marker with its top-left corner at (x, y) mm: a black square, its white cells as one path."""
     cell, path = length / len(cells), canvas.beginPath()
     for row, column in np.argwhere(cells).tolist():
         path.rect((x + column * cell) * MM, (y - (row + 1) * cell) * MM, cell * MM, cell * MM)
@@ -238,7 +238,7 @@ def _draw_ruler(canvas: Any, x: float, y: float) -> None:  # noqa: ANN401
 
 
 def _draw_lamps(canvas: Any, board: BoardSpec, page: Page) -> None:  # noqa: ANN401
-    """Draw pages with the markers for lamps, row by row, each with a cutting line."""
+    """Draws pages with the markers for lamps, row by row, each with a cutting line."""
     cells, size = marker_cells(board), board.opencv_dictionary().markerSize + 2 * board.border_bits
     x, y, row = SIDE_MM, page.height - TOP_MM, 0.0
     canvas.setPageSize((page.width * MM, page.height * MM))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def result_path(folder: Path, name: str, *, force: bool) -> Path:
-    """Return the path of a new file in `folder`/calibration, checked before any work is done.
+    """Returns the path of a new file in `folder`/calibration, checked before any work is done.
 
     Raises:
         DeltalightError: the file exists and `force` is not given, or the folder cannot be written.
@@ -36,7 +36,7 @@ def result_path(folder: Path, name: str, *, force: bool) -> Path:
 
 
 def write_result(path: Path, save: Callable[[Path], None]) -> None:
-    """Let `save` write a temporary file, then move it into place; make its folder if missing."""
+    """Lets `save` write a temporary file, then moves it into place; makes its folder if missing."""
     make_output_folder(path.parent)
     with replacing(path) as temporary:
         save(temporary)
@@ -50,7 +50,7 @@ class Watch:
     console: Console = field(default_factory=lambda: Console(stderr=True, soft_wrap=True))
 
     def collect(self, series: "Series", target: "Target", enough: int) -> "ViewCollector":
-        """Collect the views of a series."""
+        """Collects the views of a series."""
         from deltalight.sensor_node.calibration.picture_sources import collect_views
 
         if self.total is None:
@@ -79,7 +79,7 @@ class Watch:
 
 
 def save_lens(path: Path, lens: "CameraModel | FisheyeLens") -> None:
-    """Write rgb.yaml or fisheye.yaml; response and vignetting of an older fisheye.yaml stay."""
+    """Writes rgb.yaml or fisheye.yaml; response and vignetting of an older fisheye.yaml stay."""
     from deltalight.protocol.camera_model import CameraModel, save_camera_yaml
     from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
 
@@ -93,7 +93,7 @@ def save_lens(path: Path, lens: "CameraModel | FisheyeLens") -> None:
 
 
 def save_pictures(result: "LensResult", stem: Path) -> list[str]:
-    """Write `<stem>_coverage.png` and `<stem>_residuals.png`; return their names."""
+    """Writes `<stem>_coverage.png` and `<stem>_residuals.png`; returns their names."""
     from deltalight.sensor_node.calibration.coverage import draw_coverage, draw_misses
 
     pictures = {
@@ -108,7 +108,7 @@ def save_pictures(result: "LensResult", stem: Path) -> list[str]:
 
 
 def lens_report(result: "LensResult") -> dict[str, Any]:
-    """Return the figures of a lens calibration as plain values."""
+    """Returns the figures of a lens calibration as plain values."""
     fit = result.fit
     return {
         "pictures": result.pictures,
@@ -128,7 +128,7 @@ def lens_report(result: "LensResult") -> dict[str, Any]:
 
 
 def print_lens_report(result: "LensResult") -> None:
-    """Print the views, what was left out, the coverage and the figures."""
+    """Prints the views, what was left out, the coverage and the figures."""
     report, console = lens_report(result), Console(soft_wrap=True, highlight=False, markup=False)
     rows = [(view["name"], str(view["points"]), f"{view['rms_px']:.2f}") for view in report["per_view"]]
     print_table(console, ("view", "points", "rms px"), rows)
@@ -145,7 +145,7 @@ def print_lens_report(result: "LensResult") -> None:
 
 
 def print_table(console: Console, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under headings, with numbers right-aligned."""
+    """Prints rows under headings, with numbers right-aligned."""
     table = Table(box=None)
     for column, heading in enumerate(headings):
         table.add_column(heading, justify="left" if column == 0 else "right")

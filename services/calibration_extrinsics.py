@@ -30,7 +30,7 @@ class ExtrinsicsJob(NamedTuple):
 
 
 def find_transform(job: ExtrinsicsJob, *, force: bool) -> dict[str, Any]:
-    """Find a transform, write it beside the others, and return its figures.
+    """Finds a transform, writes it beside the others, and returns its figures.
 
     Raises:
         DeltalightError: the recording does not determine it, or it is known already and `force` is not given.
@@ -49,7 +49,7 @@ def find_transform(job: ExtrinsicsJob, *, force: bool) -> dict[str, Any]:
 
 
 def board_of(source: Source, path: Path) -> BoardSpec:
-    """Return the board of a source.
+    """Returns the board of a source.
 
     Raises:
         DeltalightError: the source describes none.
@@ -98,7 +98,7 @@ def _depth_from_rgb(source: Source, board: BoardSpec) -> tuple[Float64[np.ndarra
 
 
 def _watched(source: Source) -> Iterator[SensorFrame]:
-    """Yield the frames of a source, with a progress bar on stderr."""
+    """Yields the frames of a source, with a progress bar on stderr."""
     console = Console(stderr=True)
     hidden = not console.is_terminal  # it would leave an empty line in a file
     yield from track(

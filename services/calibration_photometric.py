@@ -15,7 +15,7 @@ from deltalight.services.calibration_extrinsics import board_of
 
 
 def find_response(source: Path, eye: Literal["rgb", "fisheye"], out: Path, *, force: bool) -> dict[str, Any]:
-    """Find a response; write `out`/response.txt, or the fish-eye's into its calibration/fisheye.yaml.
+    """Finds a response; writes `out`/response.txt, or the fish-eye's into its calibration/fisheye.yaml.
 
     Raises:
         DeltalightError: the bracket does not determine it, or there is one already and `force` is not given.
@@ -57,7 +57,7 @@ def _write_into_fisheye(path: Path, table: Float32[np.ndarray, "256 3"]) -> None
 def find_paper_albedo(
     source: Path, card: tuple[str, float], out: Path, board: Path | None, *, force: bool
 ) -> dict[str, Any]:
-    """Find the paper's albedo by a grey card (position, albedo); write it into `out`/calibration/board.yaml.
+    """Finds the paper's albedo by a grey card (position, albedo); writes it into `out`/calibration/board.yaml.
 
     Raises:
         DeltalightError: the pictures do not show it, or the board has one already and `force` is not given.

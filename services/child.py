@@ -30,13 +30,13 @@ class Watch(Protocol):
     """Tells whether a process hangs (`watchdog.Watchdog`)."""
 
     def fault(self) -> str | None:
-        """Return what shows that it hangs, None while nothing does."""
+        """Returns what shows that it hangs, None while nothing does."""
 
     def is_starting(self) -> bool:
         """Whether it has not done yet what it is for."""
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stops watching."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ChildSpec:
 
     @classmethod
     def deltalight(cls, name: str, *arguments: str) -> "ChildSpec":
-        """Return a child that runs a command of this command line."""
+        """Returns a child that runs a command of this command line."""
         return cls(name, ("-P", "-m", "deltalight.services.cli", *arguments))
 
     @property
@@ -81,7 +81,7 @@ class Child:
     reader: threading.Thread | None = None
 
     def start(self, spare: Process | None = None) -> None:
-        """Start it, by a process that waits for these arguments if there is one."""
+        """Starts it, by a process that waits for these arguments if there is one."""
         self.last_lines.clear()
         self.process = spare or self._take_spare() or open_process(self.spec.arguments, subprocess.DEVNULL)
         self.started += 1
@@ -97,7 +97,7 @@ class Child:
         return is_young and self.watch is not None and self.watch.is_starting()
 
     def start_spare_if_due(self) -> None:
-        """Start a spare once the process itself has had the time to start; none again for one that died."""
+        """Starts a spare once the process itself has had the time to start; none again for one that died."""
         due = self.spec.warm and self.process is not None and self.spare is None
         if due and time.monotonic() - self.started_s >= SPARE_AFTER_S:
             self.spare = open_spare(self.spec.arguments, self.spec.warm)
@@ -105,7 +105,7 @@ class Child:
                 rehearse_spare(self.spare, self.spec.words)
 
     def _take_spare(self) -> Process | None:
-        """Return the spare, which starts now, None if there is none."""
+        """Returns the spare, which starts now, None if there is none."""
         spare, self.spare = self.spare, None
         return spare if spare is not None and use_spare(spare) else None
 
@@ -117,14 +117,14 @@ class Child:
                 self.forward(f"{self.spec.name}: {line.rstrip()}")
 
     def last_sentence(self) -> str:
-        """Return the last line that the child wrote, without the command's name before it."""
+        """Returns the last line that the child wrote, without the command's name before it."""
         if self.reader is not None:
             self.reader.join(timeout=1.0)
         line = next((line for line in reversed(self.last_lines) if line.strip()), "it said nothing")
         return line.removeprefix("deltalight: ")
 
     def end_if_hanging(self) -> None:
-        """Kill it if it hangs, and say so."""
+        """Kills it if it hangs, and says so."""
         fault = None if self.watch is None else self.watch.fault()
         if fault is not None and self.process is not None:
             self.forward(f"{self.spec.name}: {fault}; killing it.")
@@ -132,13 +132,13 @@ class Child:
             self.process.wait()
 
     def end_watching(self) -> None:
-        """Stop looking whether it hangs."""
+        """Stops looking whether it hangs."""
         if self.watch is not None:
             self.watch.close()
             self.watch = None
 
     def end_reading(self) -> None:
-        """Wait shortly for its last lines."""
+        """Waits shortly for its last lines."""
         if self.reader is not None:
             self.reader.join(timeout=0.2)
 
@@ -146,7 +146,7 @@ class Child:
 def open_process(
     arguments: Sequence[str], stdin: int, more: Mapping[str, str] | None = None
 ) -> subprocess.Popen[str]:
-    """Start Python with these arguments, and `more` in the environment; it ends with this process."""
+    """Starts Python with these arguments, and `more` in the environment; it ends with this process."""
     return subprocess.Popen(
         [sys.executable, *arguments],
         stdin=stdin,
@@ -159,14 +159,14 @@ def open_process(
 
 
 def open_spare(arguments: Sequence[str], prepared: tuple[str, ...]) -> subprocess.Popen[str]:
-    """Start a process that prepares these (`warm_spare`) and waits."""
+    """Starts a process that prepares these (`warm_spare`) and waits."""
     return open_process(arguments, subprocess.PIPE, spare_environment(prepared))
 
 
 def fork_spares(
     commands: Mapping[str, str], earlier: Mapping[str, Process] | None = None
 ) -> dict[str, Process]:
-    """Fork a spare of each command, by the name of its process, and return them with the `earlier` ones.
+    """Forks a spare of each command, by the name of its process, and returns them with the `earlier` ones.
 
     They are for a `Supervisor` (`ending_spares`), and share what this process has imported. Only Linux forks safely,
     and only a process with one thread; elsewhere they are started.
@@ -186,7 +186,7 @@ def fork_spares(
 
 @contextmanager
 def ending_spares(spares: Mapping[str, Process]) -> Iterator[Mapping[str, Process]]:
-    """End those of the spares at the end that nobody took."""
+    """Ends those of the spares at the end that nobody took."""
     try:
         yield spares
     finally:
@@ -194,12 +194,12 @@ def ending_spares(spares: Mapping[str, Process]) -> Iterator[Mapping[str, Proces
 
 
 def take_spare(spare: Process | None, spec: ChildSpec) -> Process | None:
-    """Tell a spare to go on as a deltalight command; None where there is no spare, or it died."""
+    """Tells a spare to go on as a deltalight command; None where there is no spare, or it died."""
     return spare if spare is not None and use_spare(spare, spec.words) else None
 
 
 def end_all(processes: Sequence[Process]) -> None:
-    """End processes: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
+    """Ends processes: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
     try:
         for process in processes:
             process.terminate()

@@ -66,7 +66,7 @@ class _Commands(TyperGroup):
     """Shows wrong values of options without words of pydantic's."""
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - click's context, of typer's own click in newer versions
-        """Run the command that was named."""
+        """Runs the command that was named."""
         try:
             return super().invoke(ctx)
         except typer.BadParameter as fault:
@@ -139,7 +139,7 @@ def _global_options(
 
 
 def main() -> None:
-    """Run the command line of this process and exit with its code."""
+    """Runs the command line of this process and exit with its code."""
     code = None
     while code is None:
         with suppress(InForkedChild):  # this process is the child, with a command line of its own
@@ -148,7 +148,7 @@ def main() -> None:
 
 
 def _with_output_flushed(code: int) -> int:
-    """Write what standard output still holds, which Python would do with a traceback, and return the exit code."""
+    """Writes what standard output still holds, which Python would do with a traceback, and returns the exit code."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -168,7 +168,7 @@ def _run_as_process() -> int:
 
 
 def limit_blas_threads(words: Sequence[str]) -> None:
-    """Give live commands one thread of OpenBLAS each, unless the environment says how many.
+    """Gives live commands one thread of OpenBLAS each, unless the environment says how many.
 
     A frame's matrices are small: more threads wait for each other, spinning, longer than they compute, and take the
     cores from the other processes. It works until numpy is imported.
@@ -178,7 +178,7 @@ def limit_blas_threads(words: Sequence[str]) -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command line in this process and return its exit code.
+    """Runs one command line in this process and returns its exit code.
 
     Faults become sentences on stderr; with `--debug`, anywhere on the line, they are raised.
     """
@@ -202,7 +202,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _refuse_empty_paths(command: Any) -> None:  # noqa: ANN401 - a command of click's, as above
-    """Let no option or argument take "" for a path: it would be the current folder (`--out "$UNSET"`)."""
+    """Lets no option or argument take "" for a path: it would be the current folder (`--out "$UNSET"`)."""
     hints = get_type_hints(command.callback) if command.callback else {}
     for parameter in command.params:
         hint = hints.get(parameter.name)

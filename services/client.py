@@ -55,7 +55,7 @@ class Asset:
 
     @classmethod
     def of(cls, answer: Json) -> Self:
-        """Create it from a response of the service."""
+        """Creates it from a response of the service."""
         names = tuple(answer["names"])
         return cls(answer["asset"], names, answer["kind"], answer["size_bytes"], answer["facts"])
 
@@ -88,7 +88,7 @@ class LiveFrame:
         return None if self.header.scene is None else self.header.scene.revision
 
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Decode the picture: RGB, camera-coded."""
+        """Decodes the picture: RGB, camera-coded."""
         camera = self.header.camera
         return decode_color(memoryview(self.jpeg), "jpeg", (camera.height, camera.width, 3))
 
@@ -127,12 +127,12 @@ class Scene:
         return None if picture is None else (picture["state"], picture["detail"])
 
     def refresh(self) -> None:
-        """Load the newest revision."""
+        """Loads the newest revision."""
         self._take(self._client.request("GET", self._path()))
 
     @contextmanager
     def exclusively(self) -> Iterator[None]:
-        """Refuse changes to a revision that is no longer the newest."""
+        """Refuses changes to a revision that is no longer the newest."""
         self._guarded = True
         try:
             yield
@@ -140,12 +140,12 @@ class Scene:
             self._guarded = False
 
     def replace(self, document: SceneDocument) -> None:
-        """Replace the document."""
+        """Replaces the document."""
         body = document.model_dump(mode="json", exclude={"revision"})
         self._change("PUT", "", body)
 
     def add_object(self, asset: Asset | str, **keys: Any) -> str:  # noqa: ANN401 - keys of the scene document
-        """Add an object with keys of the scene document (`pose`, `material`, ...); return its id."""
+        """Adds an object with keys of the scene document (`pose`, `material`, ...); returns its id."""
         reference = asset.reference if isinstance(asset, Asset) else asset
         before = {item["id"] for item in self._answer["document"]["objects"]}
         self._change("POST", "/objects", {"asset": reference, **keys})
@@ -153,46 +153,46 @@ class Scene:
         return next((each for each in reversed(ids) if each not in before), ids[-1])
 
     def change_object(self, object_id: str, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
-        """Change keys of an object; the others stay."""
+        """Changes keys of an object; the others stay."""
         self._change("PATCH", _object_path(object_id), keys)
 
     def move(
         self, object_id: str, *, translation_m: Place | None = None, rotation_wxyz: Rotation | None = None
     ) -> None:
-        """Change the position, metres, and rotation of an object."""
+        """Changes the position, metres, and rotation of an object."""
         pose = {"translation_m": translation_m, "rotation_wxyz": rotation_wxyz}
         self.change_object(object_id, pose={key: value for key, value in pose.items() if value is not None})
 
     def remove_object(self, object_id: str) -> None:
-        """Remove an object."""
+        """Removes an object."""
         self._change("DELETE", _object_path(object_id), None)
 
     def set_lights(self, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
-        """Change keys of the lights (`mode`, `manual`, `environment`, ...)."""
+        """Changes keys of the lights (`mode`, `manual`, `environment`, ...)."""
         self._change("PATCH", "/lights", keys)
 
     def set_method(self, name: str, **settings: Any) -> None:  # noqa: ANN401 - settings of the method
-        """Relight with another method, with these settings and defaults for the others."""
+        """Relights with another method, with these settings and defaults for the others."""
         self._change("PUT", "/method", {"name": name, **settings})
 
     def set_output(self, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
-        """Change keys of the output (`view`, `antialiasing`, ...)."""
+        """Changes keys of the output (`view`, `antialiasing`, ...)."""
         self._change("PATCH", "/output", keys)
 
     def undo(self) -> None:
-        """Undo the last change."""
+        """Undoes the last change."""
         self._change("POST", "/undo", None)
 
     def redo(self) -> None:
-        """Redo the change that was undone."""
+        """Redoes the change that was undone."""
         self._change("POST", "/redo", None)
 
     def activate(self) -> None:
-        """Show this scene."""
+        """Shows this scene."""
         self._change("POST", "/activate", None)
 
     def delete(self) -> None:
-        """Delete the scene, unless it is active."""
+        """Deletes the scene, unless it is active."""
         self._client.request("DELETE", self._path())
 
     def _path(self, rest: str = "") -> str:
@@ -239,36 +239,36 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Close the connections."""
+        """Closes the connections."""
         self._http.close()
 
     def scenes(self) -> list[Json]:
-        """Return id, name, revision and times of all scenes."""
+        """Returns id, name, revision and times of all scenes."""
         return cast(list[Json], self.request("GET", "/scenes"))
 
     def scene(self, scene_id: str) -> Scene:
-        """Return the scene with this id."""
+        """Returns the scene with this id."""
         return Scene(self, self.request("GET", f"/scenes/{scene_id}"))
 
     def active_scene(self) -> Scene:
-        """Return the scene that is rendered."""
+        """Returns the scene that is rendered."""
         return Scene(self, self.request("GET", "/active-scene"))
 
     def create_scene(self, document: SceneDocument | Mapping[str, Any]) -> Scene:
-        """Create a scene; it is shown once activated."""
+        """Creates a scene; it is shown once activated."""
         body = document.model_dump(mode="json") if isinstance(document, SceneDocument) else dict(document)
         return Scene(self, self.request("POST", "/scenes", json=body))
 
     def assets(self) -> list[Asset]:
-        """Return all uploaded files, the newest first."""
+        """Returns all uploaded files, the newest first."""
         return [Asset.of(answer) for answer in self.request("GET", "/assets")]
 
     def upload(self, path: Path) -> Asset:
-        """Upload a mesh or an environment map."""
+        """Uploads a mesh or an environment map."""
         return Asset.of(self._upload("/assets", path))
 
     def upload_recording(self, path: Path) -> Json:
-        """Upload an .mcap recording, or a .zip of a dataset folder; return its facts, with a checklist."""
+        """Uploads an .mcap recording, or a .zip of a dataset folder; returns its facts, with a checklist."""
         return cast(Json, self._upload("/recordings/upload", path))
 
     def _upload(self, address: str, path: Path) -> Any:  # noqa: ANN401 - JSON
@@ -282,15 +282,15 @@ class Client:
             raise DeltalightError(f"{path} cannot be read ({fault.strerror}); correct the path.") from fault
 
     def state(self) -> Json:
-        """Return rates, drops and delays of the processes."""
+        """Returns rates, drops and delays of the processes."""
         return cast(Json, self.request("GET", "/state"))
 
     def cameras(self) -> list[str]:
-        """Return the names of the cameras whose pictures are made, the first one's first."""
+        """Returns the names of the cameras whose pictures are made, the first one's first."""
         return [str(each["name"]) for each in self.state()["cameras"]]
 
     def pick(self, x: float, y: float, *, ignore: str | None = None, camera: str | None = None) -> Json:
-        """Return what a pixel of a camera's newest picture shows, looking through the object `ignore`.
+        """Returns what a pixel of a camera's newest picture shows, looking through the object `ignore`.
 
         `camera`: None = the first one.
         """
@@ -305,7 +305,7 @@ class Client:
         exr: bool = False,
         camera: str | None = None,
     ) -> list[Path]:
-        """Render one frame in several ways, `{name, view, method?}` each, and save the pictures in `folder`.
+        """Renders one frame in several ways, `{name, view, method?}` each, and saves the pictures in `folder`.
 
         `camera`: whose frame; None = the first one's.
 
@@ -325,17 +325,17 @@ class Client:
         return files
 
     def start_recording(self, name: str | None = None, duration_s: float | None = None) -> Json:
-        """Record the node's streams, until stopped or for this time."""
+        """Records the node's streams, until stopped or for this time."""
         body = {"name": name, "duration_s": duration_s}
         body = {key: value for key, value in body.items() if value is not None}
         return cast(Json, self.request("POST", "/recordings", json=body))
 
     def stop_recording(self, recording_id: str) -> Json:
-        """Stop a recording; return its facts."""
+        """Stops a recording; returns its facts."""
         return cast(Json, self.request("POST", f"/recordings/{recording_id}/stop"))
 
     def download_recording(self, recording_id: str, path: Path) -> None:
-        """Save a recording as an .mcap file, atomically.
+        """Saves a recording as an .mcap file, atomically.
 
         Raises:
             ApiError: there is none, or it is still growing.
@@ -351,7 +351,7 @@ class Client:
                     file.write(chunk)
 
     def frames(self, view: ShownView | None = None, *, camera: str | None = None) -> Iterator[LiveFrame]:
-        """Yield composites as they arrive, always the newest; a slow caller misses some.
+        """Yields composites as they arrive, always the newest; a slow caller misses some.
 
         `view`: what to look at; None = the scene's own. Until the renderer shows it, frames are in the scene's own
         (`frame.header.view`). `camera`: whose pictures, by its node's name; None = the first one's.
@@ -365,13 +365,13 @@ class Client:
                     socket.send("ack")
 
     def events(self) -> Iterator[Json]:
-        """Yield events as they arrive: `{type, ...}`; the first is `hello`."""
+        """Yields events as they arrive: `{type, ...}`; the first is `hello`."""
         with self._socket("/events") as socket:
             for message in socket:
                 yield json.loads(message)
 
     def request(self, method: str, path: str, **options: Any) -> Any:  # noqa: ANN401 - JSON
-        """Send one request and return the response's JSON; for routes without a method here.
+        """Sends one request and returns the response's JSON; for routes without a method here.
 
         Raises:
             ApiError: the service refused it.
@@ -403,7 +403,7 @@ class Client:
 
     @contextmanager
     def _socket(self, path: str) -> Iterator["ClientConnection"]:
-        """Open a WebSocket, with a ticket if the service requires tokens."""
+        """Opens a WebSocket, with a ticket if the service requires tokens."""
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 

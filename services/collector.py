@@ -62,7 +62,7 @@ class CompositeCollector:
         return max((after - before for before, after in pairwise(times_s)), default=0.0)
 
     def take(self, timeout_s: float, limit: int) -> bool:
-        """Take what arrived within `timeout_s`, up to `limit` composites in total; return whether there was any."""
+        """Takes what arrived within `timeout_s`, up to `limit` composites in total; returns whether there was any."""
         before = self.count
         for multipart in (self._receiver.latest(timeout_s) or {}).values():
             message, parts = decode(multipart)
@@ -81,7 +81,7 @@ class CompositeCollector:
         return str(detail or "unknown: the render server did not answer")
 
     def _ask(self, op: str, timeout_s: float) -> dict[str, Any] | None:
-        """Return the payload of the render server's reply; None if it does not answer in time."""
+        """Returns the payload of the render server's reply; None if it does not answer in time."""
         try:
             return self._client.request(
                 ControlRequest(node="collector", id=uuid.uuid4().hex, op=op), timeout_s
@@ -97,7 +97,7 @@ class CompositeCollector:
         return (len(arrivals_s) - 1) / max(arrivals_s[-1] - arrivals_s[0], 1e-3)
 
     def write_overview(self) -> None:
-        """Write contact_sheet.png and the video from the pictures in the folder."""
+        """Writes contact_sheet.png and the video from the pictures in the folder."""
         if self._out is None or not self.messages:
             return
         step = max(1, math.ceil(self.count / SHEET_PICTURES))
@@ -106,7 +106,7 @@ class CompositeCollector:
         self._write_video()
 
     def close(self) -> None:
-        """Close sockets and files."""
+        """Closes sockets and files."""
         self._receiver.close()
         self._client.close()
         if self._index is not None:
@@ -160,7 +160,7 @@ class CompositeCollector:
 
 @contextmanager
 def _no_warnings() -> Iterator[None]:
-    """Keep OpenCV from warning of each picture that the disk refuses."""
+    """Keeps OpenCV from warning of each picture that the disk refuses."""
     before = logs.setLogLevel(logs.LOG_LEVEL_ERROR)
     try:
         yield
@@ -188,7 +188,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pictures as small tiles in rows; all have the size of the first."""
+    """Returns the pictures as small tiles in rows; all have the size of the first."""
     height, width = pictures[0].shape[:2]
     tile = (SHEET_WIDTH, round(SHEET_WIDTH * height / width))
     tiles = [cv2.resize(picture, tile, interpolation=cv2.INTER_AREA) for picture in pictures]
@@ -199,7 +199,7 @@ def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarra
 
 
 def summarize(collector: CompositeCollector, restarts: dict[str, int]) -> dict[str, Any]:
-    """Return the figures of a finished run; a render server that does not answer only lacks its name.
+    """Returns the figures of a finished run; a render server that does not answer only lacks its name.
 
     `settled_...` are those of the later half, without the start and the first choice of size by a frame budget.
     """

@@ -6,7 +6,7 @@ from typing import Any
 
 
 async def run_until_first_ends(*coroutines: Coroutine[Any, Any, None]) -> None:
-    """Run coroutines until one of them ends, by an exception too; then cancel the others."""
+    """Runs coroutines until one of them ends, by an exception too; then cancel the others."""
     tasks = [asyncio.ensure_future(each) for each in coroutines]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -17,7 +17,7 @@ NAME = "Demo"
 
 
 def demo_scene(method: str) -> SceneDocument:
-    """Return the demo's scene with a method of `deltalight.protocol.method_names`.
+    """Returns the demo's scene with a method of `deltalight.protocol.method_names`.
 
     Raises:
         DeltalightError: the demo's files are missing.
@@ -29,7 +29,7 @@ def demo_scene(method: str) -> SceneDocument:
 
 
 def demo_plan(session: Path) -> HostPlan:
-    """Return the demo's processes without the web process, connected by ports of their own."""
+    """Returns the demo's processes without the web process, connected by ports of their own."""
     node_port, composite_port, control_port = ports.private_ports(3)
     return HostPlan(
         str(RECORDING),

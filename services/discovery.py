@@ -34,11 +34,11 @@ class FoundNode:
     key: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the node as plain data."""
+        """Returns the node as plain data."""
         return {**asdict(self), "endpoint": f"tcp://{self.address}:{self.port}", "curve": bool(self.key)}
 
     def endpoint(self, trusted: Mapping[str, bytes]) -> str:
-        """Return the endpoint to subscribe to, with the name under which the node's key is trusted.
+        """Returns the endpoint to subscribe to, with the name under which the node's key is trusted.
 
         Raises:
             DeltalightError: the node uses another version, has no keys, or its key is not trusted.
@@ -62,7 +62,7 @@ class FoundNode:
 def find_nodes(
     *, name: str | None = None, patience_s: float = PATIENCE_S, interfaces: Sequence[str] | None = None
 ) -> list[FoundNode]:
-    """Return the nodes that announce themselves, by name.
+    """Returns the nodes that announce themselves, by name.
 
     Args:
         name: stop as soon as this one is found; None = wait for all.
@@ -104,7 +104,7 @@ def find_nodes(
 
 
 def _node(info: "ServiceInfo") -> FoundNode | None:
-    """Parse an announcement; return None if it is none of a node's: anybody on the network can send one."""
+    """Parses an announcement; returns None if it is none of a node's: anybody on the network can send one."""
     texts = {key: value or "" for key, value in info.decoded_properties.items()}
     addresses = info.parsed_addresses()
     if not addresses or info.port is None or not texts.get("schema", "").isdecimal():
@@ -123,7 +123,7 @@ def _node(info: "ServiceInfo") -> FoundNode | None:
 
 
 def choose(nodes: Sequence[FoundNode], name: str) -> FoundNode:
-    """Return the node called `name`, or for `auto` the only one.
+    """Returns the node called `name`, or for `auto` the only one.
 
     Raises:
         DeltalightError: it was not found, or `auto` and there are several.
@@ -147,7 +147,7 @@ def choose(nodes: Sequence[FoundNode], name: str) -> FoundNode:
 
 
 def node_endpoint(name: str, settings: KeySettings, *, interfaces: Sequence[str] | None = None) -> str:
-    """Return the endpoint of the node called `name` (`auto`: of the only one), found on the network.
+    """Returns the endpoint of the node called `name` (`auto`: of the only one), found on the network.
 
     Raises:
         DeltalightError: there is no such node, or it is not trusted.

@@ -43,12 +43,12 @@ class Check:
     hint: str = ""
 
     def as_dict(self) -> dict[str, str]:
-        """Return the check as plain data."""
+        """Returns the check as plain data."""
         return asdict(self)
 
 
 def examine() -> Iterator[Check]:
-    """Run all checks, one after the other."""
+    """Runs all checks, one after the other."""
     yield Check("python", "ok", sys.version.split()[0])
     yield from _packages()
     yield _opencv()
@@ -91,7 +91,7 @@ def _opencv() -> Check:
 
 
 def _renderers() -> Iterator[Check]:
-    """Probe each EGL device in a child, because a broken driver ends the process."""
+    """Probes each EGL device in a child, because a broken driver ends the process."""
     only_software = True
     for device in range(MAXIMUM_DEVICES):
         probe = _probe(device)
@@ -135,7 +135,7 @@ def _methods() -> Iterator[Check]:
 
 
 def _cameras() -> Iterator[Check]:
-    """Report every camera that was found, one line each, then the kinds without any."""
+    """Reports every camera that was found, one line each, then the kinds without any."""
     from deltalight.sensor_node.cameras.discovery import discover
     from deltalight.sensor_node.cameras.drivers import driver_title
 

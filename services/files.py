@@ -13,7 +13,7 @@ SUFFIX = ".mcap"
 
 
 def make_output_folder(folder: Path) -> Path:
-    """Create `folder` if missing, and verify that files can be written into it.
+    """Creates `folder` if missing, and verifies that files can be written into it.
 
     Raises:
         DeltalightError: it is a file, or cannot be created or written.
@@ -33,7 +33,7 @@ def make_output_folder(folder: Path) -> Path:
 
 
 def require_output_folder(folder: Path) -> None:
-    """Check a folder that is written after long work; one that was missing is missing afterwards, too.
+    """Checks a folder that is written after long work; one that was missing is missing afterwards, too.
 
     Raises:
         DeltalightError: it is a file, or cannot be created or written.
@@ -46,7 +46,7 @@ def require_output_folder(folder: Path) -> None:
 
 
 def require_output_file(path: Path) -> None:
-    """Check a file that is written after long work, so that the work is not lost; create its folder if missing.
+    """Checks a file that is written after long work, so that the work is not lost; creates its folder if missing.
 
     Raises:
         DeltalightError: it is a folder, or its folder cannot be written.
@@ -57,7 +57,7 @@ def require_output_file(path: Path) -> None:
 
 
 def require_new_recording(path: Path) -> None:
-    """Check the name of a recording to be written; create its folder if missing.
+    """Checks the name of a recording to be written; creates its folder if missing.
 
     Raises:
         DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
@@ -67,7 +67,7 @@ def require_new_recording(path: Path) -> None:
 
 
 def require_recording_name(path: Path) -> None:
-    """Check the name of a recording to appear; create its folder if missing.
+    """Checks the name of a recording to appear; creates its folder if missing.
 
     Raises:
         DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
@@ -79,7 +79,7 @@ def require_recording_name(path: Path) -> None:
 
 
 def require_absent(path: Path) -> None:
-    """Refuse to replace anything.
+    """Refuses to replace anything.
 
     Raises:
         DeltalightError: the path exists.
@@ -90,9 +90,9 @@ def require_absent(path: Path) -> None:
 
 @contextmanager
 def appearing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` for a file or folder.
+    """Yields a temporary path beside `path` for a file or folder.
 
-    Move it into place at the end, remove it on an error. A killed process leaves it behind, hidden. The suffix stays.
+    Moves it into place at the end, or removes it on an error. A killed process leaves it, hidden. The suffix stays.
 
     Raises:
         DeltalightError: `path` already exists, or the disk refuses.

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Pause garbage collection while modules are imported, and exempt them from later collections.
+    """Pauses garbage collection while modules are imported, and exempts them from later collections.
 
     Modules live as long as the process. Without this, a tenth of a live process's start goes into collections that
     find nothing.

@@ -56,7 +56,7 @@ class AccessUnit:
 
 
 def why_unavailable() -> str | None:
-    """Return why there is no H.264 here, one sentence; None where there is."""
+    """Returns why there is no H.264 here, one sentence; None where there is."""
     try:
         import av
     except ImportError:
@@ -83,7 +83,7 @@ class H264Encoder:
         self.codec = ""  # as RFC 6381 names it, from the first picture on
 
     def encode(self, picture: UInt8[np.ndarray, "h w 3"], *, as_key: bool = False) -> AccessUnit:
-        """Encode an sRGB picture.
+        """Encodes an sRGB picture.
 
         Raises:
             DeltalightError: the encoder failed.
@@ -126,7 +126,7 @@ class H264Decoder:
         self._context.thread_count = 1  # more would keep pictures back
 
     def decode(self, data: bytes, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
-        """Return the picture of an access unit, sRGB.
+        """Returns the picture of an access unit, sRGB.
 
         Raises:
             DeltalightError: it is damaged, or builds on one that did not come.
@@ -143,7 +143,7 @@ class H264Decoder:
 
 
 def rgb_picture(frame: "VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
-    """Return a decoded picture of this encoder's streams, sRGB."""
+    """Returns a decoded picture of this encoder's streams, sRGB."""
     from av.video.reformatter import ColorRange, Colorspace
 
     picture = frame.reformat(
@@ -156,13 +156,13 @@ def rgb_picture(frame: "VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
 
 
 def even_sized(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Repeat the last row and column where a size is odd: colour has half the resolution."""
+    """Repeats the last row and column where a size is odd: colour has half the resolution."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 def codec_name(data: bytes) -> str:
-    """Return the name of a stream by its first parameter set, such as `avc1.64001e` (RFC 6381, 3.3).
+    """Returns the name of a stream by its first parameter set, such as `avc1.64001e` (RFC 6381, 3.3).
 
     Raises:
         DeltalightError: it has none.

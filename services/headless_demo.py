@@ -25,7 +25,7 @@ LONGEST_FRAME_S = 1800.0  # after it whoever is still at work hangs
 def run_headless(
     method: str, frames: int, out: Path, *, as_json: bool, spares: Mapping[str, Process]
 ) -> None:
-    """Collect `frames` composites in the folder `out`, with a contact sheet and a video, and print a summary.
+    """Collects `frames` composites in the folder `out`, with a contact sheet and a video, and prints a summary.
 
     `spares` become the demo's processes, by name.
 
@@ -42,7 +42,7 @@ def run_headless(
 def collect_composites(
     scene: SceneDocument, frames: int, out: Path | None, spares: Mapping[str, Process] | None = None
 ) -> dict[str, Any]:
-    """Play the demo's recording through real processes and collect composites (into `out`, if given).
+    """Plays the demo's recording through real processes and collects composites (into `out`, if given).
 
     Raises:
         DeltalightError: a process died for good, or composites stopped coming.
@@ -66,7 +66,7 @@ def collect_composites(
 
 
 def _collect(collector: CompositeCollector, supervisor: Supervisor, progress: Progress, frames: int) -> None:
-    """Take composites until there are `frames`; wait while a process starts or is at work on the next one."""
+    """Takes composites until there are `frames`; waits while a process starts or is at work on the next one."""
     came_s = time.monotonic()
     while collector.count < frames:
         supervisor.poll()

@@ -19,7 +19,7 @@ HEALTH_PATH = "/api/v1/health"
 
 
 def check_health(address: str, *, streams: bool, timeout_s: float) -> str | None:
-    """Return what is wrong as a sentence, or None.
+    """Returns what is wrong as a sentence, or None.
 
     Raises:
         DeltalightError: the address is malformed, or requires keys that are missing.
@@ -81,7 +81,7 @@ def _await_report(endpoint: str, keys: "Keys | None", timeout_s: float) -> str |
 
 
 def main(words: list[str]) -> int:
-    """Check what the command line names; return its exit code."""
+    """Checks what the command line names; returns its exit code."""
     addresses = [word for word in words if word != "--streams"]
     if len(addresses) != 1:
         print("usage: python -m deltalight.services.health_check ADDRESS [--streams]", file=sys.stderr)

@@ -29,26 +29,26 @@ class HostCommands:
     allow_software: bool = False
 
     def child(self, label: str, command: str, *options: str) -> ChildSpec:
-        """Return a process that runs a command, with the configuration of all."""
+        """Returns a process that runs a command, with the configuration of all."""
         config = [] if self.config is None else ["--config", str(self.config.absolute())]
         spec = ChildSpec.deltalight(label, "--log-level", self.log_level, command, *config, *options)
         return replace(spec, warm=PREPARED[command]) if self.spares else spec
 
     def node(self, label: str, source: str, publish: str, clock: str, *more: str) -> ChildSpec:
-        """Return a sensor node."""
+        """Returns a sensor node."""
         return self.child(label, "node", "--source", source, "--publish", publish, "--clock", clock, *more)
 
     def player(
         self, label: str, source: str, publish: str, clock: str, control: str, *more: str
     ) -> ChildSpec:
-        """Return a node that plays a recording, paused at its start until it is told otherwise at `control`."""
+        """Returns a node that plays a recording, paused at its start until it is told otherwise at `control`."""
         options = ["--publish", publish, "--clock", clock, "--control", control, "--paused", *more]
         return self.child(label, "replay", source, *options)
 
     def server(
         self, label: str, session: Path, publish: str, control: str, device: int | None, *more: str
     ) -> ChildSpec:
-        """Return a render server; `more` says where its frames come from."""
+        """Returns a render server; `more` says where its frames come from."""
         options = ["--session", str(session), *more, "--publish", publish, "--control", control]
         if device is not None:
             options += ["--device", str(device)]
@@ -57,12 +57,12 @@ class HostCommands:
         return replace(self.child(label, "server", *options), rehearsed=True)
 
     def web(self, data: Path, page_port: int, *more: str) -> ChildSpec:
-        """Return a web process."""
+        """Returns a web process."""
         options = ("--data", str(data.absolute()), *more, "--port", str(page_port))
         return self.child(WEB, "api", *options)
 
     def keys(self, endpoints: Sequence[str]) -> Keys | None:
-        """Return the keys that connections to these endpoints take.
+        """Returns the keys that connections to these endpoints take.
 
         Raises:
             DeltalightError: they are missing.
@@ -109,12 +109,12 @@ class HostPlan:
         return {SERVER: "server", **node, **({} if self.data is None else {WEB: "api"})}
 
     def specs(self) -> list[ChildSpec]:
-        """Return the children to supervise, in the order of the stream."""
+        """Returns the children to supervise, in the order of the stream."""
         specs = [self._server()] if self.source is None else [self._node(self.source), self._server()]
         return specs if self.data is None else [*specs, self._web(self.data)]
 
     def require_free_ports(self) -> None:
-        """Check every port before a child is started.
+        """Checks every port before a child is started.
 
         Raises:
             DeltalightError: another program listens on one of them, or two are the same.
@@ -171,7 +171,7 @@ class HostPlan:
 
 
 def choose_scene(source: Source | None, path: Path | None) -> SceneDocument:
-    """Return the scene document at `path`, else the one that the recording carries.
+    """Returns the scene document at `path`, else the one that the recording carries.
 
     Raises:
         DeltalightError: there is neither, or the document is wrong.
@@ -184,7 +184,7 @@ def choose_scene(source: Source | None, path: Path | None) -> SceneDocument:
 
 
 def recording_of(source: str | None) -> Source | None:
-    """Return the recording that a source names, None if it is a camera, or another host's.
+    """Returns the recording that a source names, None if it is a camera, or another host's.
 
     Raises:
         DeltalightError: it is not there, or cannot be read.

@@ -19,7 +19,7 @@ LIMIT_BYTES = 512 << 20
 
 
 def open_store(folder: Path, config_file: Path | None = None, database: str | None = None) -> Store:
-    """Open the store of a data folder, with the database and the store of assets of the configuration.
+    """Opens the store of a data folder, with the database and the store of assets of the configuration.
 
     Raises:
         DeltalightError: it cannot be used.
@@ -29,7 +29,7 @@ def open_store(folder: Path, config_file: Path | None = None, database: str | No
 
 
 def activate_document(store: Store, document: SceneDocument) -> SceneDocument:
-    """Store a document and its files, activate it, and return it as a render server expects it.
+    """Stores a document and its files, activate it, and returns it as a render server expects it.
 
     Raises:
         DeltalightError: one of its files is wrong.
@@ -39,7 +39,7 @@ def activate_document(store: Store, document: SceneDocument) -> SceneDocument:
 
 
 def activate_first(store: Store, document: SceneDocument) -> None:
-    """Store a document and its files and activate it, unless another web process was faster.
+    """Stores a document and its files and activate it, unless another web process was faster.
 
     Raises:
         DeltalightError: one of its files is wrong.
@@ -53,7 +53,7 @@ def activate_first(store: Store, document: SceneDocument) -> None:
 
 
 def scene_to_show(store: Store, source: Source | None, path: Path | None) -> SceneDocument:
-    """Return the initial document: that of `path`, else the store's active one, else the recording's.
+    """Returns the initial document: that of `path`, else the store's active one, else the recording's.
 
     Creates an empty scene if there is none.
 
@@ -70,7 +70,7 @@ def scene_to_show(store: Store, source: Source | None, path: Path | None) -> Sce
 
 
 def import_scene(store: Store, path: Path) -> str:
-    """Store a scene document and its assets; return the id of the scene, an old one if nothing differs.
+    """Stores a scene document and its assets; returns the id of the scene, an old one if nothing differs.
 
     Raises:
         DeltalightError: the document or one of its files is wrong.
@@ -79,7 +79,7 @@ def import_scene(store: Store, path: Path) -> str:
 
 
 def import_document(store: Store, document: SceneDocument, what: str = "imported") -> str:
-    """Import a document whose assets are absolute paths, like `import_scene`."""
+    """Imports a document whose assets are absolute paths, like `import_scene`."""
     kept = document.with_assets(lambda _place, asset: _keep(store, asset))
     for head in store.scenes.all():
         with suppress(NotFoundError):  # another process may have deleted it meanwhile

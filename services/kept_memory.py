@@ -9,7 +9,7 @@ _TRIM_THRESHOLD_BYTES = 1 << 28
 
 
 def keep_freed_memory() -> None:
-    """Make glibc keep up to 256 MB of what this process frees; has no effect with other C libraries.
+    """Makes glibc keep up to 256 MB of what this process frees; has no effect with other C libraries.
 
     A node creates and frees dozens of arrays of several megabytes for each frame. To get them from the kernel each
     time, mapped and zeroed anew, takes a fifth of its processor time.

@@ -23,7 +23,7 @@ FRAME_BUDGET_MS = 125.0  # of what a viewer calls live: eight pictures a second
 
 
 def run_live(method: str, *, port: int, with_browser: bool, spares: Mapping[str, Process]) -> None:
-    """Run the demo with its dashboard until Ctrl-C; changes are not kept. `spares` become its processes, by name.
+    """Runs the demo with its dashboard until Ctrl-C; changes are not kept. `spares` become its processes, by name.
 
     Raises:
         DeltalightError: a port is in use, or a process died for good.
@@ -45,7 +45,7 @@ def run_live(method: str, *, port: int, with_browser: bool, spares: Mapping[str,
 
 @contextmanager
 def _kept(method: str, data: Path) -> Iterator[Path]:
-    """Yield the session file of the demo's scene; a data folder stores the scene too, as the active one."""
+    """Yields the session file of the demo's scene; a data folder stores the scene too, as the active one."""
     with Store(data) as store:
         scene = demo_scene(method)
         paced = scene.replaced(

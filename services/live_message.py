@@ -90,7 +90,7 @@ class PictureHeader(BaseModel):
         renderer: str,
         node: str | None = None,
     ) -> Self:
-        """Describe a composite; `node` names its camera, where there are several.
+        """Describes a composite; `node` names its camera, where there are several.
 
         Raises:
             DeltalightError: its camera is invalid.
@@ -119,7 +119,7 @@ class LiveHeader(PictureHeader, ViewerHeader):
 
 
 def pack(picture_header: bytes, viewer_header: ViewerHeader, coded: bytes) -> bytes:
-    """Return the message: little-endian uint32 length of the JSON header, the header, the coded picture.
+    """Returns the message: little-endian uint32 length of the JSON header, the header, the coded picture.
 
     `picture_header` is the JSON text of a `PictureHeader`, or of a part of one, encoded once for all viewers.
     """
@@ -128,7 +128,7 @@ def pack(picture_header: bytes, viewer_header: ViewerHeader, coded: bytes) -> by
 
 
 def unpack(message: bytes, before: LiveHeader | None = None) -> tuple[LiveHeader, bytes]:
-    """Return the header and the coded picture of a message; `before` is the header of the one before it.
+    """Returns the header and the coded picture of a message; `before` is the header of the one before it.
 
     Raises:
         DeltalightError: it is malformed.
@@ -145,5 +145,5 @@ def unpack(message: bytes, before: LiveHeader | None = None) -> tuple[LiveHeader
 
 
 def age_ms(message: CompositeMessage) -> float:
-    """Return the time since the picture's capture, by this host's clock, ms."""
+    """Returns the time since the picture's capture, by this host's clock, ms."""
     return (time.time_ns() - message.capture_ns - message.clock_offset_ns) / 1e6

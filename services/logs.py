@@ -13,7 +13,7 @@ FORMAT_VARIABLE: Final = "DELTALIGHT_LOG_FORMAT"  # inherited by child processes
 
 
 def configure_logging(level: str) -> None:
-    """Send log lines of at least `level` to stderr: for people, or as JSON where the environment asks for it.
+    """Sends log lines of at least `level` to stderr: for people, or as JSON where the environment asks for it.
 
     Raises:
         DeltalightError: the level is not one of debug, info, warning, error, or the format not text or json.
@@ -29,7 +29,7 @@ def configure_logging(level: str) -> None:
 
 
 def _renderers(wanted: str) -> list[structlog.typing.Processor]:
-    """Return what makes lines: JSON with date and zone (ISO 8601, UTC), or text with the time of day."""
+    """Returns what makes lines: JSON with date and zone (ISO 8601, UTC), or text with the time of day."""
     if wanted == "json":
         return [
             structlog.processors.TimeStamper(fmt="iso", utc=True),

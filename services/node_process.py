@@ -35,7 +35,7 @@ def run_configured_node(
     camera: PlaybackCamera | None = None,
     control: str | None = None,
 ) -> None:
-    """Run a node until Ctrl-C or its end; `given` settings override the file's.
+    """Runs a node until Ctrl-C or its end; `given` settings override the file's.
 
     Args:
         given: settings of the node.
@@ -67,7 +67,7 @@ def run_configured_node(
 
 @contextmanager
 def playback_control(camera: PlaybackCamera, endpoint: str, keys: Keys | None) -> Iterator[None]:
-    """Answer requests at a replay's control endpoint for the duration of the block.
+    """Answers requests at a replay's control endpoint for the duration of the block.
 
     Raises:
         DeltalightError: the endpoint cannot be used.
@@ -80,7 +80,7 @@ def playback_control(camera: PlaybackCamera, endpoint: str, keys: Keys | None) -
 
 
 def _execute(camera: PlaybackCamera, request: ControlRequest) -> dict[str, object]:
-    """Execute a request; every op answers with the position after it."""
+    """Executes a request; every op answers with the position after it."""
     match request.op:
         case "position":
             pass

@@ -17,7 +17,7 @@ UNITS = {0.01: "centimetres", 0.001: "millimetres"}
 
 
 def size_warnings(scene: SceneDocument) -> Iterator[str]:
-    """Yield a sentence for each visible object longer than 1 m or shorter than 1 cm, with the scale to give it.
+    """Yields a sentence for each visible object longer than 1 m or shorter than 1 cm, with the scale to give it.
 
     Raises:
         DeltalightError: an asset cannot be read.
@@ -49,7 +49,7 @@ def _warning(item: SceneObject, edge_m: float) -> str:
 
 
 def likely_factor(edge_m: float) -> float:
-    """Return the factor from the likely unit of a file to metres: centimetres, millimetres, or a power of ten."""
+    """Returns the factor from the likely unit of a file to metres: centimetres, millimetres, or a power of ten."""
     if edge_m > LARGEST_M:
         return min(UNITS, key=lambda factor: abs(math.log(edge_m * factor / SENSIBLE_M)))
     return float(10.0 ** round(math.log10(SENSIBLE_M / edge_m)))

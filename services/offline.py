@@ -65,12 +65,12 @@ class RenderSummary:
     render_ms: list[float] = field(default_factory=list)
 
     def add(self, composite: "CompositeFrame", milliseconds: float) -> None:
-        """Count one frame."""
+        """Counts one frame."""
         self.render_ms.append(milliseconds)
         self.without_pose += composite.status == "no_pose"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the summary as plain data."""
+        """Returns the summary as plain data."""
         return {
             "frames": len(self.render_ms),
             "no_pose": self.without_pose,
@@ -81,7 +81,7 @@ class RenderSummary:
 
 
 def with_output(scene: SceneDocument, size: tuple[int, int] | None, view: str | None) -> SceneDocument:
-    """Return the scene with another output size (width, height) or view, if given."""
+    """Returns the scene with another output size (width, height) or view, if given."""
     changes: dict[str, object] = {}
     if size is not None:
         changes |= {"width": size[0], "height": size[1]}
@@ -94,17 +94,17 @@ class Progress(Protocol):
     """Observer of a job."""
 
     def renderer(self, name: str, *, is_software: bool) -> None:
-        """Report the OpenGL renderer in use."""
+        """Reports the OpenGL renderer in use."""
 
     def notice(self, sentence: str) -> None:
-        """Report something that the user should read."""
+        """Reports something that the user should read."""
 
     def frame_done(self) -> None:
-        """Report one more frame on disk."""
+        """Reports one more frame on disk."""
 
 
 def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
-    """Render every frame of the job.
+    """Renders every frame of the job.
 
     A picture is complete before its line in frames.jsonl is written, and each line is written at once, so an
     interrupted run leaves a valid shorter run.
@@ -147,7 +147,7 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
 
 @contextmanager
 def _written(job: RenderJob, progress: Progress) -> "Iterator[Write]":
-    """Yield what writes a frame: to a folder, or to a video that appears at the end."""
+    """Yields what writes a frame: to a folder, or to a video that appears at the end."""
     if not job.is_video:
         if (make_output_folder(job.out) / INDEX_FILE).exists():
             progress.notice(
@@ -195,7 +195,7 @@ def _render_frames(
 
 
 def _require_light(scene: SceneDocument, frame: ViewFrame, notes: Sequence[str]) -> None:
-    """Refuse a source without fish-eye light if the scene needs it.
+    """Refuses a source without fish-eye light if the scene needs it.
 
     The first pictures apply to all earlier frames.
     """
@@ -226,7 +226,7 @@ def _write_layers(job: RenderJob, number: int, picture: "RelitPicture") -> None:
 
 
 def frame_record(number: int, frame: ViewFrame, composite: "CompositeFrame") -> dict[str, Any]:
-    """Return the line of frames.jsonl for one frame."""
+    """Returns the line of frames.jsonl for one frame."""
     return {
         "frame": number,
         "timestamp": frame.timestamp_ns / 1e9,

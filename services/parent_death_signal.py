@@ -10,7 +10,7 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def end_with_supervisor() -> None:
-    """Request SIGTERM from the kernel at the supervisor's death, if a supervisor started this process."""
+    """Requests SIGTERM from the kernel at the supervisor's death, if a supervisor started this process."""
     supervisor = os.environ.pop(SUPERVISOR_VARIABLE, None)
     if supervisor is None or not sys.platform.startswith("linux"):
         return

@@ -23,7 +23,7 @@ class PictureSource:
         self._receiver = Receiver((), self._topics)
 
     def follow(self, endpoint: str | None) -> None:
-        """Receive from this endpoint from now on, None = from nowhere; one other thread may call it.
+        """Receives from this endpoint from now on, None = from nowhere; one other thread may call it.
 
         Raises:
             DeltalightError: the endpoint leaves the host without keys, or is malformed.
@@ -34,7 +34,7 @@ class PictureSource:
         before.close()  # which wakes who waits for its pictures
 
     def newest(self, timeout_s: float) -> UInt8[np.ndarray, "h w 3"] | None:
-        """Return the newest relit picture (sRGB) that comes within this time, None if there is none.
+        """Returns the newest relit picture (sRGB) that comes within this time, None if there is none.
 
         Raises:
             DeltalightError: a message cannot be read.
@@ -46,5 +46,5 @@ class PictureSource:
         return None
 
     def close(self) -> None:
-        """Stop receiving."""
+        """Stops receiving."""
         self._receiver.close()

@@ -19,7 +19,7 @@ REMEMBERED_PORTS = len(PRIVATE_PORTS) // 2  # of those that were used: a room ma
 
 
 def endpoint(port: int) -> str:
-    """Return the ZeroMQ endpoint of a loopback port."""
+    """Returns the ZeroMQ endpoint of a loopback port."""
     return f"tcp://{LOOPBACK}:{port}"
 
 
@@ -44,7 +44,7 @@ def answers(port: int) -> bool:
 
 
 def require_free(port: int, purpose: str, option: str) -> None:
-    """Check a port before anything starts.
+    """Checks a port before anything starts.
 
     Raises:
         DeltalightError: another program listens on it.
@@ -64,7 +64,7 @@ class ChosenPort(NamedTuple):
 
 
 def require_all_free(chosen: Sequence[ChosenPort]) -> None:
-    """Check the ports of one host before anything starts.
+    """Checks the ports of one host before anything starts.
 
     Raises:
         DeltalightError: another program listens on one of them, or two are the same.
@@ -82,12 +82,12 @@ def require_all_free(chosen: Sequence[ChosenPort]) -> None:
 
 
 def used_ports() -> deque[int]:
-    """Return an empty memory of the ports that were used last."""
+    """Returns an empty memory of the ports that were used last."""
     return deque(maxlen=REMEMBERED_PORTS)
 
 
 def private_ports(count: int, avoid: Container[int] = ()) -> list[int]:
-    """Return free ports for one run's own processes, chosen so that two runs rarely collide, and none to `avoid`.
+    """Returns free ports for one run's own processes, chosen so that two runs rarely collide, and none to `avoid`.
 
     Raises:
         DeltalightError: nearly all ports of the range are in use.

@@ -31,20 +31,20 @@ class Process(Protocol):
         """The end of its standard error to read from, if that is a pipe."""
 
     def poll(self) -> int | None:
-        """Return its exit code, minus the number of the signal that ended it; None while it runs."""
+        """Returns its exit code, minus the number of the signal that ended it; None while it runs."""
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end, `timeout` seconds at most, and return its exit code.
+        """Waits for its end, `timeout` seconds at most, and returns its exit code.
 
         Raises:
             subprocess.TimeoutExpired: it still runs.
         """
 
     def terminate(self) -> None:
-        """Send it SIGTERM unless it has ended."""
+        """Sends it SIGTERM unless it has ended."""
 
     def kill(self) -> None:
-        """Send it SIGKILL unless it has ended."""
+        """Sends it SIGKILL unless it has ended."""
 
 
 class InForkedChild(BaseException):
@@ -63,7 +63,7 @@ class ForkedProcess:
         self._exit_code: int | None = None
 
     def poll(self) -> int | None:
-        """Return its exit code, None while it runs."""
+        """Returns its exit code, None while it runs."""
         if self._exit_code is None:
             ended, status = os.waitpid(self.pid, os.WNOHANG)
             if ended:
@@ -71,7 +71,7 @@ class ForkedProcess:
         return self._exit_code
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end, `timeout` seconds at most, and return its exit code.
+        """Waits for its end, `timeout` seconds at most, and returns its exit code.
 
         Raises:
             subprocess.TimeoutExpired: it still runs.
@@ -84,15 +84,15 @@ class ForkedProcess:
         return code
 
     def terminate(self) -> None:
-        """Send it SIGTERM unless it has ended."""
+        """Sends it SIGTERM unless it has ended."""
         self._send(signal.SIGTERM)
 
     def kill(self) -> None:
-        """Send it SIGKILL unless it has ended."""
+        """Sends it SIGKILL unless it has ended."""
         self._send(signal.SIGKILL)
 
     def close(self) -> None:
-        """Close this end of its pipes."""
+        """Closes this end of its pipes."""
         self.stdin.close()
         self.stderr.close()
 
@@ -104,7 +104,7 @@ class ForkedProcess:
 def fork(
     arguments: Sequence[str], environment: Mapping[str, str], others: Sequence[ForkedProcess]
 ) -> ForkedProcess:
-    """Fork a child that goes on as a command line with these `arguments`, and `environment` in addition to its own.
+    """Forks a child that goes on as a command line with these `arguments`, and `environment` in addition to its own.
 
     Like the children that `child.open_process` starts it has a session of its own, ends with this process, and is
     told and says things by pipes. It closes its copies of the pipes of `others`, which were forked before it. Call it
@@ -133,7 +133,7 @@ def fork(
 
 
 def _take_pipes(stdin: int, stderr: int, *parents: int) -> None:
-    """Make two pipes the standard input and error of this process, and close the others."""
+    """Makes two pipes the standard input and error of this process, and closes the others."""
     os.dup2(stdin, 0)
     os.dup2(stderr, 2)
     for each in (stdin, stderr, *parents):

@@ -40,7 +40,7 @@ class Progress:
             receiver.close()
 
     def look(self, process_ids: Mapping[str, int]) -> None:
-        """Look at these processes, by name, if the last look is a while ago."""
+        """Looks at these processes, by name, if the last look is a while ago."""
         now_s = time.monotonic()
         if now_s - self._looked_s < LOOK_INTERVAL_S:
             return

@@ -67,7 +67,7 @@ class RawFrameAssembler:
         self._last: dict[str, Any] = {}
 
     def add(self, message: Message, parts: Sequence[memoryview]) -> None:
-        """Store a message until its frame is complete.
+        """Stores a message until its frame is complete.
 
         Raises:
             DeltalightError: the board or the fish-eye pictures of the message are broken.
@@ -91,7 +91,7 @@ class RawFrameAssembler:
         self._streams.add(message.stream)
 
     def take(self, *, is_idle: bool = False) -> SensorFrame | None:
-        """Return the oldest frame if it is complete or, if nothing more arrived (`is_idle`), as it is.
+        """Returns the oldest frame if it is complete or, if nothing more arrived (`is_idle`), as it is.
 
         Raises:
             DeltalightError: the payload of the frame is broken; the frame is dropped, and the next call continues.
@@ -163,12 +163,12 @@ class RawFrameAssembler:
         return DepthImage(depth_m, valid, camera, header.noise_sigma_m)
 
     def _fisheye_at(self, capture_ns: int) -> FisheyePictures | None:
-        """Return the newest pictures that are not later; before the first, the first."""
+        """Returns the newest pictures that are not later; before the first, the first."""
         held = (pictures for pictures in reversed(self._fisheyes) if pictures.timestamp_ns <= capture_ns)
         return next(held, self._fisheyes[0] if self._fisheyes else None)
 
     def _add_fisheye(self, message: FisheyeMessage, parts: Sequence[memoryview]) -> None:
-        """Decode fish-eye pictures, unless they are a repetition for late subscribers."""
+        """Decodes fish-eye pictures, unless they are a repetition for late subscribers."""
         if message.capture_ns == self._fisheye_ns:
             return
         self._fisheye_ns = message.capture_ns
@@ -178,19 +178,19 @@ class RawFrameAssembler:
         self._fisheyes.append(replace(pictures, timestamp_ns=max(message.capture_ns, earliest_ns)))
 
     def _same(self, stream: str, made: Built) -> Built:
-        """Return the previous message's instance while it is equal, so that its rays are computed once."""
+        """Returns the previous message's instance while it is equal, so that its rays are computed once."""
         if self._last.get(stream) != made:
             self._last[stream] = made
         return self._last[stream]  # type: ignore[no-any-return]
 
 
 def _given_pose(pose: PoseMessage) -> np.ndarray | None:
-    """Return the pose if it was given with the frame: without a reprojection error, no board was searched."""
+    """Returns the pose if it was given with the frame: without a reprojection error, no board was searched."""
     return None if _is_found(pose) else _matrix(pose)
 
 
 def _found_pose(pose: PoseMessage) -> np.ndarray | None:
-    """Return the pose if the node found it by the board."""
+    """Returns the pose if the node found it by the board."""
     return _matrix(pose) if _is_found(pose) else None
 
 

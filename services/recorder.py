@@ -92,7 +92,7 @@ class RecordStatus:
         return self.size_bytes / self.seconds if self.seconds > 0 else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures as plain data."""
+        """Returns the figures as plain data."""
         seconds = max(self.seconds, 1e-9)
         return {
             "out": str(self.out),
@@ -139,7 +139,7 @@ class Recorder:
         self._started_s = self._started_cpu_s = 0.0
 
     def follow(self, endpoint: str | None) -> None:
-        """Keep the relit pictures of this render server from now on, None = of none; any thread may call it.
+        """Keeps the relit pictures of this render server from now on, None = of none; any thread may call it.
 
         Raises:
             DeltalightError: the endpoint leaves the host without keys, or is malformed.
@@ -151,7 +151,7 @@ class Recorder:
             before.close()
 
     def run(self, stop: Event) -> RecordStatus:
-        """Record until `stop` is set or enough was recorded; without any frame no file is left.
+        """Records until `stop` is set or enough was recorded; without any frame no file is left.
 
         While the disk refuses, the recording waits, except for its first frame.
 
@@ -180,7 +180,7 @@ class Recorder:
         return self.status
 
     def _receive(self, timeout_s: float) -> bool:
-        """Take one message and write complete frames; return False if none came."""
+        """Takes one message and writes complete frames; returns False if none came."""
         multipart = self._queue.take(timeout_s)
         self._idle_polls = 0 if multipart is not None else self._idle_polls + 1
         try:
@@ -196,14 +196,14 @@ class Recorder:
         return multipart is not None or frame is not None
 
     def _take_followed(self) -> None:
-        """Take the pictures of the render server that is followed; none of them waits for long."""
+        """Takes the pictures of the render server that is followed; none of them waits for long."""
         with self._following:
             queue = self._followed
         while queue is not None and (multipart := queue.take(0)) is not None:
             self._take_picture(multipart)
 
     def _take_rest(self) -> None:
-        """Write what arrived before the end and, where relit pictures come, wait for that of the last frame."""
+        """Writes what arrived before the end and, where relit pictures come, waits for that of the last frame."""
         awaits = self._relit.count > 0 and not self._is_refused()
         if not awaits:
             self._queue.close()  # what it holds can still be taken
@@ -355,7 +355,7 @@ def _lacks_place(extrinsics: Extrinsics | None) -> bool:
 
 
 def scene_of_server(endpoint: str, keys: Keys | None) -> SceneDocument:
-    """Request the scene document from the render server at a control endpoint.
+    """Requests the scene document from the render server at a control endpoint.
 
     Raises:
         DeltalightError: it does not answer, or its answer is no scene document.

@@ -31,14 +31,14 @@ class Copied:
 
 
 def recovered_name(path: Path) -> Path:
-    """Return the default path of a recovered recording: `NAME.mcap` of `NAME.mcap.active`, else a name beside it."""
+    """Returns the default path of a recovered recording: `NAME.mcap` of `NAME.mcap.active`, else a name beside it."""
     if path.name.endswith(ACTIVE_SUFFIX):
         return path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
     return path.with_name(f"{path.stem}-recovered.mcap")
 
 
 def recover_recording(path: Path, out: Path, track: Track) -> Copied | None:
-    """Write all readable frames to a new, finished recording; return None if there is nothing to recover.
+    """Writes all readable frames to a new, finished recording; returns None if there is nothing to recover.
 
     The recording itself is only read; `out` appears when it is complete.
 
@@ -81,7 +81,7 @@ def _losses(scan: RecordingScan, lost: int) -> list[str]:
 
 
 def import_folder(folder: Path, out: Path, scene: Path | None, track: Track) -> Copied:
-    """Write a dataset folder as a recording, with the scene `scene`, else scene.json in the folder if it exists.
+    """Writes a dataset folder as a recording, with the scene `scene`, else scene.json in the folder if it exists.
 
     Colour keeps its JPEG bytes, everything else its pixels. `out` appears when it is complete.
 
@@ -112,7 +112,7 @@ def _scene_of(folder: Path, scene: Path | None) -> SceneDocument | None:
 
 
 def export_recording(path: Path, out: Path, track: Track) -> Copied:
-    """Write a recording as a dataset folder, with its scene as scene.json.
+    """Writes a recording as a dataset folder, with its scene as scene.json.
 
     The folder appears when it is complete; a killed process leaves a hidden one beside it.
 

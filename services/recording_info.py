@@ -57,7 +57,7 @@ class RecordingScan:
 
 
 def scan_recording(path: Path, progress: Callable[[float], None] | None = None) -> RecordingScan:
-    """Scan a recording, as far as it is readable; `progress` is called with the fraction from 0 to 1.
+    """Scans a recording, as far as it is readable; `progress` is called with the fraction from 0 to 1.
 
     Raises:
         DeltalightError: the file cannot be read at all.
@@ -116,7 +116,7 @@ def _take(scan: RecordingScan, topic: str, message: Message) -> None:
 
 
 def describe_recording(path: Path, progress: Callable[[float], None] | None = None) -> dict[str, Any]:
-    """Return the contents of a recording as plain data.
+    """Returns the contents of a recording as plain data.
 
     Raises:
         DeltalightError: not a recording, of another schema version, or without a complete frame.

@@ -13,7 +13,7 @@ KEPT_PICTURES = 8  # that came before their frames, which wait for depth
 
 
 def relit_picture(message: CompositeMessage, parts: Sequence[memoryview]) -> bytes | None:
-    """Return the relit picture of a message as JPEG or PNG; None if it shows other views only."""
+    """Returns the relit picture of a message as JPEG or PNG; None if it shows other views only."""
     views = [message.view, *(other.view for other in message.others)]
     if RELIT_VIEW not in views:
         return None
@@ -42,7 +42,7 @@ class RelitPictures:
         return self.count > 0 and self.last_ns < self._frames[-1]
 
     def add_picture(self, message: CompositeMessage, parts: Sequence[memoryview]) -> None:
-        """Take a message: write its picture if its frame is recorded, else keep it for a while."""
+        """Takes a message: writes its picture if its frame is recorded, else keep it for a while."""
         picture = relit_picture(message, parts)
         if picture is None or message.capture_ns <= self.last_ns:
             return
@@ -52,7 +52,7 @@ class RelitPictures:
             self._waiting.append((message.capture_ns, picture))
 
     def add_frame(self, timestamp_ns: int) -> None:
-        """Take note of a frame that was written."""
+        """Takes note of a frame that was written."""
         self._frames.append(timestamp_ns)
         picture = dict(self._waiting).get(timestamp_ns)  # of several of one frame, the newest
         if picture is not None:

@@ -32,7 +32,7 @@ class RetryingWriter:
         return self._refusal is not None
 
     def add(self, frame: SensorFrame) -> bool:
-        """Append a frame; return whether it is in the file.
+        """Appends a frame; returns whether it is in the file.
 
         Raises:
             DiskRefusesError: the disk refuses the first frame.
@@ -52,7 +52,7 @@ class RetryingWriter:
         return True
 
     def add_composite(self, timestamp_ns: int, picture: bytes) -> None:
-        """Append the relit picture of a frame that is in the file.
+        """Appends the relit picture of a frame that is in the file.
 
         Raises:
             DeltalightError: the disk fails.
@@ -89,7 +89,7 @@ class RetryingWriter:
         )
 
     def end(self) -> None:
-        """Try a last time to write what the disk refused.
+        """Tries a last time to write what the disk refused.
 
         Raises:
             DiskRefusesError: it still refuses.
@@ -110,6 +110,6 @@ class RetryingWriter:
 
 
 def reason(fault: DeltalightError) -> str:
-    """Return what the system says of a fault of the disk, else its sentence."""
+    """Returns what the system says of a fault of the disk, else its sentence."""
     cause = fault.__cause__
     return str(cause.strerror) if isinstance(cause, OSError) else str(fault)

@@ -11,7 +11,7 @@ from deltalight.protocol.scene import SceneDocument
 
 @contextmanager
 def session_file(scene: SceneDocument) -> Iterator[Path]:
-    """Yield a temporary file with the scene document, for the render server's `--session`."""
+    """Yields a temporary file with the scene document, for the render server's `--session`."""
     with TemporaryDirectory(prefix="deltalight-") as folder:
         path = Path(folder) / "scene.json"
         write_scene(path, scene)
@@ -19,5 +19,5 @@ def session_file(scene: SceneDocument) -> Iterator[Path]:
 
 
 def write_scene(path: Path, scene: SceneDocument) -> None:
-    """Write a scene document for the render server's `--session`."""
+    """Writes a scene document for the render server's `--session`."""
     write_bytes(path, scene.model_dump_json(indent=1).encode())

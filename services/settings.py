@@ -71,7 +71,7 @@ class Configuration:
     sections: Mapping[str, Values]
 
     def section(self, name: str, model: type[Model], given: Mapping[str, Any] | None = None) -> Model:
-        """Return the validated settings of a section; `given` are those of the command line.
+        """Returns the validated settings of a section; `given` are those of the command line.
 
         Raises:
             DeltalightError: a key is unknown (the nearest is named), or a value is wrong; names the origin.
@@ -79,7 +79,7 @@ class Configuration:
         return self._merged(name, model, given or {})[0]
 
     def explained(self, name: str, model: type[Model]) -> tuple[Model, dict[str, str]]:
-        """Return the settings of a section, and the origin of the value of each key (`depth.fill`).
+        """Returns the settings of a section, and the origin of the value of each key (`depth.fill`).
 
         Raises:
             DeltalightError: as `section`.
@@ -106,7 +106,7 @@ class Configuration:
 
 
 def _blame(model: type[BaseModel], layers: list[_Layer]) -> None:
-    """Attribute a fault to the layer that caused it: the first with which the settings are wrong.
+    """Attributes a fault to the layer that caused it: the first with which the settings are wrong.
 
     Raises:
         DeltalightError: always, if the layers together are wrong.
@@ -118,7 +118,7 @@ def _blame(model: type[BaseModel], layers: list[_Layer]) -> None:
 
 
 def load_configuration(path: Path | None = None) -> Configuration:
-    """Read the configuration file: `path`, else ./deltalight.toml, else the user's.
+    """Reads the configuration file: `path`, else ./deltalight.toml, else the user's.
 
     Raises:
         DeltalightError: the named file is missing, or a file is not TOML or has an unknown section.

@@ -22,7 +22,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def raise_signals() -> None:
-    """Make SIGTERM raise `Terminated` in the main thread, once, and SIGINT `Interrupted` unless it is ignored.
+    """Makes SIGTERM raise `Terminated` in the main thread, once, and SIGINT `Interrupted` unless it is ignored.
 
     Linux signals the death of a supervisor once for each of its threads that dies: a second exception would interrupt
     the clean-up that the first one started.
@@ -50,7 +50,7 @@ def _print_faults(kind: type[BaseException], fault: BaseException, trace: Traceb
 
 
 def _deliver_again(lost: "sys.UnraisableHookArgs") -> None:
-    """Resend a signal that was lost with a traceback because it arrived while an object was freed."""
+    """Resends a signal that was lost with a traceback because it arrived while an object was freed."""
     if isinstance(lost.exc_value, Terminated):
         signal.signal(signal.SIGTERM, _raise_terminated)
         again = signal.SIGTERM

@@ -34,7 +34,7 @@ class SrtAddress:
 
     @classmethod
     def parse(cls, url: str) -> Self:
-        """Read an address.
+        """Reads an address.
 
         Raises:
             DeltalightError: it has no host or port, or a part that is unknown or out of its range.
@@ -91,7 +91,7 @@ QUERY: dict[str, tuple[int, Callable[[str], str | int]]] = {
 
 
 def why_unavailable() -> str | None:
-    """Return what is missing for SRT, None if nothing is."""
+    """Returns what is missing for SRT, None if nothing is."""
     return None if _library_name() else NO_LIBRARY
 
 
@@ -115,11 +115,11 @@ class SrtCaller(io.RawIOBase):
         self._connect(address)
 
     def writable(self) -> bool:
-        """Return true."""
+        """Returns true."""
         return True
 
     def write(self, data: Any) -> int:  # noqa: ANN401 (whatever has a buffer)
-        """Send bytes, in payloads of whole packets of MPEG-TS; return how many."""
+        """Sends bytes, in payloads of whole packets of MPEG-TS; returns how many."""
         view = memoryview(data).cast("B")
         for begin in range(0, len(view), PAYLOAD_BYTES):
             payload = bytes(view[begin : begin + PAYLOAD_BYTES])
@@ -127,7 +127,7 @@ class SrtCaller(io.RawIOBase):
         return len(view)
 
     def close(self) -> None:
-        """Close the connection."""
+        """Closes the connection."""
         if not self.closed:
             self._srt.srt_close(self._socket)
         super().close()
@@ -157,7 +157,7 @@ def _library_name() -> str | None:
 
 
 def _packed_place(host: str, port: int) -> bytes:
-    """Return a `sockaddr` of Linux."""
+    """Returns a `sockaddr` of Linux."""
     family, _, _, _, (name, *_, scope) = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
     packed = socket.inet_pton(family, str(name).partition("%")[0])
     head = struct.pack("=H", family) + struct.pack(">H", port)

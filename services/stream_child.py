@@ -34,12 +34,12 @@ class StreamSpec:
     height: int
 
     def line(self) -> bytes:
-        """Return it as a line."""
+        """Returns it as a line."""
         return json.dumps(asdict(self)).encode() + b"\n"
 
 
 def send(spec: StreamSpec, packets: Iterator[tuple[int, bool, bytes]], answers: BinaryIO) -> None:
-    """Send packets and answer each; the connection begins with the first."""
+    """Sends packets and answers each; the connection begins with the first."""
     import av
 
     ticks = Fraction(1, TICKS_PER_S)
@@ -64,7 +64,7 @@ def send(spec: StreamSpec, packets: Iterator[tuple[int, bool, bytes]], answers: 
 
 @contextmanager
 def _opened(url: str) -> Iterator[str | SrtCaller]:
-    """Yield what PyAV writes to: an address of FFmpeg's, or a connection by SRT, which it has not."""
+    """Yields what PyAV writes to: an address of FFmpeg's, or a connection by SRT, which it has not."""
     if not url.startswith("srt:"):
         yield url
         return

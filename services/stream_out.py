@@ -52,7 +52,7 @@ class Target:
 
     @classmethod
     def parse(cls, url: str) -> Self:
-        """Read an address.
+        """Reads an address.
 
         Raises:
             DeltalightError: there is no way to it.
@@ -103,18 +103,18 @@ class StreamOut:
         self._told = ""
 
     def __enter__(self) -> Self:
-        """Return it; the connection begins with the first picture."""
+        """Returns it; the connection begins with the first picture."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Say goodbye to the server."""
+        """Says goodbye to the server."""
         if self._sender is not None:
             self._sender.close()
 
     def show(self, picture: Picture) -> None:
-        """Send an sRGB picture, unless the server is away; one of another size begins a new connection.
+        """Sends an sRGB picture, unless the server is away; one of another size begins a new connection.
 
         Raises:
             DeltalightError: no encoder takes it.
@@ -179,7 +179,7 @@ class _Sender:
         self._begin = StreamSpec(target.url, target.container, target.options, even[1], even[0]).line()
 
     def send(self, picture: Picture) -> int:
-        """Send a picture and return its bytes, once they were taken.
+        """Sends a picture and returns its bytes, once they were taken.
 
         Raises:
             StreamEndedError: they were not.
@@ -197,7 +197,7 @@ class _Sender:
         return len(unit.data)
 
     def close(self) -> None:
-        """End the process; a second Ctrl-C meanwhile leaves none behind."""
+        """Ends the process; a second Ctrl-C meanwhile leaves none behind."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
@@ -220,7 +220,7 @@ class _Sender:
             raise StreamEndedError(self._answer() or "its process ended") from fault
 
     def _answer(self) -> str:
-        """Wait for an answer; it is empty for a packet that was sent."""
+        """Waits for an answer; it is empty for a packet that was sent."""
         assert self._process.stdout is not None
         line, deadline_s = b"", time.monotonic() + ANSWER_TIMEOUT_S
         while not line.endswith(b"\n"):

@@ -30,7 +30,7 @@ class StreamQueue(Subscriber):
         super().__init__(endpoints, subscriptions, keys=keys, high_water_mark=QUEUED_MESSAGES)
 
     def take(self, timeout_s: float) -> ReceivedMultipart | None:
-        """Return the oldest message; None if there was none within `timeout_s` seconds."""
+        """Returns the oldest message; None if there was none within `timeout_s` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._messages or self._closed, timeout_s)
             if not self._messages:
@@ -61,7 +61,7 @@ class StreamQueue(Subscriber):
 
 
 def _stream(message: ReceivedMultipart) -> str:
-    """Return the stream of a message; subscriptions end in a dot, so every topic has one."""
+    """Returns the stream of a message; subscriptions end in a dot, so every topic has one."""
     return bytes(message[0]).partition(b".")[0].decode("ascii", errors="replace")
 
 

@@ -56,19 +56,19 @@ class Supervisor:
         self.stop()
 
     def process_ids(self) -> dict[str, int]:
-        """Return the process id of every started child, by name."""
+        """Returns the process id of every started child, by name."""
         return {c.spec.name: c.process.pid for c in self._children if c.process is not None}
 
     def spare_ids(self) -> dict[str, int]:
-        """Return the process id of every spare that waits, by name."""
+        """Returns the process id of every spare that waits, by name."""
         return {c.spec.name: c.spare.pid for c in self._children if c.spare is not None}
 
     def restarts(self) -> dict[str, int]:
-        """Return how often each child was restarted, by name."""
+        """Returns how often each child was restarted, by name."""
         return {child.spec.name: max(child.started - 1, 0) for child in self._children}
 
     def poll(self) -> None:
-        """Check every child once; kill one that hangs and restart one that died, but not one that ended well.
+        """Checks every child once; kills one that hangs and restarts one that died, but not one that ended well.
 
         Spares would take the processor from whoever still starts, so they come afterwards.
         """
@@ -87,13 +87,13 @@ class Supervisor:
                 self._restart(child, code)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Poll until `until` returns true (or an exception ends the process)."""
+        """Polls until `until` returns true (or an exception ends the process)."""
         while not until():
             self.poll()
             time.sleep(POLL_INTERVAL_S)
 
     def stop(self) -> None:
-        """End all children: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
+        """Ends all children: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
         processes = [each for child in self._children for each in (child.process, child.spare)]
         end_all([process for process in processes if process is not None])
         for child in self._children:

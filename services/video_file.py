@@ -40,7 +40,7 @@ class VideoWriter:
         self.frames = 0
 
     def add(self, picture: UInt8[np.ndarray, "h w 3"], timestamp_ns: int) -> None:
-        """Append an sRGB picture, later than the one before.
+        """Appends an sRGB picture, later than the one before.
 
         Raises:
             DeltalightError: it is not later, or has another size than the first.
@@ -68,7 +68,7 @@ class VideoWriter:
         self.frames += 1
 
     def finish(self) -> None:
-        """Write what the encoder still holds.
+        """Writes what the encoder still holds.
 
         Raises:
             DeltalightError: there was no picture.
@@ -90,7 +90,7 @@ class VideoWriter:
 
 @contextmanager
 def video_file(path: Path, timestamps_ns: Sequence[int]) -> Iterator[VideoWriter]:
-    """Open a video that appears at `path` when the block ends, and not at all when that raises.
+    """Opens a video that appears at `path` when the block ends, and not at all when that raises.
 
     `timestamps_ns` are the times of its pictures: the rate in its header is that of their median step.
 
@@ -108,7 +108,7 @@ def video_file(path: Path, timestamps_ns: Sequence[int]) -> Iterator[VideoWriter
 
 
 def require_video_support(instead: str = INSTEAD) -> None:
-    """Refuse early, with what to do instead.
+    """Refuses early, with what to do instead.
 
     Raises:
         DeltalightError: PyAV is not installed, or its FFmpeg has no H.264 encoder of constant quality.

@@ -34,7 +34,7 @@ ADVICE = (
 
 
 def _ioctl_number(direction: int, number: int, size: int) -> int:
-    """Return the request of _IOR or _IOWR of group V (<asm-generic/ioctl.h>)."""
+    """Returns the request of _IOR or _IOWR of group V (<asm-generic/ioctl.h>)."""
     return direction << 30 | size << 16 | ord("V") << 8 | number
 
 
@@ -65,17 +65,17 @@ class VirtualCamera:
             raise
 
     def __enter__(self) -> Self:
-        """Return the camera."""
+        """Returns the camera."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the device."""
+        """Closes the device."""
         os.close(self._file)
 
     def begin(self, size: tuple[int, int]) -> None:
-        """Set the width and height, rounded down to even ones, into which pictures are scaled.
+        """Sets the width and height, rounded down to even ones, into which pictures are scaled.
 
         Raises:
             DeltalightError: another program writes to the device, or it wants another format.
@@ -94,7 +94,7 @@ class VirtualCamera:
             )
 
     def show(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Write an sRGB picture.
+        """Writes an sRGB picture.
 
         Raises:
             DeltalightError: the device refuses it.
@@ -138,7 +138,7 @@ def _why_closed(path: Path, fault: OSError) -> str:
 
 
 def fitted(picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Scale a picture into a size, with black beside it where the shapes differ."""
+    """Scales a picture into a size, with black beside it where the shapes differ."""
     width, height = size
     scale = min(width / picture.shape[1], height / picture.shape[0])
     inner = max(round(picture.shape[1] * scale), 1), max(round(picture.shape[0] * scale), 1)
@@ -154,5 +154,5 @@ def fitted(picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[
 
 
 def yuyv(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Return the picture as YUYV 4:2:2: BT.601, limited range, which programs assume of webcams."""
+    """Returns the picture as YUYV 4:2:2: BT.601, limited range, which programs assume of webcams."""
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_YUYV)).tobytes()

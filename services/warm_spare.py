@@ -45,7 +45,7 @@ class Spare:
         self._has_ended = False
 
     def is_called(self, timeout_s: float = 0.0) -> bool:
-        """Wait so long to be told something; return whether there is anything, or stdin has ended."""
+        """Waits so long to be told something; returns whether there is anything, or stdin has ended."""
         while not (b"\n" in self._unread or self._has_ended):
             if not select.select([self._stdin], [], [], timeout_s)[0]:
                 return False
@@ -53,14 +53,14 @@ class Spare:
         return True
 
     def next_line(self) -> str:
-        """Wait for the next line and return it; empty once stdin has ended."""
+        """Waits for the next line and returns it; empty once stdin has ended."""
         while not (b"\n" in self._unread or self._has_ended):
             self._read()
         line, _, self._unread = self._unread.partition(b"\n")
         return line.decode()
 
     def rehearse(self, arguments: Sequence[str], run: Callable[[list[str]], int]) -> None:
-        """Run a command until it is ready; a signal ends the process, a fault leaves the spare as it was."""
+        """Runs a command until it is ready; a signal ends the process, a fault leaves the spare as it was."""
         self.is_rehearsing = True
         code = run(list(arguments))
         self.is_rehearsing = False
@@ -77,12 +77,12 @@ _spare: Spare | None = None
 
 
 def this_spare() -> Spare | None:
-    """Return what this process is or was as a spare; None if it was started as what it is."""
+    """Returns what this process is or was as a spare; None if it was started as what it is."""
     return _spare
 
 
 def spare_environment(prepared: tuple[str, ...]) -> dict[str, str]:
-    """Return the variable that makes a started command wait as a spare once it has prepared these.
+    """Returns the variable that makes a started command wait as a spare once it has prepared these.
 
     `module` is imported, `module:function` called.
     """
@@ -90,7 +90,7 @@ def spare_environment(prepared: tuple[str, ...]) -> dict[str, str]:
 
 
 def rehearse_spare(spare: Process, arguments: Sequence[str]) -> None:
-    """Tell a spare to get ready for a command with these arguments, once it has prepared what it was started for."""
+    """Tells a spare to get ready for a command with these arguments, once it has prepared what it was started for."""
     assert spare.stdin is not None
     with suppress(OSError):  # it died meanwhile
         spare.stdin.write(REHEARSE + json.dumps(arguments) + "\n")
@@ -98,7 +98,7 @@ def rehearse_spare(spare: Process, arguments: Sequence[str]) -> None:
 
 
 def use_spare(spare: Process, arguments: Sequence[str] = ()) -> bool:
-    """Tell a spare to go on, with other `arguments` than its own if there are any; return whether it does."""
+    """Tells a spare to go on, with other `arguments` than its own if there are any; returns whether it does."""
     assert spare.stdin is not None
     if spare.poll() is not None:
         return False
@@ -136,7 +136,7 @@ def wait_if_spare(run: Callable[[list[str]], int]) -> None:
 
 
 def prepare(names: Sequence[str]) -> None:
-    """Prepare these (`spare_environment`) in this process."""
+    """Prepares these (`spare_environment`) in this process."""
     with no_garbage_collection():
         for name in names:
             found = pkgutil.resolve_name(name)

@@ -50,7 +50,7 @@ class WatchdogTimeouts:
     longest_frame_s: float = 1800.0
 
     def on_gpu(self) -> "WatchdogTimeouts":
-        """Return that for a GPU, which needs no minutes for a kernel or a frame; its driver spins where it hangs."""
+        """Returns that for a GPU, which needs no minutes for a kernel or a frame; its driver spins where it hangs."""
         return replace(self, deaf_s=DEAF_ON_GPU_S, longest_frame_s=LONGEST_FRAME_ON_GPU_S)
 
 
@@ -69,17 +69,17 @@ class Heartbeat:
         self.answered_s = self.worked_s = self.started_s
 
     def note_report(self, now_s: float) -> None:
-        """Note that a report came."""
+        """Notes that a report came."""
         if self.reported_s is not None:
             self._gaps_s.append(now_s - self.reported_s)
         self.reported_s = now_s
 
     def unreported_s(self, now_s: float) -> float:
-        """Return the seconds since the last report, or since the start."""
+        """Returns the seconds since the last report, or since the start."""
         return now_s - (self.started_s if self.reported_s is None else self.reported_s)
 
     def fault(self, now_s: float) -> str | None:
-        """Return what shows that the process hangs, None while nothing does."""
+        """Returns what shows that the process hangs, None while nothing does."""
         unreported_s = self.unreported_s(now_s)
         unanswered_s = min(unreported_s, now_s - self.answered_s)
         silent_s = min(unanswered_s, now_s - self.worked_s)
@@ -123,7 +123,7 @@ class Watchdog:
         self._thread.start()
 
     def fault(self) -> str | None:
-        """Return what shows that the process hangs, None while nothing does (any thread)."""
+        """Returns what shows that the process hangs, None while nothing does (any thread)."""
         return self._heartbeat.fault(time.monotonic())
 
     def is_starting(self) -> bool:
@@ -131,7 +131,7 @@ class Watchdog:
         return self.newest is None or self.newest.state in ("starting", "waiting")
 
     def close(self) -> None:
-        """Stop listening; does not wait for an answer that is still expected."""
+        """Stops listening; does not wait for an answer that is still expected."""
         self._closing.set()
         self._receiver.close()
 
@@ -192,7 +192,7 @@ class ProcessorUse:
 
 
 def processor_time_s(process_id: int) -> float:
-    """Return the processor time that a process has used, by /proc (Linux); 0 if that is unknown."""
+    """Returns the processor time that a process has used, by /proc (Linux); 0 if that is unknown."""
     try:
         fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
     except OSError:

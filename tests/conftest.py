@@ -53,7 +53,7 @@ if WORKER is not None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes() -> None:
-    """Give each worker that starts now one thread to render and to compute with: together they fill the cores."""
+    """Gives each worker that starts now one thread to render and to compute with: together they fill the cores."""
     for name in THREAD_COUNTS:
         os.environ.setdefault(name, "1")
 
@@ -63,7 +63,7 @@ killed: set[str] = set()
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_handlecrashitem(crashitem: str, report: pytest.TestReport, sched: Any) -> None:  # noqa: ANN401 (no stubs)
-    """Run a test again whose worker was killed: one machine's fault is no fault of the test, twice the same is."""
+    """Runs a test again whose worker was killed: one machine's fault is no fault of the test, twice the same is."""
     if crashitem not in killed:
         killed.add(crashitem)
         report.outcome = "rerun"  # type: ignore[assignment]  # no outcome that pytest counts
@@ -71,7 +71,7 @@ def pytest_handlecrashitem(crashitem: str, report: pytest.TestReport, sched: Any
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Name the tests whose worker was killed, whatever came of them."""
+    """Names the tests whose worker was killed, whatever came of them."""
     for test in sorted(killed):
         terminalreporter.write_line(f"a worker was killed in {test}, which ran again")
 
@@ -82,7 +82,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave slow tests out of the quick tier; in the full one they come first, so that none is waited for alone."""
+    """Leaves slow tests out of the quick tier; in the full one they come first, so that none is waited for alone."""
     grant(items)
     if config.getoption("all") or _are_slow_ones_named(config):
         items[:] = dealt(items, WORKERS)

@@ -11,7 +11,7 @@ LOST_S = 120.0  # that the failed tests of a file may take together: two waits o
 
 
 def grant(items: Iterable[pytest.Item]) -> None:
-    """Give tests that say how long they take that time, TIMES over; the others have pytest-timeout's."""
+    """Gives tests that say how long they take that time, TIMES over; the others have pytest-timeout's."""
     for item in items:
         mark = item.get_closest_marker("slow")
         limit_s = TIMES * mark.kwargs.get("seconds", 0.0) if mark is not None else 0.0
@@ -29,7 +29,7 @@ class LostTime:
         self._lost_s = defaultdict[str, float](float)  # by file
 
     def note(self, report: pytest.TestReport) -> None:
-        """Count the time of a test that failed."""
+        """Counts the time of a test that failed."""
         if report.failed:
             self._lost_s[_file(report.nodeid)] += report.duration
 

@@ -30,7 +30,7 @@ def files_of(title: str) -> dict[str, str]:
 
 
 def changed(text: str, change: str) -> str:
-    """Apply the hunks of a diff, each at the one place where its old lines are."""
+    """Applies the hunks of a diff, each at the one place where its old lines are."""
     for hunk in change.split("@@\n")[1:]:
         lines = hunk.splitlines(keepends=True)
         old, new = ("".join(line[1:] or line for line in lines if line[0] != sign) for sign in "+-")
@@ -141,3 +141,20 @@ def test_floors_installs_what_its_tests_import() -> None:
             re.search(rf"^(import|from) {module}\b", path.read_text(), re.MULTILINE) for path in collected
         ):
             assert module in tools[1].split(), module
+
+
+def test_docstrings_say_what_functions_do() -> None:
+    """Those of commands and routes are shown to users, as instructions."""
+    instruction = re.compile(r'^ *"""(Return|Yield|Write|Read|Send|Check) ', re.MULTILINE)
+    shown = ("benchmarks/cli.py", "services/api/routes/", "services/commands/")
+    folders = ("benchmarks", "deltalight", "protocol", "render_server", "sensor_node", "services")
+    modules = [path.relative_to(ROOT) for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    wrong = [
+        str(module)
+        for module in modules
+        if "node_modules" not in module.parts
+        and not str(module).startswith(shown)
+        and instruction.search((ROOT / module).read_text("utf-8"))
+    ]
+    assert len(modules) > 600
+    assert not wrong

@@ -24,7 +24,7 @@ HEADING = re.compile(rf"^\#{{2,4}} ({NUMBER}) \S", re.MULTILINE)
 
 
 def cited_sections(numbers: str) -> list[str]:
-    """Return the sections that a list such as `3, 4.5`, `3 and 4` or `4.1 to 4.3` names."""
+    """Returns the sections that a list such as `3, 4.5`, `3 and 4` or `4.1 to 4.3` names."""
     found: list[str] = []
     for link, number in re.findall(rf"(to\b)?[^\w.]*({NUMBER})", numbers):
         if link:
@@ -41,7 +41,7 @@ def sections(page: str) -> frozenset[str]:
 
 
 def tracked_sources() -> Iterator[tuple[str, str]]:
-    """Yield name and text of every source file that git tracks."""
+    """Yields name and text of every source file that git tracks."""
     if not (ROOT / ".git").exists():
         pytest.skip("this is no git checkout, so what belongs to the project is not known")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True)

@@ -16,7 +16,7 @@ ROOMS = ("protocol", "sensor_node", "render_server", "services", "deltalight")
 
 
 def build_site(folder: Path) -> None:
-    """Build it; every broken link or anchor, and every page outside of the navigation, raises."""
+    """Builds it; every broken link or anchor, and every page outside of the navigation, raises."""
     pytest.importorskip("material", reason="mkdocs-material is not installed")
     from mkdocs.commands.build import build
     from mkdocs.config import load_config

@@ -43,7 +43,7 @@ class ComparedPicture:
 
 
 def shader_parts() -> "dict[str, Callable[[GpuContext, Path], None]]":
-    """Return what compiles every variant of every shader, by name.
+    """Returns what compiles every variant of every shader, by name.
 
     Raises:
         Skipped: the tests are not here.
@@ -53,7 +53,7 @@ def shader_parts() -> "dict[str, Callable[[GpuContext, Path], None]]":
 
 
 def protected_cases() -> list[Any]:
-    """Return the protected scenes; their names are their strings.
+    """Returns the protected scenes; their names are their strings.
 
     Raises:
         Skipped: the tests are not here.
@@ -62,7 +62,7 @@ def protected_cases() -> list[Any]:
 
 
 def compare_picture(gpu: "GpuContext", case: Any, folder: Path) -> ComparedPicture:  # noqa: ANN401 (see _module)
-    """Render a protected scene, with its assets in `folder`, and compare its picture with the golden."""
+    """Renders a protected scene, with its assets in `folder`, and compares its picture with the golden."""
     scenes = _module("protected_scenes")
     pictures, _ = scenes.pictures_of(gpu, case, folder)
     picture = pictures[scenes.SHOWN]
@@ -80,7 +80,7 @@ def _module(name: str) -> Any:  # noqa: ANN401 (of the tests, which mypy does no
 
 
 def require_tests() -> None:
-    """Check that the project's tests are here.
+    """Checks that the project's tests are here.
 
     Raises:
         Skipped: this is an installed package, which has none.

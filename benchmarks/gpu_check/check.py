@@ -26,7 +26,7 @@ Say = Callable[[str], None]
 
 
 def check_gpu(out: Path, steps: Sequence[Step], missing: Sequence[str], say: Say) -> Report:
-    """Take the steps and return the report, which is in the folder `out` too; `say` is told of progress.
+    """Takes the steps and returns the report, which is in the folder `out` too; `say` is told of progress.
 
     `missing`: the packages that are not installed.
 
@@ -49,7 +49,7 @@ def check_gpu(out: Path, steps: Sequence[Step], missing: Sequence[str], say: Say
 
 
 def _take(step: Step, limit_s: float, report: Report, folder: Path) -> Record:
-    """Run the step's process for at most `limit_s` and return what it found."""
+    """Runs the step's process for at most `limit_s` and returns what it found."""
     path, output = folder / f"{step.name}.json", report.out / OUTPUT_FILE
     report.put(step.name, Record())
     started_s = time.monotonic()
@@ -113,7 +113,7 @@ def _caches(folder: Path) -> dict[str, str]:
 
 
 def _ended(child: "subprocess.Popen[bytes]") -> int | None:
-    """Wait a moment for the process; return its exit code, None while it runs."""
+    """Waits a moment for the process; returns its exit code, None while it runs."""
     with suppress(subprocess.TimeoutExpired):
         return child.wait(POLL_S)
     return None

@@ -16,7 +16,7 @@ Step = Callable[[Findings], str]
 
 
 def take_step(target: str, findings: Findings) -> None:
-    """Run the step and write its record, whatever it raises."""
+    """Runs the step and writes its record, whatever it raises."""
     try:
         sentence = _step(target)(findings)
     except Skipped as reason:
@@ -39,7 +39,7 @@ def _step(target: str) -> Step:
 
 
 def main() -> None:
-    """Take the step that the command line names."""
+    """Takes the step that the command line names."""
     end_with_supervisor()
     target, record, out = sys.argv[1:]
     with TemporaryDirectory(prefix="deltalight-gpu-check-") as scratch:

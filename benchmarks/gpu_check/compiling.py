@@ -51,7 +51,7 @@ class UncompiledShader(moderngl.ComputeShader):
 
 
 def compile_everything(findings: Findings, processes: int) -> str:
-    """Compile every variant and render every scene; note what the driver refuses, and what was done when.
+    """Compiles every variant and renders every scene; notes what the driver refuses, and what was done when.
 
     One process leaves out what several need to share the work.
     """
@@ -66,7 +66,7 @@ def compile_everything(findings: Findings, processes: int) -> str:
 
 
 def _compile_known(findings: Findings, parts: Sequence[str], processes: int) -> set[str]:
-    """Compile what the parts ask for, each variant once, and return the labels."""
+    """Compiles what the parts ask for, each variant once, and returns the labels."""
     known: dict[str, str] = {}
     for asked in spread(asked_variants, parts, processes):
         known |= asked.result or {}
@@ -99,7 +99,7 @@ def _note_parts(
 
 
 def asked_variants(part: str) -> dict[str, str]:
-    """Return the compute shaders that a part asks for, by label. None is compiled, so its pictures are worthless."""
+    """Returns the compute shaders that a part asks for, by label. None is compiled, so its pictures are worthless."""
     found: dict[str, str] = {}
 
     def note(label: str, sources: Mapping[str, str]) -> None:
@@ -114,13 +114,13 @@ def asked_variants(part: str) -> dict[str, str]:
 
 
 def dealt(found: Mapping[str, str], count: int) -> list[list[Variant]]:
-    """Return the variants as at most `count` lists of about the same length of text."""
+    """Returns the variants as at most `count` lists of about the same length of text."""
     longest_first = sorted(found.items(), key=lambda variant: len(variant[1]), reverse=True)
     return [chunk for index in range(count) if (chunk := longest_first[index::count])]
 
 
 def compile_variants(variants: list[Variant]) -> list[str]:
-    """Compile each; return a sentence for each that the driver refuses."""
+    """Compiles each; returns a sentence for each that the driver refuses."""
     gpu, faults = process_context(), []
     for label, source in variants:
         try:
@@ -140,7 +140,7 @@ class RenderedPart:
 
 
 def render_part(gpu: "GpuContext", part: str) -> RenderedPart:
-    """Render a part; what is refused leaves out the rest of it."""
+    """Renders a part; what is refused leaves out the rest of it."""
     labels: list[str] = []
 
     def note(label: str, _sources: Mapping[str, str]) -> None:
@@ -159,5 +159,5 @@ def render_part(gpu: "GpuContext", part: str) -> RenderedPart:
 
 
 def render_part_here(part: str) -> RenderedPart:
-    """Render a part in this process's context."""
+    """Renders a part in this process's context."""
     return render_part(process_context(), part)

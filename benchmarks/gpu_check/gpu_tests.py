@@ -26,22 +26,22 @@ class Recorder:
         self._total = 0
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """Note how many tests there are; where workers run them, nothing is collected here."""
+        """Notes how many tests there are; where workers run them, nothing is collected here."""
         self._total = max(self._total, len(session.items))
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_xdist_node_collection_finished(self, ids: Sequence[str]) -> None:
-        """Note how many tests a worker found, which is all."""
+        """Notes how many tests a worker found, which is all."""
         self._total = len(ids)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """Keep which test runs: a driver may end the process."""
+        """Keeps which test runs: a driver may end the process."""
         done = sum(self.counts.values())
         said = f"{done} of {self._total} tests done, {nodeid} was begun last"
         self._findings.keep(said, counts=self.counts)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Count a test once; what goes wrong before or after it is a failure too, but for want of a package."""
+        """Counts a test once; what goes wrong before or after it is a failure too, but for want of a package."""
         if report.passed and report.when != "call":
             return
         lines = [line for line in report.longreprtext.splitlines() if line.startswith("E ")]
@@ -54,7 +54,7 @@ class Recorder:
             self._findings.fault(reason)
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        """Note a file that cannot be collected; for want of a package it is left out."""
+        """Notes a file that cannot be collected; for want of a package it is left out."""
         if not report.failed:
             return
         reason = f"{report.nodeid}: {report.longreprtext.splitlines()[-1].removeprefix('E ').strip()}"
@@ -70,7 +70,7 @@ class Recorder:
 
 
 def run_tests(findings: Findings, marked: str, tests: Path = TESTS) -> str:
-    """Run the tests below `tests` that the marker expression takes; pytest-xdist, if installed, spreads them."""
+    """Runs the tests below `tests` that the marker expression takes; pytest-xdist, if installed, spreads them."""
     recorder = Recorder(findings)
     options = [
         "-q",

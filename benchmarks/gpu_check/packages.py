@@ -46,7 +46,7 @@ After a slash: a folder of the module, which some builds of it lack.
 
 
 def missing_packages() -> list[str]:
-    """Return the packages of PACKAGES that are not installed.
+    """Returns the packages of PACKAGES that are not installed.
 
     Raises:
         DeltalightError: one that brings a module of FIRST is among them.

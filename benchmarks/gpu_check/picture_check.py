@@ -29,7 +29,7 @@ GAIN = 8  # of the difference, so that a code or two can be seen
 
 
 def compare_pictures(findings: Findings, processes: int) -> str:
-    """Render and compare every case; note those that differ, and show them in a picture."""
+    """Renders and compares every case; notes those that differ, and shows them in a picture."""
     cases = protected_cases()
     if processes > 1:
         return _note(findings, spread(compare_here, cases, processes), len(cases))
@@ -55,7 +55,7 @@ def _note(findings: Findings, compared: "Iterable[Done[Any, ComparedPicture]]", 
 
 
 def compare_here(case: Any) -> ComparedPicture:  # noqa: ANN401 (of the tests, as `protected_cases`)
-    """Render and compare a case in this process's context."""
+    """Renders and compares a case in this process's context."""
     return _compare(process_context(), case)
 
 
@@ -72,7 +72,7 @@ class FailedPictures:
         self._rows: list[Picture] = []
 
     def add(self, one: ComparedPicture) -> None:
-        """Add a row: label, picture, golden (black where missing), difference eight times as strong."""
+        """Adds a row: label, picture, golden (black where missing), difference eight times as strong."""
         golden = np.zeros_like(one.picture) if one.golden is None else one.golden
         difference = np.abs(one.picture.astype(int) - golden) * GAIN
         clipped = np.minimum(difference, 255).astype(np.uint8)

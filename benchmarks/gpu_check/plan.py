@@ -37,7 +37,7 @@ STEPS = [
 
 
 def choose_steps(text: str | None) -> list[Step]:
-    """Return the steps of a list of names separated by commas, in the order of STEPS; None is all of them.
+    """Returns the steps of a list of names separated by commas, in the order of STEPS; None is all of them.
 
     Raises:
         DeltalightError: one is unknown.

@@ -31,13 +31,13 @@ class Done(Generic[Item, Result]):
 
 
 def usable_cores() -> int:
-    """Return on how many cores this process may run, and at most MOST_PROCESSES."""
+    """Returns on how many cores this process may run, and at most MOST_PROCESSES."""
     return min(len(os.sched_getaffinity(0)), MOST_PROCESSES)
 
 
 @contextmanager
 def opened_context() -> "Iterator[GpuContext]":
-    """Open an OpenGL context, and release it."""
+    """Opens an OpenGL context, and releases it."""
     from deltalight.render_server.gpu.context import create_context
 
     gpu = create_context()
@@ -49,7 +49,7 @@ def opened_context() -> "Iterator[GpuContext]":
 
 @cache
 def process_context() -> "GpuContext":
-    """Return the context of this process, which ends with it."""
+    """Returns the context of this process, which ends with it."""
     from deltalight.render_server.gpu.context import create_context
 
     return create_context()
@@ -58,7 +58,7 @@ def process_context() -> "GpuContext":
 def spread(
     work: Callable[[Item], Result], items: Sequence[Item], processes: int
 ) -> Iterator[Done[Item, Result]]:
-    """Do the work on every item, in processes of its own, and return each as soon as it is done.
+    """Does the work on every item, in processes of its own, and returns each as soon as it is done.
 
     `work` is a function of a module, or a partial of one. A driver that ends a process ends the whole work: what was
     not done by then is at fault.
@@ -70,7 +70,7 @@ def spread(
 
 
 def guarded(work: Callable[[Item], Result], item: Item) -> tuple[Result | None, str | None]:
-    """Do the work; return its result, or a sentence that says what was raised, whose traceback is printed."""
+    """Does the work; returns its result, or a sentence that says what was raised, whose traceback is printed."""
     try:
         return work(item), None
     except Exception as fault:

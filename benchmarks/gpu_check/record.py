@@ -41,7 +41,7 @@ class Record:
         return self.state not in (State.PASSED, State.SKIPPED)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the record as plain data."""
+        """Returns the record as plain data."""
         return asdict(self)
 
 
@@ -60,35 +60,35 @@ class Findings:
     _began_s: float = field(default_factory=time.monotonic, init=False)
 
     def keep(self, sentence: str = "", **figures: object) -> None:
-        """Add figures and write the record; `sentence` says how far the step is."""
+        """Adds figures and writes the record; `sentence` says how far the step is."""
         self.record.sentence = sentence or self.record.sentence
         self.record.figures |= figures
         write_bytes(self.path, json.dumps(self.record.as_dict()).encode())
 
     def done(self, what: str) -> None:
-        """Note after how many seconds a part of the step was done: where time runs out, that tells what took it."""
+        """Notes after how many seconds a part of the step was done: where time runs out, that tells what took it."""
         seconds = round(time.monotonic() - self._began_s, 1)
         self.keep(done_after_s={**self.record.figures.get("done_after_s", {}), what: seconds})
 
     def fault(self, sentence: str) -> None:
-        """Note something wrong: the step fails at its end."""
+        """Notes something wrong: the step fails at its end."""
         self.record.faults.append(" ".join(sentence.split()))
         self.keep()
 
     def end(self, state: State, sentence: str) -> None:
-        """Write the record for the last time."""
+        """Writes the record for the last time."""
         self.record.state = state
         self.keep(sentence)
 
 
 def fault_sentence(fault: Exception) -> str:
-    """Return what an exception says, with its kind where that is not written for users."""
+    """Returns what an exception says, with its kind where that is not written for users."""
     kind = "" if isinstance(fault, DeltalightError) else f"{type(fault).__name__}, "
     return f"{kind}{fault}"
 
 
 def read_record(path: Path) -> Record:
-    """Return what a step wrote; nothing yet is an empty record."""
+    """Returns what a step wrote; nothing yet is an empty record."""
     if not path.exists():
         return Record()
     found = json.loads(path.read_bytes())

@@ -18,7 +18,7 @@ MOST_FAULTS = 20  # of a step in report.md; report.json has all
 
 
 def about_checkout(root: Path) -> dict[str, str | None]:
-    """Return date, Python and commit; the commit is None where git or the repository is missing."""
+    """Returns date, Python and commit; the commit is None where git or the repository is missing."""
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         described = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
@@ -40,13 +40,13 @@ class Report:
     is_finished: bool = False
 
     def put(self, name: str, record: Record) -> None:
-        """Set a step's record."""
+        """Sets a step's record."""
         if self.records.get(name) != record:
             self.records[name] = record
             self._write()
 
     def finish(self) -> None:
-        """Say in the files that no step is to come."""
+        """Says in the files that no step is to come."""
         self.is_finished = True
         self._write()
 

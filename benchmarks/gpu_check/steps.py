@@ -34,7 +34,7 @@ LEAK_FRAMES = 4
 
 @contextmanager
 def _noting(findings: Findings, what: str) -> Iterator[None]:
-    """Note what is raised inside, so that the step goes on with the next thing; `what` names this one."""
+    """Notes what is raised inside, so that the step goes on with the next thing; `what` names this one."""
     try:
         yield
     except Exception as fault:  # moderngl raises its own Error, with the driver's words
@@ -43,13 +43,13 @@ def _noting(findings: Findings, what: str) -> Iterator[None]:
 
 
 def _processes() -> int:
-    """Return how many processes share a step's work: one in software, which fills the cores by itself."""
+    """Returns how many processes share a step's work: one in software, which fills the cores by itself."""
     with opened_context() as gpu:
         return 1 if gpu.is_software else usable_cores()
 
 
 def machine(findings: Findings) -> str:
-    """Say what renders here: GL_RENDERER, GL_VENDOR, and GL_VERSION, which names the driver after the first space."""
+    """Says what renders here: GL_RENDERER, GL_VENDOR, GL_VERSION, which names the driver after the first space."""
     with opened_context() as gpu:
         version, _, driver = gpu.version.partition(" ")
         findings.keep(
@@ -63,7 +63,7 @@ def machine(findings: Findings) -> str:
 
 
 def doctor(findings: Findings) -> str:
-    """Examine the machine as `deltalight doctor` does."""
+    """Examines the machine as `deltalight doctor` does."""
     from deltalight.services.doctor import examine
 
     checks: list[dict[str, str]] = []
@@ -76,21 +76,21 @@ def doctor(findings: Findings) -> str:
 
 
 def shaders(findings: Findings) -> str:
-    """Let the driver compile every variant of every shader."""
+    """Lets the driver compile every variant of every shader."""
     from deltalight.benchmarks.gpu_check.compiling import compile_everything
 
     return compile_everything(findings, _processes())
 
 
 def pictures(findings: Findings) -> str:
-    """Compare the protected pictures with their goldens; those that differ go into `failed_pictures.png`."""
+    """Compares the protected pictures with their goldens; those that differ go into `failed_pictures.png`."""
     from deltalight.benchmarks.gpu_check.picture_check import compare_pictures
 
     return compare_pictures(findings, _processes())
 
 
 def speed(findings: Findings) -> str:
-    """Time every method at each of SIZES, with its stages, in milliseconds."""
+    """Times every method at each of SIZES, with its stages, in milliseconds."""
     from deltalight.benchmarks.gpu_check.timing import time_method
 
     timed: dict[str, dict[str, Any]] = {title: {} for title in SIZES}
@@ -108,7 +108,7 @@ def _not_yet(names: Iterable[str]) -> str:
 
 
 def memory(findings: Findings) -> str:
-    """Say what each method's frame holds: bytes of each source and stage (`deltalight graph`), and GL objects.
+    """Says what each method's frame holds: bytes of each source and stage (`deltalight graph`), and GL objects.
 
     `room_bytes` is what a room takes of the device's memory, whatever its method.
     """
@@ -130,7 +130,7 @@ def _free_bytes(gpu: "GpuContext") -> int | None:
 
 
 def _room_bytes(gpu: "GpuContext", held: dict[str, dict[str, Any]], free_bytes: int | None) -> int:
-    """Return the process's peak in software, else what is less free than `free_bytes`, or the largest frame."""
+    """Returns the process's peak in software, else what is less free than `free_bytes`, or the largest frame."""
     if gpu.is_software:
         return getrusage(RUSAGE_SELF).ru_maxrss * 1024
     now, largest = _free_bytes(gpu), max(each["total_bytes"] for each in held.values())
@@ -152,7 +152,7 @@ def _held(gpu: "GpuContext", method: str, folder: Path) -> dict[str, Any]:
 
 
 def leaks(findings: Findings) -> str:
-    """Create, use and release a renderer of each method again and again: the number of GL objects stays the same."""
+    """Creates, uses and releases a renderer of each method repeatedly: the number of GL objects stays the same."""
     counts: dict[str, list[dict[str, int]]] = {}
     with opened_context() as gpu:
         for number, method in enumerate(METHODS, start=1):
@@ -176,12 +176,12 @@ def _counts(gpu: "GpuContext", method: str, folder: Path) -> Iterator[dict[str, 
 
 
 def tests(findings: Findings) -> str:
-    """Run the renderer's tests where pytest is installed, but for those marked `slow`."""
+    """Runs the renderer's tests where pytest is installed, but for those marked `slow`."""
     return _tests(findings, "not slow")
 
 
 def slow_tests(findings: Findings) -> str:
-    """Run those of the renderer's tests that are marked `slow`."""
+    """Runs those of the renderer's tests that are marked `slow`."""
     return _tests(findings, "slow")
 
 
@@ -197,7 +197,7 @@ def _tests(findings: Findings, marked: str) -> str:
 
 
 def quality(findings: Findings) -> str:
-    """Compare methods' pictures of a stored scene with path-traced truth, on what the objects change."""
+    """Compares methods' pictures of a stored scene with path-traced truth, on what the objects change."""
     from deltalight.benchmarks.gpu_check.stored_truth import StoredTruth
 
     truth = StoredTruth.unpacked(findings.scratch / "truth")
@@ -214,7 +214,7 @@ def quality(findings: Findings) -> str:
 
 
 def _rendered(gpu: "GpuContext", method: str, folder: Path) -> "SceneRenderer":
-    """Return a renderer after some frames of a given model, during which the camera turns."""
+    """Returns a renderer after some frames of a given model, during which the camera turns."""
     from deltalight.render_server.renderer import SceneRenderer
     from deltalight.services.frame_account import room_scene, turned_frame
 

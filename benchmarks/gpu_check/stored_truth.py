@@ -41,7 +41,7 @@ class StoredTruth:
 
     @classmethod
     def unpacked(cls, folder: Path, file: Path = FILE) -> "StoredTruth":
-        """Unpack the file into a folder."""
+        """Unpacks the file into a folder."""
         with ZipFile(file) as packed:
             packed.extractall(folder)
         return cls(folder)
@@ -70,7 +70,7 @@ class StoredTruth:
         return decode_rgb(read_bytes(path), str(path))
 
     def psnr_db(self, gpu: "GpuContext", method: str) -> float:
-        """Return the PSNR on what the objects change of a method's picture.
+        """Returns the PSNR on what the objects change of a method's picture.
 
         Raises:
             DeltalightError: the method cannot be used here.
@@ -87,7 +87,7 @@ class StoredTruth:
         return self.psnr_of(picture)
 
     def psnr_of(self, picture: Picture) -> float:
-        """Return the PSNR of a picture on what the objects change; infinite for truth itself."""
+        """Returns the PSNR of a picture on what the objects change; infinite for truth itself."""
         error: Float64[np.ndarray, "n 3"] = (picture.astype(float) - self._picture(REFERENCE_FILE))[
             self.changed
         ]

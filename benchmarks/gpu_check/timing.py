@@ -24,7 +24,7 @@ class Timing:
 
 
 def time_method(method: str, frames: int, size: tuple[int, int], volume: int) -> Timing:
-    """Time a method on the demo; `size` in pixels, `volume` in voxels an edge where the method has voxels.
+    """Times a method on the demo; `size` in pixels, `volume` in voxels an edge where the method has voxels.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a volume beyond the memory budget.
@@ -51,7 +51,7 @@ def time_method(method: str, frames: int, size: tuple[int, int], volume: int) ->
 
 @cache
 def _prepared_take() -> "Take":
-    """Prepare the demo's frames, once for all methods: it takes some seconds."""
+    """Prepares the demo's frames, once for all methods: it takes some seconds."""
     from rich.progress import Progress
 
     from deltalight.benchmarks.speed.motions import prepare_take

@@ -25,7 +25,7 @@ Ours has +z, +x and +y in these places.
 
 
 def material(finish: Finish) -> dict[str, Any]:
-    """Return Mitsuba's material of the scene document's terms; Lambertian or smooth glass if that says so."""
+    """Returns Mitsuba's material of the scene document's terms; Lambertian or smooth glass if that says so."""
     color = rgb(finish.base_color)
     if finish.transmission:
         return {"type": "dielectric", "int_ior": GLASS_IOR, "ext_ior": 1.0, "specular_transmittance": color}
@@ -37,7 +37,7 @@ def material(finish: Finish) -> dict[str, Any]:
 
 
 def environment_light(radiance: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
-    """Return light from a map in the layout of render_server/lights/environment.py.
+    """Returns light from a map in the layout of render_server/lights/environment.py.
 
     Mitsuba puts the first and the last row at the poles, this project row j at (j + 0.5)/h of the height. A map of 2
     h + 1 rows, with the given ones at the odd rows and their means between, is the same function in its layout.
@@ -73,11 +73,11 @@ class Assembly:
         ]
 
     def without(self) -> dict[str, Any]:
-        """Return the real room and its lights."""
+        """Returns the real room and its lights."""
         return {"type": "scene", **self._lights, **self._real}
 
     def with_objects(self, frame: int) -> dict[str, Any]:
-        """Return the room with the virtual objects in their poses of a frame.
+        """Returns the room with the virtual objects in their poses of a frame.
 
         They come last, so that paths that never meet them draw the same random numbers as without.
         """
@@ -91,7 +91,7 @@ class Assembly:
         return {**self.without(), **objects}
 
     def mask(self, frame: int) -> dict[str, Any]:
-        """Return objects that emit radiance 1 among dark real things, for `RoomRenderer.cover`.
+        """Returns objects that emit radiance 1 among dark real things, for `RoomRenderer.cover`.
 
         Flat normals: an emitter is dark where its interpolated normal faces away, as along outlines.
         """
@@ -109,7 +109,7 @@ class Assembly:
         return {"type": "scene", **lamps, **self._real, **objects}
 
     def base_m(self) -> Float[np.ndarray, "3"]:
-        """Return the middle of the first object's underside in the first frame."""
+        """Returns the middle of the first object's underside in the first frame."""
         low, high = self._meshes[0].bounds
         middle = np.array([*(low[:2] + high[:2]) / 2, low[2], 1.0])
         return np.asarray((self.scene.objects[0].world_from_object[0] @ middle)[:3])

@@ -26,7 +26,7 @@ class BoardTexture:
 
 
 def board_texture(board: BoardSpec) -> BoardTexture:
-    """Print `board` with a white margin of about MARGIN_M: marker edges fall on texel edges.
+    """Prints `board` with a white margin of about MARGIN_M: marker edges fall on texel edges.
 
     Raises:
         DeltalightError: the board is not a grid of markers.
@@ -58,5 +58,5 @@ def _texel_of(
     max_m: Float[np.ndarray, "2"],
     texel_m: float,
 ) -> Int[np.ndarray, "2"]:
-    """Return column and row of the texel whose upper left corner is `point_m`."""
+    """Returns column and row of the texel whose upper left corner is `point_m`."""
     return np.rint(np.array([point_m[0] - min_m[0], max_m[1] - point_m[1]]) / texel_m).astype(int)

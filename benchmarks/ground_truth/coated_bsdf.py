@@ -55,7 +55,7 @@ def coated(
     sheen: Triple,
     sheen_roughness: float,
 ) -> dict[str, Any]:
-    """Return a surface under a coat (factor, roughness) over a sheen, in glTF's terms."""
+    """Returns a surface under a coat (factor, roughness) over a sheen, in glTF's terms."""
     variant = str(mi.variant())
     if variant not in _registered:
         mi.register_bsdf(PLUGIN, bsdf_class(CoatedSurface))
@@ -77,7 +77,7 @@ def _lambda(cosine: Numbers, alpha: float, exp: Any, where: Any) -> Numbers:  # 
 def _fibres(
     facing: Numbers, cosines: tuple[Numbers, Numbers], alpha: float, functions: tuple[Any, Any]
 ) -> Numbers:
-    """Return the BRDF of a white sheen; `facing`: the half-vector's cosine."""
+    """Returns the BRDF of a white sheen; `facing`: the half-vector's cosine."""
     distribution = (2 + 1 / alpha) * (1 - facing * facing) ** (0.5 / alpha) / (2 * math.pi)
     shadow = 1 + sum(_lambda(each, alpha, *functions) for each in cosines)
     return distribution / (4 * shadow * cosines[0] * cosines[1])
@@ -85,7 +85,7 @@ def _fibres(
 
 @cache
 def sheen_albedo(alpha: float) -> Float64[np.ndarray, " k"]:
-    """Return the directional albedo of a white sheen as LobeAlbedo has a lobe's."""
+    """Returns the directional albedo of a white sheen as LobeAlbedo has a lobe's."""
     x = (1 - np.cos(np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)) / 2
     nodes, weights = np.polynomial.legendre.leggauss(2 * QUADRATURE)
     level, turn = np.meshgrid(((nodes + 1) / 2) ** 2, np.pi * (np.arange(400) + 0.5) / 400, indexing="ij")
@@ -112,7 +112,7 @@ class CoatedSurface:
 
     @classmethod
     def of(cls, props: Numbers) -> Self:
-        """Return the surface that Mitsuba's properties describe."""
+        """Returns the surface that Mitsuba's properties describe."""
         alpha = max(float(props["coat_roughness"]) ** 2, LEAST_ALPHA)
         return cls(
             GlossySurface.of(props),
@@ -125,7 +125,7 @@ class CoatedSurface:
         )
 
     def sample(self, si: Numbers, sample1: Numbers, sample2: Numbers, active: Numbers) -> Numbers:
-        """Draw a direction, of the coat or of the base."""
+        """Draws a direction, of the coat or of the base."""
         normal, _ = self.facets.sample(si.wi, sample2)
         bs, _ = self.base.sample(
             si, (sample1 - self._coat_samples) / (1 - self._coat_samples), sample2, active
@@ -141,7 +141,7 @@ class CoatedSurface:
         return self.base.color
 
     def albedo(self, si: Numbers, active: Numbers) -> Numbers:
-        """Return that of the base."""
+        """Returns that of the base."""
         return self.base.albedo(si, active)
 
     @property
@@ -152,7 +152,7 @@ class CoatedSurface:
         return self.amount * (1 - self.energy.below(cosine))
 
     def eval_pdf(self, si: Numbers, wo: Numbers, active: Numbers) -> Numbers:
-        """Return the BSDF times cosine, and the density of `sample` per solid angle."""
+        """Returns the BSDF times cosine, and the density of `sample` per solid angle."""
         value, pdf = self.base.eval_pdf(si, wo, active)
         cosine_i, cosine_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         seen = active & (cosine_i > 0) & (cosine_o > 0)

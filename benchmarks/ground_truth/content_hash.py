@@ -8,7 +8,7 @@ import numpy as np
 
 
 def content_hash(*parts: object) -> str:
-    """Return 16 hexadecimal digits that change when any number, name, order or file behind `parts` does.
+    """Returns 16 hexadecimal digits that change when any number, name, order or file behind `parts` does.
 
     Files are named by the key `filename` and hashed by their bytes, so their location does not matter.
 
@@ -41,7 +41,7 @@ def _tokens(part: object) -> Iterator[bytes]:
 
 
 def _array(part: object) -> np.ndarray:
-    """Return the numbers of an array, or of Mitsuba's transforms and bitmaps."""
+    """Returns the numbers of an array, or of Mitsuba's transforms and bitmaps."""
     if isinstance(part, np.ndarray) and part.dtype != object:
         return part
     if type(part).__module__.startswith("mitsuba"):

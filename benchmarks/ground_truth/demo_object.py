@@ -31,7 +31,7 @@ FOOT_PROFILE_M = (
 
 
 def object_mesh() -> trimesh.Trimesh:
-    """Return knot and foot in the object's own frame: metres, z up, standing on z = 0 around the z axis."""
+    """Returns knot and foot in the object's own frame: metres, z up, standing on z = 0 around the z axis."""
     knot = _knot(segments=200, sides=18)
     knot.apply_translation([0, 0, FOOT_PROFILE_M[-1][1] - 0.003 - knot.bounds[0, 2]])
     foot = trimesh.creation.revolve(np.array(FOOT_PROFILE_M), sections=64)
@@ -41,7 +41,7 @@ def object_mesh() -> trimesh.Trimesh:
 
 
 def write_glb(path: Path) -> None:
-    """Write the object as GLB with its PBR material, y up as glTF requires."""
+    """Writes the object as GLB with its PBR material, y up as glTF requires."""
     mesh = object_mesh()
     normals = mesh.vertex_normals.copy()
     y_up = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
@@ -59,7 +59,7 @@ def write_glb(path: Path) -> None:
 
 
 def _knot(segments: int, sides: int) -> trimesh.Trimesh:
-    """Return a tube around the trefoil (sin t + 2 sin 2t, -sin 3t, cos t - 2 cos 2t), framed by its own curvature."""
+    """Returns a tube around the trefoil (sin t + 2 sin 2t, -sin 3t, cos t - 2 cos 2t), framed by its curvature."""
     t = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
     center = np.hstack([np.sin(t) + 2 * np.sin(2 * t), -np.sin(3 * t), np.cos(t) - 2 * np.cos(2 * t)])
     first = np.hstack([np.cos(t) + 4 * np.cos(2 * t), -3 * np.cos(3 * t), -np.sin(t) + 4 * np.sin(2 * t)])
@@ -78,7 +78,7 @@ def _knot(segments: int, sides: int) -> trimesh.Trimesh:
 
 
 def _tube_triangles(segments: int, sides: int) -> np.ndarray:
-    """Return indices (2 segments sides, 3) of a tube closed in both directions, wound outwards."""
+    """Returns indices (2 segments sides, 3) of a tube closed in both directions, wound outwards."""
     ring, side = np.divmod(np.arange(segments * sides), sides)
     ahead, beside = (ring + 1) % segments, (side + 1) % sides
     a, b = ring * sides + side, ahead * sides + side

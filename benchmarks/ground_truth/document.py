@@ -15,7 +15,7 @@ FRAMES_FOLDER = "scenes"
 
 
 def scene_document(scene: BenchmarkScene, frame: int, assets: str = "") -> dict[str, Any]:
-    """Return the document of one frame; the names of its assets begin with `assets`."""
+    """Returns the document of one frame; the names of its assets begin with `assets`."""
     return {
         "name": scene.title,
         "real": {"geometry": "depth", "surfaces": list(scene.surfaces)},
@@ -47,7 +47,7 @@ def _object(item: VirtualObject, frame: int, assets: str) -> dict[str, Any]:
 
 
 def _lights(scene: BenchmarkScene, assets: str) -> dict[str, Any]:
-    """Return the lights, whose strength is known, so that none is registered."""
+    """Returns the lights, whose strength is known, so that none is registered."""
     registration = [1.0, 1.0, 1.0]
     if scene.environment is not None:
         map_file = {"map": assets + ENVIRONMENT_FILE}
@@ -66,12 +66,12 @@ def objects_move(scene: BenchmarkScene) -> bool:
 
 
 def document_path(folder: Path, scene: BenchmarkScene, frame: int) -> Path:
-    """Return the path of a frame's document; scenes at rest have one for all frames."""
+    """Returns the path of a frame's document; scenes at rest have one for all frames."""
     return folder / FRAMES_FOLDER / f"{frame:06d}.json" if objects_move(scene) else folder / DOCUMENT_FILE
 
 
 def write_documents(folder: Path, scene: BenchmarkScene) -> None:
-    """Write the first frame's document and, if objects move, one for each frame."""
+    """Writes the first frame's document and, if objects move, one for each frame."""
     _write(folder / DOCUMENT_FILE, scene_document(scene, 0))
     if objects_move(scene):
         (folder / FRAMES_FOLDER).mkdir()

@@ -28,7 +28,7 @@ _registered: set[str] = set()  # variants
 def energy_keeping(
     base_color: dict[str, Any], *, roughness: float, metallic: float = 0.0, specular: float = 0.5
 ) -> dict[str, Any]:
-    """Return a GGX lobe over a diffuse base, in the scene document's terms (docs/formats.md 3).
+    """Returns a GGX lobe over a diffuse base, in the scene document's terms (docs/formats.md 3).
 
     `base_color` is Mitsuba's: one colour, or a texture if `metallic` is 0. It is a material of one side.
     """
@@ -37,7 +37,7 @@ def energy_keeping(
 
 
 def fresnel(cosine: Numbers, f0: float, metallic: float) -> Numbers:
-    """Return what a microfacet reflects: the exact term of a dielectric, Schlick's of a metal."""
+    """Returns what a microfacet reflects: the exact term of a dielectric, Schlick's of a metal."""
     root = f0**0.5
     eta = (1 + root) / (1 - root) if metallic < 1 else 1.0
     schlick = f0 + (1 - f0) * (1 - cosine) ** 5
@@ -50,7 +50,7 @@ def fresnel(cosine: Numbers, f0: float, metallic: float) -> Numbers:
 
 
 def smith_visibility(cosine_i: Numbers, cosine_o: Numbers, alpha: float) -> Numbers:
-    """Return G / (4 cos cos) of the height-correlated Smith term (Heitz 2014)."""
+    """Returns G / (4 cos cos) of the height-correlated Smith term (Heitz 2014)."""
     a2 = alpha * alpha
     sum_i = cosine_o * (cosine_i * cosine_i * (1 - a2) + a2) ** 0.5
     sum_o = cosine_i * (cosine_o * cosine_o * (1 - a2) + a2) ** 0.5
@@ -75,7 +75,7 @@ class LobeAlbedo:
 
 @cache
 def lobe_albedo(alpha: float, f0: Triple, metallic: float) -> LobeAlbedo:
-    """Integrate the lobe for a GGX roughness `alpha`."""
+    """Integrates the lobe for a GGX roughness `alpha`."""
     x = (1 - np.cos(np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)) / 2
     rows = np.array([_integrals(float(root * root), alpha, f0, metallic) for root in x])
     fits = np.polynomial.chebyshev.chebfit(2 * x - 1, rows, DEGREE)
@@ -89,7 +89,7 @@ def lobe_albedo(alpha: float, f0: Triple, metallic: float) -> LobeAlbedo:
 
 
 def _integrals(cosine: float, alpha: float, f0: Triple, metallic: float) -> Float64[np.ndarray, " 4"]:
-    """Return the light that one reflection lets out, R G B and with F = 1: means over visible normals.
+    """Returns the light that one reflection lets out, R G B and with F = 1: means over visible normals.
 
     Those are on the unit sphere's part that the stretched view sees (Dupuy & Benyoub 2023).
     """
@@ -112,13 +112,13 @@ def _integrals(cosine: float, alpha: float, f0: Triple, metallic: float) -> Floa
 
 
 def _masking(out: Float64[np.ndarray, "n n"], cosine: float, alpha: float) -> Float64[np.ndarray, "n n"]:
-    """Return G / G1 towards the light's side."""
+    """Returns G / G1 towards the light's side."""
     g1 = 2 * cosine / (cosine + np.sqrt(cosine**2 * (1 - alpha**2) + alpha**2))
     return np.asarray(smith_visibility(cosine, out, alpha) * 4 * cosine * out / g1)
 
 
 def register() -> None:
-    """Make the material known to Mitsuba's current variant."""
+    """Makes the material known to Mitsuba's current variant."""
     import mitsuba as mi
 
     from deltalight.benchmarks.ground_truth.energy_keeping_bsdf import GlossySurface, bsdf_class

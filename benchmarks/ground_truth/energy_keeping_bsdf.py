@@ -32,25 +32,25 @@ class LobeEnergy:
         return mi.Color3f(*self.lobe.further.tolist())
 
     def single(self, cosine: Numbers) -> Numbers:
-        """Return what single reflection lets out."""
+        """Returns what single reflection lets out."""
         x = polynomial_place(cosine)
         return dr.clip(mi.Color3f(*[polynomial(each, x) for each in self.lobe.single]), 0, 1)
 
     def held(self, cosine: Numbers) -> Numbers:
-        """Return what the gaps between facets still hold then."""
+        """Returns what the gaps between facets still hold then."""
         return dr.clip(1 - polynomial(self.lobe.whole, polynomial_place(cosine)), 0, 1)
 
     def below(self, cosine: Numbers) -> Numbers:
-        """Return what the lobe leaves to the diffuse base."""
+        """Returns what the lobe leaves to the diffuse base."""
         return dr.maximum(1 - self.single(cosine) - self.held(cosine) * self.further, 0)
 
     def gaps(self, cosine_i: Numbers, cosine_o: Numbers) -> Numbers:
-        """Return the BSDF of further reflections (Kulla & Conty 2017)."""
+        """Returns the BSDF of further reflections (Kulla & Conty 2017)."""
         mean_held = max(1 - self.lobe.mean_whole, 1e-6)
         return self.held(cosine_i) * self.held(cosine_o) / (dr.pi * mean_held) * self.further
 
     def base(self, cosine_i: Numbers, cosine_o: Numbers) -> Numbers:
-        """Return what a base under the lobe reflects, relative to one without (Kelemen 2001)."""
+        """Returns what a base under the lobe reflects, relative to one without (Kelemen 2001)."""
         mean_left = np.maximum(1 - self.lobe.mean, 1e-6)
         return self.below(cosine_i) * self.below(cosine_o) / mi.Color3f(*mean_left.tolist())
 
@@ -68,7 +68,7 @@ class GlossySurface:
 
     @classmethod
     def of(cls, props: Numbers) -> Self:
-        """Return the surface that Mitsuba's properties describe."""
+        """Returns the surface that Mitsuba's properties describe."""
         base, metallic = props.get_texture("base_color"), float(props["metallic"])
         alpha = max(float(props["roughness"]) ** 2, LEAST_ALPHA)
         f0 = _normal_reflectance(base, metallic, 0.08 * float(props["specular"]))
@@ -81,11 +81,11 @@ class GlossySurface:
         return self.base
 
     def albedo(self, si: Numbers, active: Numbers) -> Numbers:
-        """Return that of the base."""
+        """Returns that of the base."""
         return (1 - self.metallic) * self.base.eval(si, active)
 
     def sample(self, si: Numbers, sample1: Numbers, sample2: Numbers, active: Numbers) -> Numbers:
-        """Draw a direction, of the lobe or of the base."""
+        """Draws a direction, of the lobe or of the base."""
         is_glossy = sample1 < self._glossy_probability(si, active)
         normal, _ = self.facets.sample(si.wi, sample2)
         even = mi.warp.square_to_cosine_hemisphere(sample2)
@@ -99,7 +99,7 @@ class GlossySurface:
         return bs, dr.select(found, value / dr.select(found, bs.pdf, 1), 0)
 
     def eval_pdf(self, si: Numbers, wo: Numbers, active: Numbers) -> Numbers:
-        """Return the BSDF times cosine, and the density of `sample` per solid angle."""
+        """Returns the BSDF times cosine, and the density of `sample` per solid angle."""
         cosine_i, cosine_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         seen = active & (cosine_i > 0) & (cosine_o > 0)
         cosine_i, cosine_o = dr.maximum(cosine_i, 1e-6), dr.maximum(cosine_o, 1e-6)
@@ -113,12 +113,12 @@ class GlossySurface:
         return dr.select(seen, value, 0), dr.select(seen, pdf, 0)
 
     def _glossy(self, normal: Numbers, facing: Numbers, cosine_i: Numbers, cosine_o: Numbers) -> Numbers:
-        """Return the BSDF of single reflection at facets that `normal` points from."""
+        """Returns the BSDF of single reflection at facets that `normal` points from."""
         strength = self.facets.eval(normal) * smith_visibility(cosine_i, cosine_o, self.alpha)
         return strength * mi.Color3f(*[fresnel(facing, each, self.metallic) for each in self.f0])
 
     def _glossy_probability(self, si: Numbers, active: Numbers) -> Numbers:
-        """Return the probability of sampling the lobe: its fraction of what is reflected."""
+        """Returns the probability of sampling the lobe: its fraction of what is reflected."""
         cosine = mi.Frame3f.cos_theta(si.wi)
         gaps = self.energy.held(cosine) * self.energy.further
         below = self.albedo(si, active) * self.energy.below(cosine)
@@ -131,16 +131,16 @@ class Surface(Protocol):
 
     @classmethod
     def of(cls, props: Numbers) -> Self:
-        """Return the surface that Mitsuba's properties describe."""
+        """Returns the surface that Mitsuba's properties describe."""
 
     def sample(self, si: Numbers, sample1: Numbers, sample2: Numbers, active: Numbers) -> Numbers:
-        """Draw a direction."""
+        """Draws a direction."""
 
     def eval_pdf(self, si: Numbers, wo: Numbers, active: Numbers) -> Numbers:
-        """Return the BSDF times cosine, and the density of `sample` per solid angle."""
+        """Returns the BSDF times cosine, and the density of `sample` per solid angle."""
 
     def albedo(self, si: Numbers, active: Numbers) -> Numbers:
-        """Return the diffuse reflectance, which guides denoisers."""
+        """Returns the diffuse reflectance, which guides denoisers."""
 
     @property
     def color(self) -> Numbers:
@@ -148,7 +148,7 @@ class Surface(Protocol):
 
 
 def bsdf_class(kind: type[Surface]) -> type:
-    """Return the current variant's class of such surfaces; a context's choice of components is not heeded."""
+    """Returns the current variant's class of such surfaces; a context's choice of components is not heeded."""
 
     class SurfaceBsdf(mi.BSDF):
         """Hands everything on to its surface."""
@@ -187,7 +187,7 @@ def bsdf_class(kind: type[Surface]) -> type:
 
 
 def _normal_reflectance(base: Numbers, metallic: float, dielectric: float) -> Triple:
-    """Return F0, R G B; a metal's is its colour, which must be one for the whole surface."""
+    """Returns F0, R G B; a metal's is its colour, which must be one for the whole surface."""
     if metallic == 0:
         return (dielectric,) * 3
     color = np.array(base.eval(dr.zeros(mi.SurfaceInteraction3f))).ravel()
@@ -196,12 +196,12 @@ def _normal_reflectance(base: Numbers, metallic: float, dielectric: float) -> Tr
 
 
 def polynomial_place(cosine: Numbers) -> Numbers:
-    """Return where LobeAlbedo's polynomials are evaluated."""
+    """Returns where LobeAlbedo's polynomials are evaluated."""
     return 2 * dr.sqrt(dr.clip(cosine, 0, 1)) - 1
 
 
 def polynomial(coefficients: Float64[np.ndarray, " k"], x: Numbers) -> Numbers:
-    """Return a Chebyshev series by Clenshaw's recurrence."""
+    """Returns a Chebyshev series by Clenshaw's recurrence."""
     last, before = 0.0 * x, 0.0 * x
     for value in coefficients[:0:-1]:
         last, before = float(value) + 2 * x * last - before, last

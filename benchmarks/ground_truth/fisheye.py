@@ -36,7 +36,7 @@ clips lies 25 times above the read noise of the next."""
 
 
 def fisheye_sensor(camera: CameraModel, world_from_camera: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """Return Mitsuba's equidistant lens without film.
+    """Returns Mitsuba's equidistant lens without film.
 
     Angle from the axis = radius / focal length, even beyond 90 degrees. Its image circle touches the nearest edge of
     the picture; beyond it the picture is black.
@@ -62,7 +62,7 @@ def fisheye_sensor(camera: CameraModel, world_from_camera: Float[np.ndarray, "4 
 
 @cache
 def _register(variant: str) -> None:
-    """Create the plugin `equidistant` for a variant of Mitsuba, whose types are known only once it is set."""
+    """Creates the plugin `equidistant` for a variant of Mitsuba, whose types are known only once it is set."""
     import drjit as dr
     import mitsuba as mi
 
@@ -75,7 +75,7 @@ def _register(variant: str) -> None:
             self.fx, self.fy, self.cx, self.cy, self.largest = (props[name] for name in names)
 
         def sample_ray(self, *sample: Any) -> Any:  # noqa: ANN401 - typed by the variant
-            """Return the ray through a position on the film, given as fractions of its size."""
+            """Returns the ray through a position on the film, given as fractions of its size."""
             _time, _wavelength, position, *_ = sample
             size = self.film().size()
             x = (position.x * size[0] - 0.5 - self.cx) / self.fx
@@ -88,7 +88,7 @@ def _register(variant: str) -> None:
             return mi.Ray3f(mi.Point3f(pose.translation()), direction), mi.Spectrum(weight)
 
         def sample_ray_differential(self, *sample: Any) -> Any:  # noqa: ANN401 - typed by the variant
-            """Return the same ray; nothing in these scenes needs differentials."""
+            """Returns the same ray; nothing in these scenes needs differentials."""
             ray, weight = self.sample_ray(*sample)
             return mi.RayDifferential3f(ray), weight
 
@@ -99,7 +99,7 @@ def _register(variant: str) -> None:
 def write_bracket(
     folder: Path, radiance: Float32[np.ndarray, "h w 3"], timestamp_ns: int, rng: np.random.Generator
 ) -> None:
-    """Write the exposure bracket of a fish-eye picture and its calibration into a dataset (docs/formats.md 1)."""
+    """Writes the exposure bracket of a fish-eye picture and its calibration into a dataset (docs/formats.md 1)."""
     (folder / "fisheye").mkdir()
     lines = ["# timestamp filename exposure_s"]
     for number, exposure_s in enumerate(EXPOSURES_S):

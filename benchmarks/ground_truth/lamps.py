@@ -15,11 +15,11 @@ class Lamp(Protocol):
     """A light in both representations."""
 
     def mitsuba(self) -> dict[str, Any]:
-        """Return the emitter, or the shape that carries it."""
+        """Returns the emitter, or the shape that carries it."""
         ...
 
     def document(self) -> dict[str, Any]:
-        """Return the entry of `lights.manual`."""
+        """Returns the entry of `lights.manual`."""
         ...
 
 
@@ -33,13 +33,13 @@ class SphereLamp:
     color_linear: Triple = WHITE
 
     def mitsuba(self) -> dict[str, Any]:
-        """Return an emitting sphere: intensity = radiance times the area of its disc."""
+        """Returns an emitting sphere: intensity = radiance times the area of its disc."""
         radiance = np.array(self.color_linear) * self.intensity / (np.pi * self.radius_m**2)
         place = placed(self.position_m, scale=(self.radius_m,) * 3)
         return shape("sphere", place, emitter={"type": "area", "radiance": rgb(radiance)})
 
     def document(self) -> dict[str, Any]:
-        """Return it as a sphere light."""
+        """Returns it as a sphere light."""
         return {
             "type": "sphere",
             "position_m": list(self.position_m),
@@ -57,11 +57,11 @@ class Ambient:
     color_linear: Triple = WHITE
 
     def mitsuba(self) -> dict[str, Any]:
-        """Return a constant environment."""
+        """Returns a constant environment."""
         return {"type": "constant", "radiance": rgb(np.array(self.color_linear) * self.radiance)}
 
     def document(self) -> dict[str, Any]:
-        """Return it as an ambient light."""
+        """Returns it as an ambient light."""
         return {"type": "ambient", "radiance": self.radiance, "color_linear": list(self.color_linear)}
 
 
@@ -81,7 +81,7 @@ class Spot:
     color_linear: Triple = WHITE
 
     def mitsuba(self) -> dict[str, Any]:
-        """Return a spot emitter."""
+        """Returns a spot emitter."""
         import mitsuba as mi
 
         target = [float(v) for v in np.add(self.position_m, self.direction)]
@@ -100,7 +100,7 @@ class Spot:
         }
 
     def irradiance(self, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-        """Return the unshadowed irradiance across the beam at a point, linear R G B."""
+        """Returns the unshadowed irradiance across the beam at a point, linear R G B."""
         offset = point - np.array(self.position_m)
         squared = float(offset @ offset)
         axis = np.array(self.direction) / np.linalg.norm(self.direction)
@@ -110,7 +110,7 @@ class Spot:
         return np.asarray(np.array(self.color_linear) * self.intensity * fraction / squared)
 
     def document(self) -> dict[str, Any]:
-        """Return it as a spot light."""
+        """Returns it as a spot light."""
         return {
             "type": "spot",
             "position_m": list(self.position_m),
@@ -134,7 +134,7 @@ class Panel:
     color_linear: Triple = WHITE
 
     def mitsuba(self) -> dict[str, Any]:
-        """Return a rectangle whose z axis is edge_u x edge_v."""
+        """Returns a rectangle whose z axis is edge_u x edge_v."""
         u, v = np.array(self.edge_u_m), np.array(self.edge_v_m)
         normal = np.cross(u, v)
         place = np.eye(4)
@@ -143,7 +143,7 @@ class Panel:
         return shape("rectangle", place, emitter={"type": "area", "radiance": rgb(radiance)})
 
     def document(self) -> dict[str, Any]:
-        """Return it as a rectangle light; its centre is its position (docs/formats.md 3)."""
+        """Returns it as a rectangle light; its centre is its position (docs/formats.md 3)."""
         return {
             "type": "rectangle",
             "position_m": list(self.center_m),

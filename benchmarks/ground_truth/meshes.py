@@ -61,7 +61,7 @@ _VASE = (
 
 
 def rabbit(height_m: float = 0.15) -> trimesh.Trimesh:
-    """Return one closed surface around blended ellipsoids; it looks along -y."""
+    """Returns one closed surface around blended ellipsoids; it looks along -y."""
     low, high = np.array([-0.32, -0.46, -0.04]), np.array([0.32, 0.54, 1.04])
     axes = [np.arange(a, b, 1 / _CELLS) for a, b in zip(low, high, strict=True)]
     field = _rabbit_field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
@@ -73,7 +73,7 @@ def rabbit(height_m: float = 0.15) -> trimesh.Trimesh:
 
 
 def _rabbit_field(points: Float[np.ndarray, "x y z 3"]) -> Float[np.ndarray, "x y z"]:
-    """Return the approximate distance to the rabbit, negative inside; cut flat by the ground."""
+    """Returns the approximate distance to the rabbit, negative inside; cut flat by the ground."""
     mirrored = [((-x, y, z), axes, pitch) for (x, y, z), axes, pitch in _PAIRS]
     parts = [_ellipsoid(points, *part) for part in (*_BODY, *_PAIRS, *mirrored)]
     blended = -_BLEND * np.log(sum(np.exp(-part / _BLEND) for part in parts))
@@ -83,7 +83,7 @@ def _rabbit_field(points: Float[np.ndarray, "x y z 3"]) -> Float[np.ndarray, "x 
 def _ellipsoid(
     points: Float[np.ndarray, "*n 3"], center: Triple, half_axes: Triple, pitch_deg: float
 ) -> Float[np.ndarray, "*n"]:
-    """Return the distance to an ellipsoid, to first order near its surface."""
+    """Returns the distance to an ellipsoid, to first order near its surface."""
     turn = trimesh.transformations.rotation_matrix(np.radians(-pitch_deg), [1, 0, 0])[:3, :3]
     local = (points - np.array(center)) @ turn
     level = np.linalg.norm(local / half_axes, axis=-1)
@@ -92,7 +92,7 @@ def _ellipsoid(
 
 
 def pawn(height_m: float = 0.13) -> trimesh.Trimesh:
-    """Return a chess pawn: foot, stem, collar and ball."""
+    """Returns a chess pawn: foot, stem, collar and ball."""
     angle = np.linspace(-0.72, np.pi / 2, 24)
     ball = np.stack([0.180 * np.cos(angle), 0.82 + 0.180 * np.sin(angle)], axis=1)
     ball[-1, 0] = 0.0
@@ -100,19 +100,19 @@ def pawn(height_m: float = 0.13) -> trimesh.Trimesh:
 
 
 def vase(height_m: float = 0.16) -> trimesh.Trimesh:
-    """Return a hollow vase with a narrow neck."""
+    """Returns a hollow vase with a narrow neck."""
     return _revolved(np.array(_VASE), height_m)
 
 
 def ball(radius_m: float = 0.04) -> trimesh.Trimesh:
-    """Return a sphere lying on the ground."""
+    """Returns a sphere lying on the ground."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius_m)
     mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
     return mesh
 
 
 def ring(radius_m: float = 0.055, tube_m: float = 0.015) -> trimesh.Trimesh:
-    """Return a ring standing upright, its axis along y."""
+    """Returns a ring standing upright, its axis along y."""
     mesh = trimesh.creation.torus(radius_m, tube_m, major_sections=96, minor_sections=32)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
@@ -120,7 +120,7 @@ def ring(radius_m: float = 0.055, tube_m: float = 0.015) -> trimesh.Trimesh:
 
 
 def block(size_m: Triple) -> trimesh.Trimesh:
-    """Return a box with sharp edges, every face with its own normals."""
+    """Returns a box with sharp edges, every face with its own normals."""
     mesh = trimesh.creation.box(extents=size_m)
     mesh.apply_translation([0, 0, size_m[2] / 2])
     mesh.unmerge_vertices()
@@ -128,7 +128,7 @@ def block(size_m: Triple) -> trimesh.Trimesh:
 
 
 def mug() -> trimesh.Trimesh:
-    """Return a mug with wall, rounded lip and handle (towards +x)."""
+    """Returns a mug with wall, rounded lip and handle (towards +x)."""
     lip = np.linspace(0, np.pi, 7)
     outside = [(0.0, 0.0), (0.032, 0.0), (0.036, 0.002), (0.038, 0.006), (0.038, 0.088)]
     rim = [(0.0365 + 0.0015 * float(np.cos(a)), 0.088 + 0.0015 * float(np.sin(a))) for a in lip[1:-1]]
@@ -144,5 +144,5 @@ def mug() -> trimesh.Trimesh:
 
 
 def _revolved(profile: Float[np.ndarray, "n 2"], height_m: float) -> trimesh.Trimesh:
-    """Revolve an outline (radius, height in units of the height) around z."""
+    """Revolves an outline (radius, height in units of the height) around z."""
     return trimesh.creation.revolve(profile * height_m, sections=96)

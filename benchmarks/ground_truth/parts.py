@@ -23,14 +23,14 @@ class MeshFolder:
     path: Path
 
     def ply(self, name: str, mesh: trimesh.Trimesh) -> str:
-        """Write a mesh with its normals and return the file's name."""
+        """Writes a mesh with its normals and returns the file's name."""
         file = self.path / f"{name}.ply"
         mesh.export(file, vertex_normal=True)
         return str(file)
 
 
 def shape(kind: str, place: Matrix, **parts: object) -> dict[str, Any]:
-    """Return a shape of Mitsuba's kind at `place` (world from shape, 4x4)."""
+    """Returns a shape of Mitsuba's kind at `place` (world from shape, 4x4)."""
     import mitsuba as mi
 
     return {"type": kind, "to_world": mi.ScalarTransform4f(place), **parts}
@@ -39,35 +39,35 @@ def shape(kind: str, place: Matrix, **parts: object) -> dict[str, Any]:
 def mesh_shape(
     name: str, mesh: trimesh.Trimesh, place: Matrix, folder: MeshFolder, bsdf: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return a double-sided triangle mesh."""
+    """Returns a double-sided triangle mesh."""
     return shape("ply", place, filename=folder.ply(name, mesh), bsdf=two_sided(bsdf))
 
 
 def placed(translation_m: Triple, turn: Matrix = IDENTITY, scale: Triple = (1.0, 1.0, 1.0)) -> Matrix:
-    """Return world from shape: scaled, then rotated, then moved."""
+    """Returns world from shape: scaled, then rotated, then moved."""
     translation = trimesh.transformations.translation_matrix(translation_m)
     return np.asarray(translation @ turn @ np.diag([*scale, 1.0]))
 
 
 def turned(axis: Literal["x", "y", "z"], angle_deg: float) -> Matrix:
-    """Return the rotation about a world axis, right-handed."""
+    """Returns the rotation about a world axis, right-handed."""
     direction = [float(axis == name) for name in "xyz"]
     return np.asarray(trimesh.transformations.rotation_matrix(np.radians(angle_deg), direction))
 
 
 def box(center_m: Triple, half_m: Triple, turn_deg: float, color: Triple) -> dict[str, Any]:
-    """Return an upright diffuse box, rotated about z."""
+    """Returns an upright diffuse box, rotated about z."""
     return shape("cube", placed(center_m, turned("z", turn_deg), half_m), bsdf=diffuse(rgb(color)))
 
 
 def rectangle(place: Matrix, albedo: Float32[np.ndarray, "h w 3"] | Triple) -> dict[str, Any]:
-    """Return a diffuse rectangle spanning [-1, 1]^2, of one colour or with a texture whose first row is at v = 1."""
+    """Returns a diffuse rectangle spanning [-1, 1]^2, of one colour or with a texture whose first row is at v = 1."""
     reflectance = rgb(albedo) if isinstance(albedo, tuple) else texture(albedo)
     return shape("rectangle", place, bsdf=two_sided(diffuse(reflectance)))
 
 
 def texture(albedo: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
-    """Return linear colours as a texture."""
+    """Returns linear colours as a texture."""
     import mitsuba as mi
 
     picture = mi.Bitmap(np.ascontiguousarray(albedo[::-1], np.float32))
@@ -75,7 +75,7 @@ def texture(albedo: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
 
 
 def sheet(board: BoardSpec) -> dict[str, Any]:
-    """Return the printed marker board on z = 0."""
+    """Returns the printed marker board on z = 0."""
     paper = board_texture(board)
     center, half = (paper.min_m + paper.max_m) / 2, (paper.max_m - paper.min_m) / 2
     place = placed((float(center[0]), float(center[1]), 0.0), scale=(float(half[0]), float(half[1]), 1.0))
@@ -83,7 +83,7 @@ def sheet(board: BoardSpec) -> dict[str, Any]:
 
 
 def sheet_surface(board: BoardSpec) -> dict[str, Any]:
-    """Return the entry of `real.surfaces` that keeps the whole sheet diffuse, with the margin beyond its print."""
+    """Returns the entry of `real.surfaces` that keeps the whole sheet diffuse, with the margin beyond its print."""
     paper = board_texture(board)
     low, high = ([float(v) for v in corner] for corner in (paper.min_m, paper.max_m))
     region = {"box": {"min_m": [*low, -0.003], "max_m": [*high, 0.003]}}
@@ -91,22 +91,22 @@ def sheet_surface(board: BoardSpec) -> dict[str, Any]:
 
 
 def two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """Return a material that is the same on both sides."""
+    """Returns a material that is the same on both sides."""
     return {"type": "twosided", "bsdf": bsdf}
 
 
 def diffuse(reflectance: dict[str, Any]) -> dict[str, Any]:
-    """Return a Lambertian material."""
+    """Returns a Lambertian material."""
     return {"type": "diffuse", "reflectance": reflectance}
 
 
 def rgb(color: Triple | Float[np.ndarray, "3"]) -> dict[str, Any]:
-    """Return a linear R G B colour."""
+    """Returns a linear R G B colour."""
     return {"type": "rgb", "value": [float(c) for c in color]}
 
 
 def looking(eye_m: Triple, target_m: Triple) -> Matrix:
-    """Return world from camera (OpenCV axes: x right, y down, z forward) of an upright camera."""
+    """Returns world from camera (OpenCV axes: x right, y down, z forward) of an upright camera."""
     eye, forward = np.array(eye_m), np.subtract(target_m, eye_m)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])

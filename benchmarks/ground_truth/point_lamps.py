@@ -15,7 +15,7 @@ LENS_BLUR_PX = 1.5
 
 
 def point_lamps(lamps: Iterable[Lamp]) -> list[Spot]:
-    """Return the lamps that no camera would see."""
+    """Returns the lamps that no camera would see."""
     return [lamp for lamp in lamps if isinstance(lamp, Spot)]
 
 
@@ -26,7 +26,7 @@ def with_point_lamps(
     lens: EquidistantLens,
     pose: Matrix,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return a linear fish-eye picture with the blurs of all point lamps that the lens at `pose` sees.
+    """Returns a linear fish-eye picture with the blurs of all point lamps that the lens at `pose` sees.
 
     The blur's radiance over the solid angle of its pixels adds up to the irradiance across the beam there.
     """
@@ -40,7 +40,7 @@ def with_point_lamps(
 
 
 def _blur(lens: EquidistantLens, place: np.ndarray) -> Float32[np.ndarray, "h w 1"]:
-    """Return the radiance of unit irradiance spread over the pixels around `place`."""
+    """Returns the radiance of unit irradiance spread over the pixels around `place`."""
     columns, rows = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
     squared = (columns - place[0]) ** 2 + (rows - place[1]) ** 2
     weight = np.exp(-squared / (2 * LENS_BLUR_PX**2))
@@ -49,7 +49,7 @@ def _blur(lens: EquidistantLens, place: np.ndarray) -> Float32[np.ndarray, "h w 
 
 
 def _solid_angles(lens: EquidistantLens) -> np.ndarray:
-    """Return every pixel's solid angle, sr, by the cross product of the steps of its ray; 0 without a ray."""
+    """Returns every pixel's solid angle, sr, by the cross product of the steps of its ray; 0 without a ray."""
     columns, rows = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
     rays = lens.directions(np.stack([columns, rows], axis=-1).reshape(-1, 2)).reshape(
         lens.height, lens.width, 3

@@ -34,7 +34,7 @@ NEAR_CLIP_M = 0.01
 
 
 def integrators(max_depth: int) -> dict[str, dict[str, Any]]:
-    """Return Mitsuba's integrators for paths of so many segments; truth is found again by a hash of them."""
+    """Returns Mitsuba's integrators for paths of so many segments; truth is found again by a hash of them."""
     return {
         "color": {"type": "path", "max_depth": max_depth},
         "cover": {"type": "path", "max_depth": 1},  # directly visible light only
@@ -64,7 +64,7 @@ MAX_PASSES = 4096
 
 
 def choose_variant() -> str:
-    """Set and return the fastest Mitsuba variant that works here: `llvm_ad_rgb`, else `scalar_rgb`.
+    """Sets and returns the fastest Mitsuba variant that works here: `llvm_ad_rgb`, else `scalar_rgb`.
 
     The LLVM variant is tried in a child process because a wrong library aborts instead of raising.
 
@@ -93,7 +93,7 @@ def _llvm_works() -> bool:
 
 
 def passes(spp: int, pixels: int) -> tuple[int, ...]:
-    """Split `spp` samples per pixel (rounded up to whole subpixels) into passes of some samples per subpixel.
+    """Splits `spp` samples per pixel (rounded up to whole subpixels) into passes of some samples per subpixel.
 
     They are powers of 4, as the stratified sampler requires, and no pass exceeds `WAVEFRONT`.
     """
@@ -118,7 +118,7 @@ class GuidedPicture:
 
 
 def _ignore() -> None:
-    """Do nothing: nobody counts the passes."""
+    """Does nothing: nobody counts the passes."""
 
 
 class RoomRenderer:
@@ -141,11 +141,11 @@ class RoomRenderer:
     def color(
         self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Render linear radiance in camera units; call `advance` after each of the `passes`."""
+        """Renders linear radiance in camera units; calls `advance` after each of the `passes`."""
         return self._mean("color", world_from_camera, spp, seed, advance)
 
     def guided(self, world_from_camera: Matrix, *, spp: int, seed: int) -> GuidedPicture:
-        """Render with any number of samples a pixel, each in its own pixel, which denoisers expect.
+        """Renders with any number of samples a pixel, each in its own pixel, which denoisers expect.
 
         What `color` has of the lens's blur is missing: `softened` adds it.
         """
@@ -155,14 +155,14 @@ class RoomRenderer:
     def cover(
         self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
     ) -> Float32[np.ndarray, "h w"]:
-        """Render the fraction of each pixel, 0..1, covered by shapes with radiance 1; nothing else may emit light.
+        """Renders the fraction of each pixel, 0..1, covered by shapes with radiance 1; nothing else may emit light.
 
         The same seed places the samples as in `color`.
         """
         return np.ascontiguousarray(self._mean("cover", world_from_camera, spp, seed, advance)[..., 0])
 
     def depth(self, world_from_camera: Matrix, *, spp: int, seed: int) -> Float32[np.ndarray, "h w"]:
-        """Render metres along the optical axis, mean over each pixel; 0 where nothing is hit.
+        """Renders metres along the optical axis, mean over each pixel; 0 where nothing is hit.
 
         Mitsuba gives the distance along the ray from the near plane; rays() has (x/z, y/z), hence the cosine.
         """
@@ -206,7 +206,7 @@ class RoomRenderer:
 
 
 def filtered(fine: Float32[np.ndarray, "hs ws 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Blur a picture of subpixels by the lens and sample it at the pixels' centres; renormalised at borders."""
+    """Blurs a picture of subpixels by the lens and samples it at the pixels' centres; renormalised at borders."""
     taps = 4 * SUBPIXELS  # 2 px to either side: 4 standard deviations
     offset_px = (np.arange(taps) - (taps - 1) / 2) / SUBPIXELS
     variance = SOFTNESS_PX**2 - 1 / (12 * SUBPIXELS**2)
@@ -223,19 +223,19 @@ def filtered(fine: Float32[np.ndarray, "hs ws 3"]) -> Float32[np.ndarray, "h w 3
 
 
 def softened(picture: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Blur a picture of whole pixels by the lens: by the variance that their own area does not have."""
+    """Blurs a picture of whole pixels by the lens: by the variance that their own area does not have."""
     side = (SOFTNESS_PX**2 - 1 / 12) / 2
     kernel = np.array([side, 1 - 2 * side, side], np.float32)
     return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE))
 
 
 def _sampler(samples: int) -> str:
-    """Return the sampler with the least noise that is right in the mean."""
+    """Returns the sampler with the least noise that is right in the mean."""
     return "stratified" if samples >= LEAST_STRATIFIED else "independent"
 
 
 def _sensor(camera: CameraModel, world_from_camera: Matrix, sampler: str) -> dict[str, Any]:
-    """Return Mitsuba's sensor of a camera, with a film on which every sample stays in its pixel."""
+    """Returns Mitsuba's sensor of a camera, with a film on which every sample stays in its pixel."""
     fisheye = camera.distortion_model == "equidistant"
     lens = (fisheye_sensor if fisheye else _pinhole)(camera, world_from_camera)
     film = {
@@ -249,7 +249,7 @@ def _sensor(camera: CameraModel, world_from_camera: Matrix, sampler: str) -> dic
 
 
 def _pinhole(camera: CameraModel, world_from_camera: Matrix) -> dict[str, Any]:
-    """Return a camera without distortion; pixel centres are at integers here, at halves in Mitsuba."""
+    """Returns a camera without distortion; pixel centres are at integers here, at halves in Mitsuba."""
     import mitsuba as mi
 
     fx, fy, cx, cy = camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]

@@ -52,7 +52,7 @@ FINISH = benchmark_scene.Finish(
 
 
 def world_from_camera(frame: int) -> Matrix:
-    """Return the pose of one frame.
+    """Returns the pose of one frame.
 
     On a tripod first, then `SWING_DEG` around the board and back, symmetric in time.
     """
@@ -64,7 +64,7 @@ def world_from_camera(frame: int) -> Matrix:
 
 
 def scene_document() -> dict[str, Any]:
-    """Return the scene document of the demo (docs/formats.md 3): this room's exact lights and the virtual object."""
+    """Returns the scene document of the demo (docs/formats.md 3): this room's exact lights and the virtual object."""
     return {
         "name": "demo",
         "real": {"geometry": "depth"},
@@ -82,7 +82,7 @@ def scene_document() -> dict[str, Any]:
 
 
 def mitsuba_scene(mesh_folder: Path, *, with_object: bool) -> dict[str, Any]:
-    """Return the room as a Mitsuba scene dictionary without sensor; write meshes as PLY into `mesh_folder`."""
+    """Returns the room as a Mitsuba scene dictionary without sensor; writes meshes as PLY into `mesh_folder`."""
     folder = MeshFolder(mesh_folder)
     lights = {"key": KEY_LIGHT.mitsuba(), "ambient": AMBIENT.mitsuba()}
     scene = {"type": "scene", **lights, **room(folder)}
@@ -93,12 +93,12 @@ def mitsuba_scene(mesh_folder: Path, *, with_object: bool) -> dict[str, Any]:
 
 
 def room(folder: MeshFolder) -> dict[str, Any]:
-    """Return everything real except the lights."""
+    """Returns everything real except the lights."""
     return {**_shell(), **_boxes(), "ball": _ball(), "mug": _mug(folder)}
 
 
 def _shell() -> dict[str, Any]:
-    """Return table, two walls and the marker sheet, each a two-sided rectangle spanning [-1, 1]^2."""
+    """Returns table, two walls and the marker sheet, each a two-sided rectangle spanning [-1, 1]^2."""
     table = placed((0.30, -0.28, TABLE_Z_M), scale=(0.80, 0.72, 1.0))
     back = placed((0.30, 0.44, 0.60), turned("x", 90), (0.80, 0.62, 1.0))
     left = placed((-0.30, -0.28, 0.60), turned("z", 90) @ turned("x", 90), (0.72, 0.62, 1.0))
@@ -111,7 +111,7 @@ def _shell() -> dict[str, Any]:
 
 
 def _boxes() -> dict[str, Any]:
-    """Return a book (cover and pages), a cardboard box and a wooden block on it."""
+    """Returns a book (cover and pages), a cardboard box and a wooden block on it."""
     return {
         "book": box((0.20, 0.20, 0.115), (0.0800, 0.018, 0.115), -14.0, (0.62, 0.045, 0.035)),
         "pages": box((0.20, 0.20, 0.115), (0.0815, 0.014, 0.111), -14.0, (0.76, 0.72, 0.62)),

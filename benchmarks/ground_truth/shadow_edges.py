@@ -11,7 +11,7 @@ from deltalight.benchmarks.ground_truth.parts import Triple
 def edge_of_shadow(
     lamp: SphereLamp, edge_m: tuple[Triple, Triple], inside_m: Triple, plane_z_m: float = TABLE_Z_M
 ) -> ShadowEdge:
-    """Return the path across the shadow that a straight edge of an object casts on a level plane.
+    """Returns the path across the shadow that a straight edge of an object casts on a level plane.
 
     `inside_m` is a point of the object whose shadow lies beside the edge's, on the dark side. The path crosses the
     shadow of the edge's middle at a right angle and is twice as long as the penumbra is wide.
@@ -32,7 +32,7 @@ def edge_of_shadow(
 def _shadow(
     lamp_m: Float[np.ndarray, "3"], point_m: Float[np.ndarray, "3"], plane_z_m: float
 ) -> Float[np.ndarray, "3"]:
-    """Return where the ray from a lamp through a point meets the plane."""
+    """Returns where the ray from a lamp through a point meets the plane."""
     reach = (lamp_m[2] - plane_z_m) / (lamp_m[2] - point_m[2])
     return np.asarray(lamp_m + reach * (point_m - lamp_m))
 
@@ -44,7 +44,7 @@ def _penumbra_m(
     shadow_m: Float[np.ndarray, "3"],
     across: Float[np.ndarray, "3"],
 ) -> float:
-    """Return the width of the penumbra along `across`: the lamp's disc through the edge, projected onto the plane."""
+    """Returns the penumbra's width along `across`: the lamp's disc through the edge, projected onto the plane."""
     beam = (edge_m - lamp_m) / np.linalg.norm(edge_m - lamp_m)
     magnified = 2 * radius_m * np.linalg.norm(shadow_m - edge_m) / np.linalg.norm(edge_m - lamp_m)
     return float(magnified * np.hypot(1, np.dot(beam, across) / beam[2]))

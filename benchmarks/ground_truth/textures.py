@@ -13,14 +13,14 @@ WOOD_DARK = np.array([0.30, 0.155, 0.07], np.float32)
 def smooth_noise(
     rng: np.random.Generator, height: int, width: int, cells_y: int, cells_x: int
 ) -> Float32[np.ndarray, "h w"]:
-    """Return noise of unit variance with features of height/cells_y by width/cells_x pixels."""
+    """Returns noise of unit variance with features of height/cells_y by width/cells_x pixels."""
     coarse = rng.standard_normal((cells_y + 1, cells_x + 1)).astype(np.float32)
     fine = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     return np.asarray(fine / fine.std())
 
 
 def wood(seed: int, height: int, width: int, planks: int) -> Float32[np.ndarray, "h w 3"]:
-    """Return a table of `planks` boards with the grain along the rows, each with its own rings, tint and seam."""
+    """Returns a table of `planks` boards with the grain along the rows, each with its own rings, tint and seam."""
     rng = np.random.default_rng(seed)
     edges = np.linspace(0, height, planks + 1).round().astype(int)
     strips = [_plank(rng, int(b - a), width) for a, b in pairwise(edges)]
@@ -42,7 +42,7 @@ def _plank(rng: np.random.Generator, height: int, width: int) -> Float32[np.ndar
 def plaster(
     seed: int, height: int, width: int, color: tuple[float, float, float]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return a painted wall of mean albedo `color` with faint roller marks."""
+    """Returns a painted wall of mean albedo `color` with faint roller marks."""
     rng = np.random.default_rng(seed)
     marks = smooth_noise(rng, height, width, 9, 14) + 0.8 * smooth_noise(rng, height, width, 120, 160)
     return np.asarray(color, np.float32) * (1 + 0.018 * marks[..., None]).astype(np.float32)

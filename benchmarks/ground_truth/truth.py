@@ -85,11 +85,11 @@ class Truth:
         return self.scene.frame_count
 
     def document(self, frame: int) -> SceneDocument:
-        """Return the scene document of a frame, with posed objects and absolute asset paths."""
+        """Returns the scene document of a frame, with posed objects and absolute asset paths."""
         return load_scene(document_path(self.folder, self.scene, frame))
 
     def frame(self, frame: int) -> TruthFrame:
-        """Read the truth of a frame.
+        """Reads the truth of a frame.
 
         Raises:
             DeltalightError: a picture is missing or damaged.
@@ -119,7 +119,7 @@ class Truth:
 def ensure_truth(
     scene: BenchmarkScene, *, size: tuple[int, int], spp: int, progress: Progress, cache: Path | None = None
 ) -> Truth:
-    """Return the truth of a scene, rendering it if `cache` (default: that of the user) does not hold it whole.
+    """Returns the truth of a scene, rendering it if `cache` (default: that of the user) does not hold it whole.
 
     `size` is width and height in pixels, `spp` the samples per pixel of each picture. The folder appears when it is
     complete; an interrupted run leaves nothing. What was not used for longest gives way beyond the cache's limit.
@@ -145,7 +145,7 @@ def ensure_truth(
 
 @contextmanager
 def _workshop(cache: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside the finished ones."""
+    """Yields a temporary folder beside the finished ones."""
     try:
         cache.mkdir(parents=True, exist_ok=True)
         workshop = tempfile.TemporaryDirectory(dir=cache, prefix=".making-")
@@ -171,7 +171,7 @@ def _about(scene: BenchmarkScene, size: tuple[int, int], spp: int, variant: str)
 
 
 def _determining(assembly: Assembly, camera: CameraModel) -> list[object]:
-    """Return everything else that determines the folder's content."""
+    """Returns everything else that determines the folder's content."""
     scene = assembly.scene
     poses = [scene.world_from_camera, *(item.world_from_object for item in scene.objects)]
     documents = [scene_document(scene, 0), scene.board.model_dump(mode="json")]

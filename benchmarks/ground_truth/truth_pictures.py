@@ -64,7 +64,7 @@ class TruthRenderer:
         return 2 * half * (poses + 2 * scene.frame_count) + poses + lens
 
     def frame(self, index: int) -> FramePictures:
-        """Render one frame. Seeds are the same in all frames, so what does not change in truth is exactly still."""
+        """Renders one frame. Seeds are the same in all frames, so what does not change in truth is exactly still."""
         pose = self.assembly.scene.world_from_camera[index]
         room = self._room(pose)
         with_objects = self._traced(self.assembly.with_objects(index), self.camera)
@@ -75,7 +75,7 @@ class TruthRenderer:
         return FramePictures(room.color, color, cover, room.depth_m)
 
     def fisheye(self) -> Float32[np.ndarray, "h w 3"]:
-        """Render the empty room as the fish-eye camera sees it, with point lamps blurred by its lens."""
+        """Renders the empty room as the fish-eye camera sees it, with point lamps blurred by its lens."""
         room = self._traced(self.assembly.without(), fisheye.CAMERA)
         pose = world_from_fisheye(self.assembly)
         picture = room.color(pose, spp=FISHEYE_SAMPLES, seed=SEED, advance=self.advance)
@@ -87,7 +87,7 @@ class TruthRenderer:
         return RoomRenderer(scene, camera, max_depth=self.assembly.scene.max_depth)
 
     def _room(self, pose: Matrix) -> RoomPictures:
-        """Render the room from a pose once: cameras on a tripod see the same room in every frame."""
+        """Renders the room from a pose once: cameras on a tripod see the same room in every frame."""
         key = pose.tobytes()
         if key not in self._rooms:
             room = self._traced(self.assembly.without(), self.camera)
@@ -101,12 +101,12 @@ class TruthRenderer:
         return halves.astype(np.float16).astype(np.float32)  # so that sensors see what is stored
 
     def _half(self, half: int) -> Any:  # noqa: ANN401 - keywords of RoomRenderer
-        """Return how to draw a half; its seeds are the same in every picture."""
+        """Returns how to draw a half; its seeds are the same in every picture."""
         return {"spp": self.spp // 2, "seed": SEED + half, "advance": self.advance}
 
 
 def world_from_fisheye(assembly: Assembly) -> Matrix:
-    """Return the pose of the fish-eye camera: above the middle of the first object's underside, looking up.
+    """Returns the pose of the fish-eye camera: above the middle of the first object's underside, looking up.
 
     Its axes are the world's: it looks along +z, +x is to the right in its picture and +y down.
     """
@@ -116,6 +116,6 @@ def world_from_fisheye(assembly: Assembly) -> Matrix:
 
 
 def coded_psnr(a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"]) -> float:
-    """Return the PSNR (dB) of two linear pictures in sRGB code of range 255; infinite if they are equal."""
+    """Returns the PSNR (dB) of two linear pictures in sRGB code of range 255; infinite if they are equal."""
     error = np.mean(np.square(srgb_coded(a) - srgb_coded(b), dtype=np.float64))
     return float(20 * np.log10(255) - 10 * np.log10(error)) if error > 0 else float("inf")

@@ -33,7 +33,7 @@ FIRST_CAPTURE_NS = 1_000_000_000
 
 
 def write_truth(out: Path, renderer: TruthRenderer, about: dict[str, Any]) -> None:
-    """Render everything and write it into the folder `out`; `about` goes into the manifest."""
+    """Renders everything and writes it into the folder `out`; `about` goes into the manifest."""
     scene = renderer.assembly.scene
     extrinsics = Extrinsics(world_from_fisheye=world_from_fisheye(renderer.assembly))
     step_m = StereoDepthSensor().step_m
@@ -75,7 +75,7 @@ def _hash(path: Path) -> str:
 
 
 def sensor_frame(index: int, pictures: FramePictures, camera: CameraModel) -> SensorFrame:
-    """Return the room as the sensors deliver it, without a pose."""
+    """Returns the room as the sensors deliver it, without a pose."""
     stereo = depth_sensor(camera)
     steps = stereo.measure(pictures.depth_m, np.random.default_rng([SEED, index, 1]))
     capture_ns = FIRST_CAPTURE_NS + round(index * 1e9 / FRAME_RATE_HZ)
@@ -90,18 +90,18 @@ def sensor_frame(index: int, pictures: FramePictures, camera: CameraModel) -> Se
 
 
 def depth_sensor(camera: CameraModel) -> StereoDepthSensor:
-    """Return the depth sensor behind a camera of any size, which measures surfaces up to the same slant."""
+    """Returns the depth sensor behind a camera of any size, which measures surfaces up to the same slant."""
     whole, focal_px = StereoDepthSensor(), float(camera.matrix[0, 0])
     return replace(whole, focal_px=focal_px, edge_step=whole.edge_step * whole.focal_px / focal_px)
 
 
 def _exposed(color: Float32[np.ndarray, "h w 3"], index: int) -> np.ndarray:
-    """Return the picture of frame `index` with that frame's draw of noise, the same for without and with."""
+    """Returns the picture of frame `index` with that frame's draw of noise, the same for without and with."""
     return ColorSensor().expose(color, np.random.default_rng([SEED, index]))
 
 
 def _write_pictures(folder: Path, index: int, pictures: FramePictures) -> None:
-    """Write linear pictures in half precision, which is far finer than noise and 8-bit code."""
+    """Writes linear pictures in half precision, which is far finer than noise and 8-bit code."""
     named = {"without": pictures.without, "with": pictures.with_objects, "cover": pictures.cover}
     for name, picture in named.items():
         np.save(picture_path(folder, name, index), picture.astype(np.float16))
@@ -110,5 +110,5 @@ def _write_pictures(folder: Path, index: int, pictures: FramePictures) -> None:
 
 
 def picture_path(folder: Path, name: str, index: int) -> Path:
-    """Return the path of the linear picture `name` (without, with, cover) of a frame."""
+    """Returns the path of the linear picture `name` (without, with, cover) of a frame."""
     return folder / f"{name}-{index:06d}.npy"

@@ -57,7 +57,7 @@ ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 
 def ablation_chain() -> list[Variant]:
-    """Return the chain from the paper's operator to the exact one and beyond, one switch per row."""
+    """Returns the chain from the paper's operator to the exact one and beyond, one switch per row."""
     chain: list[Variant] = []
     settings: dict[str, Any] = {}
     for name, sentence, changes in ABLATION_STEPS:

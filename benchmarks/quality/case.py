@@ -26,7 +26,7 @@ class SceneCase:
 
     @classmethod
     def opened(cls, truth: Truth) -> "SceneCase":
-        """Read all frames of a truth's dataset, cleaned as a node does it.
+        """Reads all frames of a truth's dataset, cleaned as a node does it.
 
         Raises:
             DeltalightError: the dataset cannot be read.

@@ -12,7 +12,7 @@ REGULARIZER = 1e-3
 
 
 def ideal_composite(truth: TruthFrame) -> Picture:
-    """Return the camera picture times the true change of light, with the true objects over it, coded.
+    """Returns the camera picture times the true change of light, with the true objects over it, coded.
 
     What then differs from the reference is the sensor's noise: it is scaled with the light here, and absent on the
     objects.

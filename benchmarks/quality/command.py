@@ -29,7 +29,7 @@ def run_quality(
     out: Path,
     as_json: bool,
 ) -> None:
-    """Measure, write the report as folder `out`, and print it; goes on where a run of the same inputs was cut off.
+    """Measures, writes the report as folder `out`, and prints it; goes on where a run of the same inputs was cut off.
 
     `scenes` None = all; `methods` None = the ablation chain; `size` is width and height in pixels.
 

@@ -15,7 +15,7 @@ MISSING = "`path+oidn` needs the package oidn; install the project with its dev 
 
 
 def require_denoiser() -> None:
-    """Check that the denoiser can be loaded.
+    """Checks that the denoiser can be loaded.
 
     Raises:
         DeltalightError: it cannot.
@@ -46,7 +46,7 @@ class Denoiser:
         self._oidn.CommitFilter(self._filter)
 
     def __call__(self, noisy: GuidedPicture) -> Linear:
-        """Return the picture without noise.
+        """Returns the picture without noise.
 
         Raises:
             DeltalightError: the denoiser failed.

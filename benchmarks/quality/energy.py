@@ -41,7 +41,7 @@ class Energy:
 
 
 def energy_ratios(result: Linear, camera: Linear, truth: Sequence[Change]) -> Energy:
-    """Compare what `result` changes in the `camera` picture (linear camera units) with what truth changes.
+    """Compares what `result` changes in the `camera` picture (linear camera units) with what truth changes.
 
     `truth` are two pictures with noise of their own. Each says where light is taken or added, the other how much: a
     picture that said both would count its own noise as light, always in its own direction. Where there is only one (a
@@ -59,7 +59,7 @@ def energy_ratios(result: Linear, camera: Linear, truth: Sequence[Change]) -> En
 
 
 def _mean_around(values: Float32[np.ndarray, "h w 3"], mask: Mask) -> Float32[np.ndarray, "h w 3"]:
-    """Return the mean of the masked pixels near each masked one without itself; 0 elsewhere and for isolated ones."""
+    """Returns the mean of the masked pixels near each masked one, without itself; 0 elsewhere and if isolated."""
     kept = mask.astype(np.float64)
     weighted = values * kept[..., None]
     total, count = (

@@ -19,7 +19,7 @@ ENHANCEMENT = 64.0
 
 
 def error_view(result: Picture, reference: Picture) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the signed error of a result as a picture."""
+    """Returns the signed error of a result as a picture."""
     difference = (result.astype(np.float64) - reference) / CODE_RANGE
     most = np.abs(difference).argmax(axis=2)[..., None]
     error = np.take_along_axis(difference, most, axis=2)

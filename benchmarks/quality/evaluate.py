@@ -72,7 +72,7 @@ class QualityResult:
 
 
 def measure_quality(job: QualityJob, progress: Progress, kept: KeptResults | None = None) -> QualityResult:
-    """Render missing truth and measure every variant on every scene.
+    """Renders missing truth and measures every variant on every scene.
 
     What `kept` holds is taken from there, and every other result is put there as soon as it is known.
 
@@ -131,7 +131,7 @@ def _result(case: SceneCase, rendered: Rendered) -> VariantResult:
 
 
 def _ceiling(case: SceneCase) -> VariantResult:
-    """Return perfect relighting without its energy: made of both halves of truth, it would count their noise."""
+    """Returns perfect relighting without its energy: made of both halves of truth, it would count their noise."""
     result = _result(case, Rendered([ideal_composite(one) for one in case.frames]))
     result.figures["darkening"] = result.figures["brightening"] = math.nan
     return result
@@ -144,5 +144,5 @@ def _scene_result(case: SceneCase, variants: dict[str, VariantResult]) -> SceneR
 
 
 def _shown_frame(case: SceneCase) -> int:
-    """Return the middle of a sequence."""
+    """Returns the middle of a sequence."""
     return len(case.frames) // 2

@@ -19,12 +19,12 @@ PARTS = ("changed", "changed_real", "changed_virtual")
 
 
 def linear(picture: Picture) -> Linear:
-    """Return camera units of an 8-bit sRGB picture."""
+    """Returns camera units of an 8-bit sRGB picture."""
     return np.asarray(decode_lut(None)[:, 0][picture])
 
 
 def scene_figures(pictures: Sequence[Picture], case: SceneCase) -> Figures:
-    """Compare a variant's pictures, one per frame, with the truth of their scene.
+    """Compares a variant's pictures, one per frame, with the truth of their scene.
 
     Names: `<part>_<share|psnr_db|ssim|flip>` with the parts picture, changed, changed_real, changed_virtual;
     `darkening`, `brightening`, `virtual_radiance` (energy.py); `penumbra_error` (first frame); `temporal_unchanged`,
@@ -58,7 +58,7 @@ def _frame_figures(
 
 
 def _penumbra_error(picture: Picture, case: SceneCase) -> float:
-    """Return the mean size of the relative errors of all shadow edges; nan if one is hidden or has no shadow."""
+    """Returns the mean size of the relative errors of all shadow edges; nan if one is hidden or has no shadow."""
     frame, view = case.frames[0], case.views[0]
     pose = case.scene.world_from_camera[0]
     camera = linear(frame.sensor_without)
@@ -73,7 +73,7 @@ def _penumbra_error(picture: Picture, case: SceneCase) -> float:
 
 
 def mean_figures(many: Iterable[Figures]) -> Figures:
-    """Return the mean of each figure over those that have it; nan if none has."""
+    """Returns the mean of each figure over those that have it; nan if none has."""
     rows = list(many)
     names = dict.fromkeys(name for row in rows for name in row)
     found = {name: [row[name] for row in rows if name in row and not np.isnan(row[name])] for name in names}

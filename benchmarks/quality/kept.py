@@ -45,7 +45,7 @@ class KeptResults:
 
     @classmethod
     def beside(cls, report: Path) -> "KeptResults":
-        """Return those of the report that is to be written as folder `report`."""
+        """Returns those of the report that is to be written as folder `report`."""
         absolute = report.absolute()
         return cls(absolute.with_name(f".{absolute.name}.partial"))
 
@@ -57,7 +57,7 @@ class KeptResults:
         variant: Variant,
         volume_size: int | None,
     ) -> VariantResult:
-        """Return a result: the kept one of the same inputs, else a new one, which is kept.
+        """Returns a result: the kept one of the same inputs, else a new one, which is kept.
 
         Raises:
             DeltalightError: the disk refuses.
@@ -81,7 +81,7 @@ class KeptResults:
         return measured
 
     def remove(self) -> None:
-        """Remove all: the report is complete."""
+        """Removes all: the report is complete."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     @cached_property

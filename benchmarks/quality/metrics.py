@@ -38,7 +38,7 @@ class Comparison:
         self._flip = flip_map(picture, reference)
 
     def over(self, mask: Mask) -> Agreement:
-        """Return the agreement over the pixels of a mask. SSIM and FLIP include neighbours outside it."""
+        """Returns the agreement over the pixels of a mask. SSIM and FLIP include neighbours outside it."""
         if not mask.any():
             return Agreement(0.0, np.nan, np.nan, np.nan)
         return Agreement(
@@ -49,17 +49,17 @@ class Comparison:
         )
 
     def everywhere(self) -> Agreement:
-        """Return the agreement over the whole picture."""
+        """Returns the agreement over the whole picture."""
         return self.over(np.ones(self._squares.shape, bool))
 
 
 def decibels(mean_square: float) -> float:
-    """Return the peak signal to noise ratio of a mean squared error in 8-bit codes, dB; infinite for 0."""
+    """Returns the peak signal to noise ratio of a mean squared error in 8-bit codes, dB; infinite for 0."""
     return float(10 * np.log10(CODE_RANGE**2 / mean_square)) if mean_square > 0 else np.inf
 
 
 def ssim_map(picture: Picture, reference: Picture) -> Float64[np.ndarray, "h w"]:
-    """Return the structural similarity of each pixel's neighbourhood, mean of the channels (Wang et al. 2004)."""
+    """Returns the structural similarity of each pixel's neighbourhood, mean of the channels (Wang et al. 2004)."""
     _, similarity = structural_similarity(
         reference,
         picture,
@@ -74,7 +74,7 @@ def ssim_map(picture: Picture, reference: Picture) -> Float64[np.ndarray, "h w"]
 
 
 def flip_map(picture: Picture, reference: Picture) -> Float32[np.ndarray, "h w"]:
-    """Return FLIP of each pixel, 0..1, at its default of 67 pixels per degree (Andersson et al. 2020)."""
+    """Returns FLIP of each pixel, 0..1, at its default of 67 pixels per degree (Andersson et al. 2020)."""
     pair = [np.asarray(codes / CODE_RANGE, np.float32) for codes in (reference, picture)]
     found, _, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
     return np.asarray(found[..., 0], np.float32)

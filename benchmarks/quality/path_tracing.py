@@ -40,7 +40,7 @@ class _Pair:
         return SUBPIXELS**2 if self.denoiser is None else 1
 
     def render(self, pose: Matrix, spp: int, seed: int) -> tuple[Linear, Linear]:
-        """Trace both with different seeds, as a differential renderer without memory does, and denoise each."""
+        """Traces both with different seeds, as a differential renderer without memory does, and denoises each."""
         without = self._render(self.without, pose, spp, seed)
         return without, self._render(self.with_objects, pose, spp, seed + 1)
 
@@ -51,7 +51,7 @@ class _Pair:
 
 
 def trace_in_time(case: SceneCase, frame_ms: float, *, is_denoised: bool = False) -> Rendered:
-    """Render every frame differentially, with as many samples per pixel as fit in `frame_ms`, at least the fewest.
+    """Renders every frame differentially, with as many samples per pixel as fit in `frame_ms`, at least the fewest.
 
     Camera picture + (with - without) on real pixels, the traced picture on the objects; both renders have the same
     number of samples, and both are denoised before they are subtracted, which takes a part of the time. The time to
@@ -90,7 +90,7 @@ def _trace(case: SceneCase, frame_ms: float, denoiser: Denoiser | None) -> Rende
 
 
 def _affordable_samples(pair: _Pair, pose: Matrix, frame_ms: float) -> int:
-    """Return the samples per pixel that fit in a time, from two trials: a fixed and a proportional part."""
+    """Returns the samples per pixel that fit in a time, from two trials: a fixed and a proportional part."""
     step, times_ms = pair.least_samples, []
     for spp in (step, step + FURTHER_TRIAL_SAMPLES):
         pair.render(pose, spp, SEED)  # compiles Mitsuba's kernels for this number

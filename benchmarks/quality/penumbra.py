@@ -47,7 +47,7 @@ class EdgeOnPicture:
 
     @classmethod
     def seen(cls, edge: ShadowEdge, camera: CameraModel, world_from_camera: Matrix) -> "EdgeOnPicture":
-        """Lay lines across an edge on a level surface, a pixel apart there, and project them."""
+        """Lays lines across an edge on a level surface, a pixel apart there, and projects them."""
         start, end = np.array(edge.start_m), np.array(edge.end_m)
         middle, half = (start + end) / 2, (end - start) / 2
         camera_from_world = np.linalg.inv(world_from_camera)
@@ -63,14 +63,14 @@ class EdgeOnPicture:
         return cls(camera.project(seen.reshape(-1, 3)).reshape(*points.shape[:2], 2), 2 * reach_m)
 
     def uncovered(self, cover: Float32[np.ndarray, "h w"]) -> "EdgeOnPicture":
-        """Drop lines that objects or the picture's border hide."""
+        """Drops lines that objects or the picture's border hide."""
         height, width = cover.shape
         seen = np.all((self.lines >= 0) & (self.lines <= [width - 1, height - 1]), axis=(1, 2))
         free = np.all(_sampled(cover[..., None], self.lines) < REAL_COVER, axis=1)
         return EdgeOnPicture(self.lines[seen & free], self.length_m)
 
     def measure(self, camera: Linear, result: Linear, without: Linear, truth: Linear) -> Penumbra:
-        """Measure the widths of one edge.
+        """Measures the widths of one edge.
 
         `truth` against noise-free `without`, `result` against the `camera` picture.
         """
@@ -78,7 +78,7 @@ class EdgeOnPicture:
         return Penumbra(widths[0] * self.length_m, widths[1] * self.length_m)
 
     def profile(self, shadowed: Linear, lit: Linear) -> Profile:
-        """Return the ratio shadowed / lit along the edge, both averaged over the lines.
+        """Returns the ratio shadowed / lit along the edge, both averaged over the lines.
 
         1 where nothing is lit or seen.
         """
@@ -89,14 +89,14 @@ class EdgeOnPicture:
 def _sampled(
     picture: Float32[np.ndarray, "h w c"], places: Float64[np.ndarray, "m n 2"]
 ) -> Float64[np.ndarray, "m n"]:
-    """Return the sum of the channels at positions (x, y), bilinear; the border is repeated outside."""
+    """Returns the sum of the channels at positions (x, y), bilinear; the border is repeated outside."""
     rows_columns = np.moveaxis(places, -1, 0)[::-1]
     total = picture.sum(axis=2, dtype=np.float64)
     return np.asarray(map_coordinates(total, rows_columns, order=1, mode="nearest"))
 
 
 def step_width(profile: Profile) -> float:
-    """Return the fraction of a profile's length between 90 % and 10 % of its fall; nan if it does not fall.
+    """Returns the fraction of a profile's length between 90 % and 10 % of its fall; nan if it does not fall.
 
     Noise may cross a level more than once, so the levels are read on the falling curve nearest to the profile (least
     squares).

@@ -36,7 +36,7 @@ class Regions:
 
 
 def find_regions(without: Linear, with_objects: Linear, cover: Float32[np.ndarray, "h w"]) -> Regions:
-    """Return the regions of one frame from noise-free pictures in camera units and the objects' coverage."""
+    """Returns the regions of one frame from noise-free pictures in camera units and the objects' coverage."""
     difference = srgb_coded(with_objects) - srgb_coded(without)
     changed = np.abs(difference).max(axis=2) > CHANGE_CODES
     return Regions(changed, cover < REAL_COVER, cover > VIRTUAL_COVER)

@@ -40,7 +40,7 @@ class Rendered:
 
 
 def render_variant(gpu: GpuContext, case: SceneCase, variant: Variant, volume_size: int | None) -> Rendered:
-    """Render every frame of a scene with a variant of kind `none` or `dvct`.
+    """Renders every frame of a scene with a variant of kind `none` or `dvct`.
 
     Raises:
         DeltalightError: the variant exceeds its memory budget, or requests what is not built.
@@ -68,7 +68,7 @@ def _delta_error(renderer: SceneRenderer) -> float | None:
 
 
 def _time_rebuilds(renderer: SceneRenderer, view: ViewFrame) -> tuple[Picture, float]:
-    """Return the last picture and the median time (ms) of frames between which the camera steps aside and back."""
+    """Returns the last picture and the median time (ms) of frames between which the camera steps aside and back."""
     times_ms: list[float] = []
     aside = _stepped_aside(view)
     for frame in (aside, view) * TIMED_PAIRS:
@@ -88,7 +88,7 @@ def _stepped_aside(view: ViewFrame) -> ViewFrame:
 def _render_rest(
     renderer: SceneRenderer, documents: Sequence[SceneDocument], views: Sequence[ViewFrame]
 ) -> list[Picture]:
-    """Render the frames after the first, in order, with objects in their poses."""
+    """Renders the frames after the first, in order, with objects in their poses."""
     pictures = []
     for document, view in zip(documents[1:], views[1:], strict=True):
         renderer.set_scene(document)

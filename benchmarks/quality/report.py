@@ -23,7 +23,7 @@ PICTURES = "pictures"
 
 
 def require_replaceable(folder: Path) -> None:
-    """Check, before anything is computed, that a report may be written as `folder`.
+    """Checks, before anything is computed, that a report may be written as `folder`.
 
     Raises:
         DeltalightError: `folder` exists and is something else.
@@ -42,7 +42,7 @@ def require_replaceable(folder: Path) -> None:
 
 
 def write_report(result: QualityResult, folder: Path) -> None:
-    """Write the report beside `folder` and move it into its place, replacing an older report.
+    """Writes the report beside `folder` and moves it into its place, replacing an older report.
 
     Raises:
         DeltalightError: it cannot be written, or `folder` is something else.
@@ -101,7 +101,7 @@ def _write_pictures(scene: SceneResult, folder: Path) -> ScenePictures:
 
 
 def markdown(result: QualityResult) -> str:
-    """Return the tables with the meaning of their columns."""
+    """Returns the tables with the meaning of their columns."""
     width, height = result.job.size
     head = [
         "# Quality against ground truth",

@@ -12,7 +12,7 @@ from deltalight.benchmarks.quality.tables import COLUMNS
 
 
 def as_data(result: QualityResult) -> dict[str, Any]:
-    """Return everything but the pictures, as JSON: null for figures that are undefined or infinite."""
+    """Returns everything but the pictures, as JSON: null for figures that are undefined or infinite."""
     job = result.job
     return {
         "kind": REPORT_KIND,

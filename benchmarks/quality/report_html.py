@@ -24,12 +24,12 @@ class ScenePictures:
 
 
 def picture_name(scene: str, what: str) -> str:
-    """Return the file name of a picture: letters, digits and dashes only."""
+    """Returns the file name of a picture: letters, digits and dashes only."""
     return f"{re.sub(r'[^a-z0-9]+', '-', f'{scene} {what}'.lower()).strip('-')}.png"
 
 
 def html_page(result: QualityResult, scenes: list[ScenePictures]) -> str:
-    """Return the page; it needs only the pictures beside it."""
+    """Returns the page; it needs only the pictures beside it."""
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = page.from_string(TEMPLATE.read_text(encoding="utf-8"))
     return template.render(

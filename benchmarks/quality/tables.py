@@ -66,12 +66,12 @@ class Table:
     rows: Sequence[Sequence[str]]
 
     def markdown(self) -> str:
-        """Return it as Markdown with its title as heading."""
+        """Returns it as Markdown with its title as heading."""
         lines = [self.headings, [":--", *["--:"] * (len(self.headings) - 1)], *self.rows]
         return "\n".join([f"## {self.title}", "", *(f"| {' | '.join(line)} |" for line in lines), ""])
 
     def print(self, console: Console) -> None:
-        """Show it in a terminal."""
+        """Shows it in a terminal."""
         shown = RichTable(title=self.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
         name_width = min(WHOLE_NAME, max((len(row[0]) for row in self.rows), default=0))
         shown.add_column(self.headings[0], overflow="fold", min_width=name_width)
@@ -83,7 +83,7 @@ class Table:
 
 
 def all_tables(result: QualityResult) -> list[Table]:
-    """Return the report's tables: means over scenes, changed pixels of each scene, the scenes themselves."""
+    """Returns the report's tables: means over scenes, changed pixels of each scene, the scenes themselves."""
     return [
         means_table(result, "Agreement with truth, mean over scenes", AGREEMENT),
         means_table(result, "Light, steadiness and time, mean over scenes", LIGHT_AND_TIME),
@@ -93,7 +93,7 @@ def all_tables(result: QualityResult) -> list[Table]:
 
 
 def means_table(result: QualityResult, title: str, columns: Sequence[Column]) -> Table:
-    """Return figures as means over scenes, one row per variant."""
+    """Returns figures as means over scenes, one row per variant."""
     rows = [
         [name, *(_number(figures.get(column.figure, np.nan), column.digits) for column in columns)]
         for name, figures in result.means().items()
@@ -102,7 +102,7 @@ def means_table(result: QualityResult, title: str, columns: Sequence[Column]) ->
 
 
 def changed_table(result: QualityResult) -> Table:
-    """Return PSNR over changed pixels: one row per scene, one column per variant."""
+    """Returns PSNR over changed pixels: one row per scene, one column per variant."""
     names = [variant.name for variant in result.variants]
     rows = [
         [scene.scene.name, *(_number(scene.variants[name].figures[CHANGED_PSNR], 2) for name in names)]
@@ -112,7 +112,7 @@ def changed_table(result: QualityResult) -> Table:
 
 
 def scenes_table(result: QualityResult) -> Table:
-    """Return how much each scene changes, how accurate its truth is, and whether pictures are repeatable.
+    """Returns how much each scene changes, how accurate its truth is, and whether pictures are repeatable.
 
     In brackets the greatest difference of a channel, in 8-bit codes.
     """

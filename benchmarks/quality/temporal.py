@@ -23,7 +23,7 @@ class Deviation:
 def temporal_deviation(
     results: Sequence[Picture], references: Sequence[Picture], changed: Sequence[Mask]
 ) -> Deviation:
-    """Compare the steps between following frames of a result with those of its reference."""
+    """Compares the steps between following frames of a result with those of its reference."""
     squares: dict[bool, list[Float64[np.ndarray, " n"]]] = {False: [], True: []}
     for now in range(1, len(results)):
         step = results[now].astype(np.float64) - results[now - 1]

@@ -62,7 +62,7 @@ class BinResult:
 
 
 def measure_bins(folder: Path, progress: Progress, device: int | None) -> list[BinResult]:
-    """Measure both cameras.
+    """Measures both cameras.
 
     Raises:
         DeltalightError: a file is missing or wrong, or shows no bin.
@@ -129,7 +129,7 @@ class _Bin:
         )
 
     def _with_sheet(self, renderer: Renderer, folder: Path) -> RelitPicture:
-        """Return the photograph of the things with a sheet beneath them."""
+        """Returns the photograph of the things with a sheet beneath them."""
         depth = np.asarray(self.depth_m, np.float32)
         pose = BoardPose(self.plane.world_from_camera)
         image = DepthImage(depth, depth > 0, self.plane.camera)
@@ -140,7 +140,7 @@ class _Bin:
         return renderer.render(frame, scene)
 
     def _with_cuboids(self, renderer: Renderer, folder: Path) -> RelitPicture:
-        """Return the photograph of the empty bin with cuboids for the things."""
+        """Returns the photograph of the empty bin with cuboids for the things."""
         points, bare = self.plane.points(self.depth_m), self._bare()
         heights = np.where(self.depth_m > 0, points[..., 2], -1)
         inside = [mask & self.floor for mask in standing(np.where(self.floor, heights, -1))]
@@ -164,7 +164,7 @@ class _Bin:
         return Cuboid(float(left + right) / 2, float(front + back) / 2, 0.0, size)
 
     def _sheet_outline(self) -> Mask:
-        """Return the pixels of the floor under the sheet."""
+        """Returns the pixels of the floor under the sheet."""
         points, sheet = self.plane.points(self.plane.depth_m), self._sheet()
         half = np.array(sheet.size_m[:2]) / 2 - SHEET_M
         return np.asarray(self.floor & (np.abs(points[..., :2] - (sheet.x_m, sheet.y_m)) < half).all(axis=2))
@@ -198,5 +198,5 @@ def _grown(mask: Mask, reach_px: int) -> Mask:
 
 
 def row_of_pictures(results: Sequence[BinResult]) -> Picture:
-    """Return sheet, relit bin and photograph of every camera, one row each."""
+    """Returns sheet, relit bin and photograph of every camera, one row each."""
     return np.vstack([np.hstack([each.sheet, each.relit, each.truth]) for each in results])

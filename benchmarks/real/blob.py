@@ -27,13 +27,13 @@ class Blob:
     darkness: Float64[np.ndarray, " 3"]
 
     def ratios(self, points: Points, cuboid: Cuboid) -> Fractions:
-        """Return what fraction of its light each point of the table keeps, R G B."""
+        """Returns what fraction of its light each point of the table keeps, R G B."""
         shape = _shape(np.array([*self.offset, self.widths, self.spread]), points, cuboid)
         return np.asarray(1 - shape[:, None] * self.darkness)
 
 
 def fit_blob(points: Points, ratios: Fractions, cuboid: Cuboid) -> Blob:
-    """Return the blob that comes nearest to a picture's ratios; arguments as for `fit_lights`."""
+    """Returns the blob that comes nearest to a picture's ratios; arguments as for `fit_lights`."""
 
     def cost(parameters: Float64[np.ndarray, " 4"]) -> float:
         shape = _shape(parameters, points, cuboid)

@@ -74,7 +74,7 @@ class CartonResult:
 
 
 def measure_cartons(folder: Path, progress: Progress, device: int | None) -> CartonResult:
-    """Fit lights in the first photograph of a folder and compare all.
+    """Fits lights in the first photograph of a folder and compares all.
 
     Raises:
         DeltalightError: a file is missing or wrong, or shows no table or nothing on it.
@@ -150,7 +150,7 @@ class _Table:
         return np.asarray(away < heights * cuboid.size_m[2])
 
     def found(self, photograph: Photograph, renderer: Renderer) -> tuple[FoundLights, Blob]:
-        """Return lights and blob that explain a photograph.
+        """Returns lights and blob that explain a photograph.
 
         Lights are found twice: what the carton sends back, which closed forms leave out, is known from a picture that
         is relit by the first ones, and taken out of the photograph for the second.
@@ -168,7 +168,7 @@ class _Table:
     def results(
         self, photograph: Photograph, lights: FoundLights, blob: Blob, renderer: Renderer
     ) -> dict[str, Linear]:
-        """Return the table by each way, linear: as it was, with a blob, with closed-form shadows, relit."""
+        """Returns the table by each way, linear: as it was, with a blob, with closed-form shadows, relit."""
         pairs = {"none": self.plate}
         for way, shadow in (("blob", blob), ("closed form", lights)):
             pairs[way] = self.plate.copy()
@@ -203,13 +203,13 @@ class _Table:
 
 
 def _filled(mask: Float64[np.ndarray, "h w"]) -> Mask:
-    """Return a mask without the hole that a thing's mask leaves around it."""
+    """Returns a mask without the hole that a thing's mask leaves around it."""
     edges, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return np.asarray(cv2.drawContours(np.zeros_like(mask), edges, -1, 1, cv2.FILLED) > 0)
 
 
 def _smooth_ratios(picture: Linear, plate: Linear, table: Mask) -> Linear:
-    """Return picture over plate, both smoothed over the table alone."""
+    """Returns picture over plate, both smoothed over the table alone."""
     inside = table[..., None].astype(np.float32)
     above, below = (cv2.blur(each * inside, (SMOOTH_PX, SMOOTH_PX)) for each in (picture, plate))
     return np.asarray(above / np.maximum(below, 1e-6), np.float32)

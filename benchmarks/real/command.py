@@ -13,7 +13,7 @@ from deltalight.services.files import make_output_folder
 
 
 def run_real(data: Path, out: Path, *, device: int | None, as_json: bool) -> None:
-    """Measure both sets of photographs of a folder, write the report into `out`, and print it.
+    """Measures both sets of photographs of a folder, writes the report into `out`, and prints it.
 
     Raises:
         DeltalightError: a folder or file is missing or wrong, `out` cannot be written, or there is no OpenGL.

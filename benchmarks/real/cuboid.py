@@ -46,7 +46,7 @@ class Cuboid:
     def hits(
         self, origins: Points, directions: Points
     ) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
-        """Return where rays enter and leave the cuboid, in lengths of `directions`; they miss it if enter > leave."""
+        """Returns where rays enter and leave the cuboid, in lengths of `directions`; they miss if enter > leave."""
         half = np.array(self.size_m) / 2
         centre = (self.x_m, self.y_m, half[2])
         origin, along = (origins - centre) @ self._turned, directions @ self._turned
@@ -56,7 +56,7 @@ class Cuboid:
 
 
 def outline(cuboid: Cuboid, plane: Plane) -> Mask:
-    """Return the pixels that a cuboid covers."""
+    """Returns the pixels that a cuboid covers."""
     drawn = np.zeros((plane.camera.height, plane.camera.width), np.uint8)
     _draw(drawn, cuboid, plane, np.zeros(2))
     return np.asarray(drawn > 0)
@@ -82,7 +82,7 @@ class Observed:
 
 
 def fit_cuboid(observed: Observed, plane: Plane) -> Cuboid:
-    """Return the cuboid whose outline and surface agree best with what is seen.
+    """Returns the cuboid whose outline and surface agree best with what is seen.
 
     Raises:
         DeltalightError: too little is seen of it.
@@ -98,7 +98,7 @@ def fit_cuboid(observed: Observed, plane: Plane) -> Cuboid:
 
 
 def rough_cuboid(points: Float64[np.ndarray, "n 3"]) -> Cuboid:
-    """Return the cuboid over the smallest rectangle around the points of the top, m."""
+    """Returns the cuboid over the smallest rectangle around the points of the top, m."""
     height = float(np.percentile(points[:, 2], 95))
     top = points[points[:, 2] > TOP_FRACTION * height, :2]
     (x, y), edges, degrees = cv2.minAreaRect(top.astype(np.float32))
@@ -149,7 +149,7 @@ class _Search:
         return cls(plane, window, low.astype(np.float64), camera, points - camera)
 
     def cost(self, parameters: Float64[np.ndarray, " 6"]) -> float:
-        """Return the fraction of pixels that are wrong, and a little of how far the surface is off."""
+        """Returns the fraction of pixels that are wrong, and a little of how far the surface is off."""
         cuboid = _cuboid(parameters)
         drawn = np.zeros(self.window.shape, np.uint8)
         _draw(drawn, cuboid, self.plane, self.corner)

@@ -53,7 +53,7 @@ class FoundLights:
     rms: float
 
     def ratios(self, points: Points, cuboid: Cuboid) -> Fractions:
-        """Return what fraction of its light each point of the table keeps beside a cuboid, R G B."""
+        """Returns what fraction of its light each point of the table keeps beside a cuboid, R G B."""
         hidden = hidden_sky(points, cuboid)[:, None] * self.even
         for light in self.lights:
             hidden_part = hidden_light(points, cuboid, light.towards, light.radius)
@@ -64,12 +64,12 @@ class FoundLights:
 def hidden_light(
     points: Points, cuboid: Cuboid, towards: Direction, radius: float
 ) -> Float64[np.ndarray, " n"]:
-    """Return the part of a distant disc's light, cosine-weighted, that a cuboid hides from points of the table."""
+    """Returns the part of a distant disc's light, cosine-weighted, that a cuboid hides from points of the table."""
     return _hidden(points, cuboid, _disc(towards, radius))
 
 
 def hidden_sky(points: Points, cuboid: Cuboid) -> Float64[np.ndarray, " n"]:
-    """Return the part of even light that a cuboid hides from points of the table."""
+    """Returns the part of even light that a cuboid hides from points of the table."""
     square, turn = (np.arange(SKY_SAMPLES) + 0.5) / SKY_SAMPLES, GOLDEN * np.arange(SKY_SAMPLES)
     across = np.sqrt(square)
     directions = np.stack([across * np.cos(turn), across * np.sin(turn), np.sqrt(1 - square)], axis=1)
@@ -119,7 +119,7 @@ class _Problem:
         return _Disc(towards, radius, hidden_light(self.points, self.cuboid, towards, radius))
 
     def solve(self, discs: Sequence[_Disc]) -> tuple[Fractions, float]:
-        """Return each disc's fractions, R G B, and the sum of squared errors."""
+        """Returns each disc's fractions, R G B, and the sum of squared errors."""
         if not discs:
             return np.zeros((0, 3)), float(((1 - self.ratios - self.sky[:, None]) ** 2).sum())
         columns = np.stack([disc.hidden - self.sky for disc in discs], axis=1)
@@ -136,7 +136,7 @@ class _Problem:
 def _at_most_one(
     matrix: Float64[np.ndarray, "n k"], wanted: Float64[np.ndarray, " n"]
 ) -> tuple[Float64[np.ndarray, " k"], float]:
-    """Return the non-negative least-squares solution whose sum is at most 1: a last unknown takes up the rest."""
+    """Returns the non-negative least-squares solution whose sum is at most 1: a last unknown takes up the rest."""
     count = matrix.shape[1]
     full = np.zeros((len(matrix) + 1, count + 1))
     full[:-1, :-1], full[-1] = matrix, SUM_WEIGHT
@@ -145,7 +145,7 @@ def _at_most_one(
 
 
 def fit_lights(points: Points, ratios: Fractions, cuboid: Cuboid) -> FoundLights:
-    """Return the lights under which a cuboid leaves the table these fractions of its light.
+    """Returns the lights under which a cuboid leaves the table these fractions of its light.
 
     `points` (n, 3) lie on the table, m; `ratios` (n, 3) are picture over empty table, linear R G B.
     """
@@ -169,14 +169,14 @@ def fit_lights(points: Points, ratios: Fractions, cuboid: Cuboid) -> FoundLights
 
 
 def _directions() -> Points:
-    """Return directions spread evenly over the sky above LOWEST."""
+    """Returns directions spread evenly over the sky above LOWEST."""
     height = np.linspace(np.sin(LOWEST), 1, CANDIDATES)
     turn, across = GOLDEN * np.arange(CANDIDATES), np.sqrt(1 - height**2)
     return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
 
 
 def _refined(problem: _Problem, discs: list[_Disc]) -> list[_Disc]:
-    """Return the lights moved and resized, one after the other in ever smaller steps, while the error shrinks."""
+    """Returns the lights moved and resized, one after the other in ever smaller steps, while the error shrinks."""
     step, error = FIRST_STEP, problem.solve(discs)[1]
     while step > LAST_STEP:
         before = error

@@ -13,7 +13,7 @@ from deltalight.protocol.frames import decode_lut
 
 
 def read_color(path: Path, size: tuple[int, int] | None = None) -> Picture:
-    """Return a photograph as RGB; `size` (width, height) is what it must have, if given.
+    """Returns a photograph as RGB; `size` (width, height) is what it must have, if given.
 
     Raises:
         DeltalightError: it is missing, no picture, or of another size.
@@ -24,7 +24,7 @@ def read_color(path: Path, size: tuple[int, int] | None = None) -> Picture:
 
 
 def read_values(path: Path, size: tuple[int, int]) -> Float64[np.ndarray, "h w"]:
-    """Return an image of one channel, such as depth, in the file's own unit; not finite = 0.
+    """Returns an image of one channel, such as depth, in the file's own unit; not finite = 0.
 
     Raises:
         DeltalightError: it is missing, has more channels, or is of another size.
@@ -54,6 +54,6 @@ def _require_size(path: Path, found: Float64[np.ndarray, "..."], size: tuple[int
 
 
 def linear(color: Picture) -> Linear:
-    """Return a photograph in linear units, by the sRGB response: the cameras' own are not known."""
+    """Returns a photograph in linear units, by the sRGB response: the cameras' own are not known."""
     lut: Float32[np.ndarray, "256 3"] = decode_lut(None)
     return np.asarray(lut[color, np.arange(3)], np.float32)

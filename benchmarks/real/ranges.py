@@ -56,12 +56,12 @@ class Plane:
         return np.asarray(np.divide(self.distance_m, slope, out=np.zeros_like(slope), where=slope > 1e-6))
 
     def points(self, depth_m: Values) -> Float64[np.ndarray, "h w 3"]:
-        """Return the world's points at a depth along the optical axis."""
+        """Returns the world's points at a depth along the optical axis."""
         pose = self.world_from_camera
         return np.asarray((_rays(self.camera) * depth_m[..., None]) @ pose[:3, :3].T + pose[:3, 3])
 
     def depth_of_ranges(self, ranges_m: Values) -> Values:
-        """Return the depth along the optical axis for ranges; of two points on a ray, that nearer the plane."""
+        """Returns the depth along the optical axis for ranges; of two points on a ray, that nearer the plane."""
         rays = _rays(self.camera)
         square, along = (rays**2).sum(-1), rays @ self.origin_m
         root = np.sqrt(np.maximum(along**2 - square * (self.origin_m @ self.origin_m - ranges_m**2), 0))
@@ -78,7 +78,7 @@ def _rays(camera: CameraModel) -> Float64[np.ndarray, "h w 3"]:
 def fit_plane(
     camera: CameraModel, ranges_m: Values, seen: Bool[np.ndarray, "h w"], *, at_camera: bool
 ) -> Plane:
-    """Return the plane that most of the `seen` pixels show; `at_camera`: ranges are distances to the camera.
+    """Returns the plane that most of the `seen` pixels show; `at_camera`: ranges are distances to the camera.
 
     Raises:
         DeltalightError: they show no plane.

@@ -23,7 +23,7 @@ BRIGHTEST = 0.95
 
 
 def table_frame(number: int, plate: Picture, plane: Plane, table: Mask) -> ViewFrame:
-    """Return the empty table as the renderer takes it: photograph, pose, and the plane's depth where the table is."""
+    """Returns the empty table as the renderer takes it: photograph, pose, the plane's depth where the table is."""
     depth_m = np.where(table, plane.depth_m, 0).astype(np.float32)
     depth = DepthImage(depth_m, depth_m > 0, plane.camera)
     pose = BoardPose(plane.world_from_camera)
@@ -33,7 +33,7 @@ def table_frame(number: int, plate: Picture, plane: Plane, table: Mask) -> ViewF
 def table_scene(
     things: Sequence[tuple[Cuboid, Albedo]], lights: FoundLights, bare: Albedo, folder: Path
 ) -> Scene:
-    """Return the scene of cuboids of an albedo on the table; their meshes go into `folder`.
+    """Returns the scene of cuboids of an albedo on the table; their meshes go into `folder`.
 
     `bare`: the empty table's radiance, R G B.
     """

@@ -19,7 +19,7 @@ MEAN = "mean of the others"
 
 
 def tables(cartons: CartonResult, bins: list[BinResult]) -> list[Table]:
-    """Return the figures as tables: lights, cartons, bins."""
+    """Returns the figures as tables: lights, cartons, bins."""
     fitted, *others = cartons.figures
     rows = [
         [f"{name}{' (fitted)' if name == fitted else ''}", way, *_cells(figures)]
@@ -96,7 +96,7 @@ def _bin_rows(bins: list[BinResult]) -> list[list[str]]:
 
 
 def as_data(cartons: CartonResult, bins: list[BinResult]) -> dict[str, Any]:
-    """Return everything but the pictures, as JSON: null for what is undefined."""
+    """Returns everything but the pictures, as JSON: null for what is undefined."""
     lights = [
         {
             **dict(zip(("azimuth_deg", "elevation_deg", "radius_deg"), _angles_deg(each), strict=True)),
@@ -139,7 +139,7 @@ def _finite(figures: Figures) -> dict[str, float | None]:
 
 
 def write_report(folder: Path, cartons: CartonResult, bins: list[BinResult]) -> None:
-    """Write real.json, real.md and the pictures into a folder that exists."""
+    """Writes real.json, real.md and the pictures into a folder that exists."""
     write_bytes(folder / "real.json", (json.dumps(as_data(cartons, bins), indent=2) + "\n").encode())
     text = "\n".join(["# Real photographs", "", *(table.markdown() for table in tables(cartons, bins))])
     write_bytes(folder / "real.md", text.encode())
@@ -149,7 +149,7 @@ def write_report(folder: Path, cartons: CartonResult, bins: list[BinResult]) -> 
 
 
 def _side_by_side(shown: Shown) -> np.ndarray:
-    """Return fit and photograph over the relit table and the one with a blob."""
+    """Returns fit and photograph over the relit table and the one with a blob."""
     return np.vstack(
         [np.hstack([shown.fit, shown.truth]), np.hstack([shown.results["exact"], shown.results["blob"]])]
     )

@@ -27,7 +27,7 @@ class Figures:
 
 
 def changed_part(truth: Linear, plate: Linear, table: Mask) -> Mask:
-    """Return the pixels of the table whose light the thing changes; both pictures are linear, equally exposed."""
+    """Returns the pixels of the table whose light the thing changes; both pictures are linear, equally exposed."""
     difference = srgb_bytes(truth).astype(np.float32) - srgb_bytes(plate)
     smooth = cv2.GaussianBlur(difference * table[..., None], (0, 0), SMOOTH_PX)
     inside = cv2.GaussianBlur(table.astype(np.float32), (0, 0), SMOOTH_PX)
@@ -36,7 +36,7 @@ def changed_part(truth: Linear, plate: Linear, table: Mask) -> Mask:
 
 
 def score(result: Linear, truth: Linear, plate: Linear, table: Mask, changed: Mask) -> Figures:
-    """Compare a result with the photograph `truth`; `plate` is the empty table. All are linear, equally exposed."""
+    """Compares a result with the photograph `truth`; `plate` is the empty table. All are linear, equally exposed."""
     regions = Regions(changed, table, np.zeros_like(table))
     energy = energy_ratios(result, plate, [Change(plate, truth, regions)])
     return Figures(
@@ -45,13 +45,13 @@ def score(result: Linear, truth: Linear, plate: Linear, table: Mask, changed: Ma
 
 
 def psnr_db(result: Linear, truth: Linear, mask: Mask) -> float:
-    """Return the PSNR of 8-bit codes over a mask, dB; nan where it is empty."""
+    """Returns the PSNR of 8-bit codes over a mask, dB; nan where it is empty."""
     codes: Float32[np.ndarray, "h w 3"] = srgb_bytes(result).astype(np.float32) - srgb_bytes(truth)
     return decibels(float(np.square(codes[mask]).mean())) if mask.any() else np.nan
 
 
 def means(figures: list[Figures]) -> Figures:
-    """Return the mean of each figure over pictures; what is not defined in one is left out."""
+    """Returns the mean of each figure over pictures; what is not defined in one is left out."""
     values = np.array(
         [(each.table_psnr_db, each.changed_psnr_db, each.taken, each.added) for each in figures]
     )

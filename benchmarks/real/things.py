@@ -33,7 +33,7 @@ class Thing:
 
 
 def table_mask(heights_m: Values) -> Mask:
-    """Return the pixels of the table: the largest even area, without its border.
+    """Returns the pixels of the table: the largest even area, without its border.
 
     Raises:
         DeltalightError: nothing is even.
@@ -48,7 +48,7 @@ def table_mask(heights_m: Values) -> Mask:
 
 
 def standing(heights_m: Values) -> list[Mask]:
-    """Return what rises above the table, the largest first, without what the picture's border cuts."""
+    """Returns what rises above the table, the largest first, without what the picture's border cuts."""
     high = ((heights_m > FLAT_M) & (heights_m < HIGHEST_M)).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(high)
     rows, columns = heights_m.shape
@@ -59,7 +59,7 @@ def standing(heights_m: Values) -> list[Mask]:
 
 
 def find_thing(color: Picture, empty_ratio: Linear, points: Float64[np.ndarray, "h w 3"]) -> Thing:
-    """Return the largest thing on the table.
+    """Returns the largest thing on the table.
 
     `empty_ratio`: linear picture over that of the empty table; `points`: of depth, in the world of the table, m.
 
@@ -76,7 +76,7 @@ def find_thing(color: Picture, empty_ratio: Linear, points: Float64[np.ndarray, 
 
 
 def _cut_by_color(color: Picture, empty_ratio: Linear, rising: Mask) -> Mask:
-    """Return the thing's pixels by GrabCut (Rother et al. 2004), begun with what depth says."""
+    """Returns the thing's pixels by GrabCut (Rother et al. 2004), begun with what depth says."""
     seed = rising.astype(np.uint8)
     near = cv2.dilate(seed, np.ones((2 * REACH_PX + 1,) * 2)) > 0
     darkest = cv2.GaussianBlur(empty_ratio.min(axis=2), (0, 0), 1.0)

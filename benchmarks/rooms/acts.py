@@ -76,7 +76,7 @@ class ActRecord(StrictModel):
 
 
 def measure(run: Run, name: str, act: Act) -> ActRecord:
-    """Wait until all spares are ready, do it, and compare what is shown before and after.
+    """Waits until all spares are ready, does it, and compares what is shown before and after.
 
     Raises:
         DeltalightError: the room does not come back, or a spare is never ready.
@@ -131,7 +131,7 @@ def _add_host(run: Run) -> None:
 
 
 def _replace_free_host(run: Run) -> None:
-    """Kill the host without a room and start another, which has no spare yet."""
+    """Kills the host without a room and starts another, which has no spare yet."""
     assert run.hosts is not None
     slots = run.installation.directory.rooms().slots
     run.hosts.kill(next(slot.host for slot in slots if slot.room is None))

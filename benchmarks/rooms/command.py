@@ -29,7 +29,7 @@ Say = Callable[[str], None]
 
 
 def run_rooms(placers: Sequence[str], times: int, out: Path, say: Say) -> RoomsReport:
-    """Measure, and write rooms.json and rooms.md into the folder `out`.
+    """Measures, and writes rooms.json and rooms.md into the folder `out`.
 
     Raises:
         DeltalightError: this is no Linux, Ray is missing, no picture came, or a room did not come back.
@@ -59,13 +59,13 @@ def run_rooms(placers: Sequence[str], times: int, out: Path, say: Say) -> RoomsR
 
 
 def print_report(report: RoomsReport, out: Path) -> None:
-    """Print the figures as a table, and where the files are."""
+    """Prints the figures as a table, and where the files are."""
     print_figures("Rooms", report.figures, f"The report is in {out}: rooms.json, rooms.md")
 
 
 @contextmanager
 def _running(placer: str) -> Iterator[Run]:
-    """Run rooms by a placer, watched by a viewer; nothing is left afterwards."""
+    """Runs rooms by a placer, watched by a viewer; nothing is left afterwards."""
     with (
         TemporaryDirectory(prefix="deltalight-bench-") as folder,
         LoopThread("viewers") as thread,

@@ -53,7 +53,7 @@ class Hosts:
         self._add(include_dashboard=False, _system_config=HEALTH_CHECKS)
 
     def add(self, name: str = "", **labels: str) -> str:
-        """Start a host; return its name, which no host has had before."""
+        """Starts a host; returns its name, which no host has had before."""
         name = name or f"host{next(self._numbers)}"
         node = self._add(node_name=name, resources={SLOT_RESOURCE: 1}, labels=labels)
         self.networks[name] = labels.get("network")
@@ -62,11 +62,11 @@ class Hosts:
         return name
 
     def raylet(self, name: str) -> psutil.Process:
-        """Return the process by whose life Ray knows that a host lives."""
+        """Returns the process by whose life Ray knows that a host lives."""
         return self._raylets[name]
 
     def kill(self, name: str) -> None:
-        """Kill a host's raylet at once (SIGKILL)."""
+        """Kills a host's raylet at once (SIGKILL)."""
         os.kill(self.raylet(name).pid, signal.SIGKILL)
         del self.networks[name]
 
@@ -78,7 +78,7 @@ class Hosts:
 
 @contextmanager
 def running_hosts(*labels: dict[str, str]) -> Iterator[Hosts]:
-    """Start a cluster with a host for each of these labels; it ends with the block."""
+    """Starts a cluster with a host for each of these labels; it ends with the block."""
     hosts = Hosts()
     try:
         for each in labels:

@@ -55,26 +55,26 @@ class Installation:
         self.client = httpx.Client(base_url=f"http://{ports.LOOPBACK}:{page_port}/api/v1", timeout=30)
 
     def close(self) -> None:
-        """Close the connections."""
+        """Closes the connections."""
         self.directory.close()
         self.client.close()
 
     def room(self, name: str) -> RoomStatus:
-        """Return what the directory says of a room."""
+        """Returns what the directory says of a room."""
         return next(room for room in self.directory.rooms().rooms if room.name == name)
 
     def epoch(self, name: str) -> int:
-        """Return the epoch of a room that has a render server."""
+        """Returns the epoch of a room that has a render server."""
         endpoints = self.room(name).endpoints
         assert endpoints is not None
         return endpoints.epoch
 
     def answered(self, name: str) -> dict[str, object]:
-        """Return what the web process says of a room."""
+        """Returns what the web process says of a room."""
         return dict(self.client.get(f"/rooms/{name}").json())
 
     def picture(self, name: str) -> bytes:
-        """Return the newest picture of a room, as JPEG; empty if there is none."""
+        """Returns the newest picture of a room, as JPEG; empty if there is none."""
         answer = self.client.get(f"/rooms/{name}/live.jpg")
         return answer.content if answer.status_code == httpx.codes.OK else b""
 
@@ -85,7 +85,7 @@ class Installation:
         return room.get("state") == "running" and isinstance(since_s, float) and since_s < 1
 
     def frames(self, name: str) -> int:
-        """Return how many pictures of a room the web process has received."""
+        """Returns how many pictures of a room the web process has received."""
         text = self.client.get(f"/rooms/{name}/metrics").text
         lines = (
             line for line in text.splitlines() if line.startswith("deltalight_live_frames_received_total")
@@ -93,7 +93,7 @@ class Installation:
         return int(float(next(lines).split()[1]))
 
     def server(self, name: str) -> psutil.Process:
-        """Return the process that listens at the room's control endpoint.
+        """Returns the process that listens at the room's control endpoint.
 
         Raises:
             DeltalightError: none does.
@@ -106,17 +106,17 @@ class Installation:
         raise DeltalightError(f"nobody listens at the control endpoint of {name}; see whether it runs.")
 
     def processes(self) -> list[psutil.Process]:
-        """Return all that it runs, on its hosts too."""
+        """Returns all that it runs, on its hosts too."""
         return [child for host in {self.process, *self.hosts} for child in children_of(host)]
 
     def spares(self) -> list[psutil.Process]:
-        """Return the render servers that are no room's."""
+        """Returns the render servers that are no room's."""
         running = [room.name for room in self.directory.rooms().rooms if room.endpoints is not None]
         taken = {self.server(name).pid for name in running}
         return [each for each in self.processes() if is_render_server(each) and each.pid not in taken]
 
     def wait_for_spares(self, **rest: float) -> None:
-        """Wait until each host has a spare that has prepared itself (`wait_until_idle`), and that is all they run.
+        """Waits until each host has a spare that has prepared itself (`wait_until_idle`), and that is all they run.
 
         Raises:
             DeltalightError: they never have.
@@ -134,7 +134,7 @@ class Installation:
             wait_until_idle(spare, **rest)
 
     def kill(self, name: str) -> str:
-        """Kill the room's render server; return the seconds until a viewer has a picture of the next, and by whom."""
+        """Kills the room's render server; returns the seconds until a viewer has the next picture, and by whom."""
         epoch, server, present = self.epoch(name), self.server(name), self.processes()
         os.kill(server.pid, signal.SIGKILL)
         killed_s = time.monotonic()
@@ -143,7 +143,7 @@ class Installation:
         return f"{gap_s:.2f} s by {'the spare' if self.server(name) in present else 'a new process'}"
 
     def shown_after(self, name: str, epoch: int) -> float:
-        """Wait for a picture of a newer epoch; return when it came, by the monotonic clock, in seconds."""
+        """Waits for a picture of a newer epoch; returns when it came, by the monotonic clock, in seconds."""
         wait_for(lambda: (self.answered(name)["epoch"] or 0) > epoch)  # type: ignore[operator]
         before = self.frames(name)
         wait_for(lambda: self.frames(name) > before)
@@ -154,7 +154,7 @@ class Installation:
 def started(
     folder: Path, *options: str, rooms: Sequence[str] = ROOMS, slots: int = 2, log: Path | None = None
 ) -> Iterator[Installation]:
-    """Run rooms of one node in so many slots, until the first two show pictures; nothing of it is left afterwards.
+    """Runs rooms of one node in so many slots, until the first two show pictures; nothing of it is left afterwards.
 
     Raises:
         DeltalightError: no picture comes, or a process outlives it.
@@ -180,7 +180,7 @@ def _without_memory(scene: SceneDocument) -> SceneDocument:
 
 @contextmanager
 def installed(folder: Path, *options: str, log: Path | None = None) -> Iterator[Installation]:
-    """Run the rooms of `folder`/rooms.yaml; nothing is left afterwards. What they write goes to `log` if it is given.
+    """Runs the rooms of `folder`/rooms.yaml; nothing is left afterwards. What they write goes to `log`, if given.
 
     Raises:
         DeltalightError: a process outlives it, or it ends otherwise than told to.
@@ -223,7 +223,7 @@ def _end(process: subprocess.Popen[bytes], found: Installation) -> None:
 
 
 def settled(installation: Installation, name: str) -> bytes:
-    """Return the room's picture of its scene's newest revision, once it is the same three times in a row.
+    """Returns the room's picture of its scene's newest revision, once it is the same three times in a row.
 
     Raises:
         DeltalightError: it never is.

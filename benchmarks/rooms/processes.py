@@ -17,7 +17,7 @@ SERVER_COMMAND = "server"
 
 
 def wait_for(condition: Callable[[], bool], what: str = "What was waited for") -> None:
-    """Wait until a condition holds; requests that are not answered meanwhile are made again.
+    """Waits until a condition holds; requests that are not answered meanwhile are made again.
 
     Raises:
         DeltalightError: it does not within `PATIENCE_S`.
@@ -41,7 +41,7 @@ def is_gone(process: psutil.Process) -> bool:
 
 
 def wait_until_idle(process: psutil.Process, quiet_s: float = SHORT_S) -> None:
-    """Wait until a process has done what it had to do: all its threads sleep, and it takes no processor time.
+    """Waits until a process has done what it had to do: all its threads sleep, and it takes no processor time.
 
     Raises:
         DeltalightError: it never rests for `quiet_s`.
@@ -76,7 +76,7 @@ def listens_at(process: psutil.Process, port: int) -> bool:
 
 
 def children_of(process: psutil.Process) -> list[psutil.Process]:
-    """Return all processes below one; none of one that is gone."""
+    """Returns all processes below one; none of one that is gone."""
     with suppress(psutil.NoSuchProcess):
         return list(process.children(recursive=True))
     return []

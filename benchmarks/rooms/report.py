@@ -24,7 +24,7 @@ class RoomsReport(StrictModel):
 
 
 def all_figures(acts: Mapping[str, Mapping[str, Act]], records: Sequence[ActRecord]) -> list[Figure]:
-    """Return the table of `acts`, by placer and name: gaps, and what has to hold each time, 1 = it did."""
+    """Returns the table of `acts`, by placer and name: gaps, and what has to hold each time, 1 = it did."""
     figures = []
     for placer, of_placer in acts.items():
         own = [each for each in records if each.placer == placer]
@@ -43,7 +43,7 @@ def all_figures(acts: Mapping[str, Mapping[str, Act]], records: Sequence[ActReco
 
 
 def markdown(report: RoomsReport) -> str:
-    """Return the report as a page."""
+    """Returns the report as a page."""
     lines = [
         "# Rooms",
         "",

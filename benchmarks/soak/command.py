@@ -53,7 +53,7 @@ class _Log:
 
 
 def run_soak(job: SoakJob, out: Path, say: Say) -> SoakReport:
-    """Soak, and write soak.json, soak.md and soak.svg into the folder `out`.
+    """Soaks, and writes soak.json, soak.md and soak.svg into the folder `out`.
 
     Raises:
         DeltalightError: this is no Linux, no picture came, or it did not come back after a fault.
@@ -68,7 +68,7 @@ def run_soak(job: SoakJob, out: Path, say: Say) -> SoakReport:
 
 
 def soak(job: SoakJob, say: Say) -> SoakReport:
-    """Run a station under faults and report.
+    """Runs a station under faults and reports.
 
     Raises:
         DeltalightError: as `run_soak`.
@@ -112,7 +112,7 @@ def soak(job: SoakJob, say: Say) -> SoakReport:
 
 
 def _put_to_faults(job: SoakJob, run: Run, log: _Log, say: Say) -> None:
-    """Run rounds of all faults, each round in an order of its own, until time is up; the first round is whole."""
+    """Runs rounds of all faults, each round in an order of its own, until time is up; the first round is whole."""
     ends_s, number = log.began_s + job.seconds, 0
     _rest(run, log)
     while True:
@@ -137,7 +137,7 @@ def _put_to_faults(job: SoakJob, run: Run, log: _Log, say: Say) -> None:
 
 
 def _rest(run: Run, log: _Log) -> None:
-    """Leave the station alone for a while."""
+    """Leaves the station alone for a while."""
     began_s = time.monotonic()
     time.sleep(run.profile.calm_s)
     run.station.check()
@@ -166,14 +166,14 @@ def _wait(station: Station, condition: Callable[[], bool], otherwise: str) -> No
 
 
 def renderer_of(client: httpx.Client, nodes: str = "/nodes") -> str:
-    """Return what the render server that reports to a web process renders with."""
+    """Returns what the render server that reports to a web process renders with."""
     known = client.get(nodes).raise_for_status().json()
     detail = next((each["detail"] for each in known if each["kind"] == "render_server"), "")
     return str(detail).partition("; ")[0]  # remarks about faults and cameras follow
 
 
 def _orphans(ids: set[int]) -> int:
-    """Return how many processes are still there; each has a moment to end."""
+    """Returns how many processes are still there; each has a moment to end."""
     deadline_s = time.monotonic() + END_TIMEOUT_S
     while (
         left := [each for each in ids if Path(f"/proc/{each}").exists()]
@@ -183,5 +183,5 @@ def _orphans(ids: set[int]) -> int:
 
 
 def print_report(report: SoakReport, out: Path) -> None:
-    """Print the figures as a table, and where the files are."""
+    """Prints the figures as a table, and where the files are."""
     print_figures("Soak", report.figures, f"The report is in {out}: soak.json, soak.md, {PLOT}")

@@ -54,7 +54,7 @@ class Flow:
     def of(
         cls, seen: Sequence[Seen], began_s: float, ended_s: float, cameras: Sequence[str] = ("",)
     ) -> "Flow":
-        """Describe pictures of some cameras that came between two moments."""
+        """Describes pictures of some cameras that came between two moments."""
         came_s = {name: [each.at_s for each in seen if each.camera == name] for name in cameras}
         gaps_s = [np.max(np.diff([began_s, *own, ended_s])) for own in came_s.values()]
         ages = [each.age_ms for each in seen]
@@ -89,28 +89,28 @@ class Crowd:
             thread.start(self._measure(camera))
 
     def pictures(self) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
-        """Return the pixels of each camera's newest picture; a camera that has sent none is missing."""
+        """Returns the pixels of each camera's newest picture; a camera that has sent none is missing."""
         with self._lock:
             newest = {name: jpeg for name, (_, jpeg) in self._newest.items()}
         pixels = {name: cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1) for name, jpeg in newest.items()}
         return {name: each.astype(np.uint8) for name, each in pixels.items() if each is not None}
 
     def between(self, began_s: float, ended_s: float) -> list[Seen]:
-        """Return the pictures that came in a span of the monotonic clock."""
+        """Returns the pictures that came in a span of the monotonic clock."""
         with self._lock:
             return [each for each in self.seen if began_s <= each.at_s < ended_s]
 
     def flow(self, began_s: float, ended_s: float) -> Flow:
-        """Describe the pictures that came in a span of the monotonic clock."""
+        """Describes the pictures that came in a span of the monotonic clock."""
         return Flow.of(self.between(began_s, ended_s), began_s, ended_s, self.cameras)
 
     def join(self, behaviour: str) -> Callable[[], None]:
-        """Add a viewer of BEHAVIOURS; return what makes it leave."""
+        """Adds a viewer of BEHAVIOURS; returns what makes it leave."""
         task = self._thread.start(_visit(self._address, BEHAVIOURS[behaviour]))
         return lambda: self._thread.cancel(task)
 
     def come_and_go(self, viewers: int, seed: int) -> Callable[[], None]:
-        """Have so many viewers at a time join and leave at random; return what makes all leave."""
+        """Has so many viewers at a time join and leave at random; returns what makes all leave."""
         dice = Random(seed)
         visits = [self._thread.start(_visits(self._address, Random(dice.random()))) for _ in range(viewers)]
 

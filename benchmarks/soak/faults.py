@@ -56,7 +56,7 @@ class Fault(ABC):
 
     @abstractmethod
     def run(self, run: Run) -> Outcome:
-        """Do it and wait until the station has recovered; return figures.
+        """Does it and waits until the station has recovered; returns figures.
 
         Raises:
             DeltalightError: the picture did not come back.
@@ -77,7 +77,7 @@ class Kill(Fault):
     process: str
 
     def run(self, run: Run) -> Outcome:
-        """Do it, and wait for a picture captured later."""
+        """Does it, and waits for a picture captured later."""
         station = run.station
         name = _chosen(self.process, run)
         documents, pictures = _documents(station), _pictures(run)
@@ -106,7 +106,7 @@ class Stop(Fault):
     process: str
 
     def run(self, run: Run) -> Outcome:
-        """Do it, and wait for a picture captured after it went on."""
+        """Does it, and waits for a picture captured after it went on."""
         name = _chosen(self.process, run)
         process_id = run.station.process_id(name)
         os.kill(process_id, signal.SIGSTOP)
@@ -129,7 +129,7 @@ class Viewers(Fault):
     """Viewers that are slow, silent or never acknowledge; others' rate and age before, meanwhile and after."""
 
     def run(self, run: Run) -> Outcome:
-        """Have one of each watch for a while."""
+        """Has one of each watch for a while."""
         with _compared(run, calm_s=run.profile.load_s) as outcome:
             leave = [run.crowd.join(behaviour) for behaviour in BEHAVIOURS]
             time.sleep(run.profile.load_s)
@@ -143,7 +143,7 @@ class Churn(Fault):
     """Many viewers that join and leave; others' rate and age before, meanwhile and after."""
 
     def run(self, run: Run) -> Outcome:
-        """Have them do so for a while."""
+        """Has them do so for a while."""
         with _compared(run, calm_s=run.profile.churn_s) as outcome:
             leave = run.crowd.come_and_go(run.profile.viewers, run.dice.randrange(2**32))
             time.sleep(run.profile.churn_s)
@@ -156,7 +156,7 @@ class Nonsense(Fault):
     """A node that sends mutated messages; others' rate and age before, meanwhile and after."""
 
     def run(self, run: Run) -> Outcome:
-        """Have it send for a while."""
+        """Has it send for a while."""
         with _compared(run, calm_s=run.profile.load_s) as outcome:
             sent = send_nonsense(run.station.places.stranger, run.profile.load_s, run.dice)
         return {"sent": sent, **outcome}
@@ -169,7 +169,7 @@ class BadLink(Fault):
     shape: str
 
     def run(self, run: Run) -> Outcome:
-        """Have it so for a while."""
+        """Has it so for a while."""
         profile, shape, seed = run.profile, SHAPES[self.shape], run.dice.randrange(2**32)
         with _compared(run) as outcome:
             try:
@@ -187,7 +187,7 @@ class Cut(Fault):
     """All links are cut for 5 s: how soon after that the picture is back; the links of peers are cut, too."""
 
     def run(self, run: Run) -> Outcome:
-        """Do it, wait for a picture captured after it, and then until the peers have sent for a while."""
+        """Does it, waits for a picture captured after it, and then until the peers have sent for a while."""
         seed = run.dice.randrange(2**32)
         with _compared(run) as outcome, ThreadPoolExecutor(1) as pool:
             peers = pool.submit(peers_on, run.thread, None, run.profile, seed, cut_s=CUT_S)
@@ -219,7 +219,7 @@ class KilledRecorder(Fault):
     """SIGKILL of a recorder of the first node: how much is lost, and whether the file can be closed."""
 
     def run(self, run: Run) -> Outcome:
-        """Do it."""
+        """Does it."""
         return kill_recorder(run.station.places.nodes[0], run.dice)
 
 
@@ -243,7 +243,7 @@ FAULTS: dict[str, Fault] = {
 
 
 def parse_faults(text: str) -> list[str]:
-    """Return names of FAULTS: of `all`, `none`, or names separated by commas.
+    """Returns names of FAULTS: of `all`, `none`, or names separated by commas.
 
     Raises:
         DeltalightError: there is no such fault.
@@ -260,7 +260,7 @@ def parse_faults(text: str) -> list[str]:
 
 @contextmanager
 def _compared(run: Run, *, calm_s: float = 0.0) -> Iterator[Outcome]:
-    """Yield an outcome that holds, after the block, the flow of pictures before it and during it.
+    """Yields an outcome that holds, after the block, the flow of pictures before it and during it.
 
     With `calm_s`, that before is of so many seconds, and there is one of as many after it: the rate wanders without
     any fault, and how far shows in what two calm spans differ by.
@@ -278,7 +278,7 @@ def _compared(run: Run, *, calm_s: float = 0.0) -> Iterator[Outcome]:
 
 
 def _until_spare(run: Run, name: str) -> Outcome:
-    """Wait until the next spare of a process is ready; return how long that took, and the flow meanwhile."""
+    """Waits until the next spare of a process is ready; returns how long that took, and the flow meanwhile."""
     if not run.profile.spare_s:
         return {}
     began_s = time.monotonic()
@@ -319,7 +319,7 @@ def _reports(station: Station, topic: str, after_s: float) -> bool:
 
 
 def _documents(station: Station) -> tuple[object, object]:
-    """Return the scene that is stored and the one that is rendered."""
+    """Returns the scene that is stored and the one that is rendered."""
     stored = station.client.get("/active-scene").raise_for_status().json()["document"]
     client = RequestClient(ports.endpoint(station.places.control))
     try:
@@ -337,7 +337,7 @@ def _pictures(run: Run) -> Pictures:
 
 
 def _settled_difference(run: Run, before: Pictures) -> float | None:
-    """Return the greatest mean difference of codes from the pictures before, once it is small or time is up.
+    """Returns the greatest mean difference of codes from the pictures before, once it is small or time is up.
 
     None where the camera moves.
     """

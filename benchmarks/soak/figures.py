@@ -52,7 +52,7 @@ class Soaked:
 
 
 def all_figures(soaked: Soaked) -> list[Figure]:
-    """Return the table; what was not measured is left out."""
+    """Returns the table; what was not measured is left out."""
     outcomes = _Outcomes(soaked.faults)
     lost_s = outcomes.of("kill-recorder", "lost_s")
     figures = [
@@ -77,7 +77,7 @@ class _Outcomes:
         self._faults = faults
 
     def of(self, name: str, *path: str) -> list[float]:
-        """Return the values at a path of all faults of that name; those that are None are left out."""
+        """Returns the values at a path of all faults of that name; those that are None are left out."""
         found = []
         for fault in self._faults:
             value: Any = fault.outcome if fault.name == name else None
@@ -212,7 +212,7 @@ def _flow_figures(outcomes: _Outcomes, path: tuple[str, str], what: str) -> list
 def all_courses(
     samples: Sequence[Sample], seen: Sequence[Seen], names: Sequence[str], cameras: Sequence[str]
 ) -> dict[str, dict[str, list[float | None]]]:
-    """Return what is plotted, by panel and line, at the times of the samples."""
+    """Returns what is plotted, by panel and line, at the times of the samples."""
     flows = [Flow.of(own, *span, cameras) for span, own in _by_sample(samples, seen)]
 
     def of_each(read: Callable[[ProcessSample], float]) -> dict[str, list[float | None]]:
@@ -244,7 +244,7 @@ def _rounded(values: Iterable[float | None]) -> list[float | None]:
 def _by_sample(
     samples: Sequence[Sample], seen: Sequence[Seen]
 ) -> Iterable[tuple[tuple[float, float], list[Seen]]]:
-    """Yield the span that ends with each sample, and the pictures in it."""
+    """Yields the span that ends with each sample, and the pictures in it."""
     number = 0
     for before, sample in zip([None, *samples], samples, strict=False):
         began_s = sample.at_s - 1.0 if before is None else before.at_s

@@ -56,7 +56,7 @@ class Schedule:
     _left_s: float = 0.0
 
     def leaves_s(self, now_s: float, size: int, shape: Shape | None) -> float:
-        """Return when `size` bytes that enter now have left.
+        """Returns when `size` bytes that enter now have left.
 
         A lost segment holds up all that is behind it: it is sent again once that is noticed, after a round trip; if
         it is lost once more, after a timeout, which doubles each time. An overtaken one holds up for its longer way.
@@ -75,12 +75,12 @@ class Schedule:
         return self._left_s
 
     def _losses(self, probability: float) -> int:
-        """Return how often a segment is lost before it arrives."""
+        """Returns how often a segment is lost before it arrives."""
         return next((count for count in range(MOST_LOSSES) if self.dice.random() >= probability), MOST_LOSSES)
 
 
 def held_up_s(losses: int, shape: Shape) -> float:
-    """Return how long a segment that was lost so often holds up those behind it."""
+    """Returns how long a segment that was lost so often holds up those behind it."""
     if losses == 0:
         return 0.0
     round_trip_s = 2 * shape.delay_s
@@ -100,13 +100,13 @@ class Link:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def cut(self, is_cut: bool) -> None:
-        """Let nothing through, as a cable that is drawn, or everything again (any thread)."""
+        """Lets nothing through, as a cable that is drawn, or everything again (any thread)."""
         change = self._uncut.clear if is_cut else self._uncut.set
         if self._loop is not None:
             self._loop.call_soon_threadsafe(change)
 
     async def serve(self) -> None:
-        """Forward until cancelled."""
+        """Forwards until cancelled."""
         self._loop = asyncio.get_running_loop()
         server = await asyncio.start_server(self._forward, LOOPBACK, self.port)
         async with server:
@@ -124,7 +124,7 @@ class Link:
             writer.close()
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        """Connect to the node with a small buffer here: what waits in the kernel would add to the link's delay."""
+        """Connects to the node with a small buffer here: what waits in the kernel would add to the link's delay."""
         end = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         end.setblocking(False)
         end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVED_BYTES)
@@ -172,7 +172,7 @@ class LoopThread:
         self.loop.close()
 
     def start(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
-        """Start a coroutine in the loop (any thread)."""
+        """Starts a coroutine in the loop (any thread)."""
 
         async def started() -> "asyncio.Task[None]":
             return asyncio.create_task(work)
@@ -180,7 +180,7 @@ class LoopThread:
         return asyncio.run_coroutine_threadsafe(started(), self.loop).result(10.0)
 
     def cancel(self, task: "asyncio.Task[None]") -> None:
-        """Cancel what `start` returned (any thread)."""
+        """Cancels what `start` returned (any thread)."""
         self.loop.call_soon_threadsafe(task.cancel)
 
 

@@ -12,7 +12,7 @@ PER_S = 200.0
 
 
 def send_nonsense(port: int, seconds: float, dice: Random) -> int:
-    """Publish mutated messages at a loopback port for a while; return how many were sent."""
+    """Publishes mutated messages at a loopback port for a while; returns how many were sent."""
     publisher = Publisher(ports.endpoint(port))
     known, sent, began_s = known_messages(), 0, time.monotonic()
     try:
@@ -26,7 +26,7 @@ def send_nonsense(port: int, seconds: float, dice: Random) -> int:
 
 
 def mutated(dice: Random, pieces: list[bytes]) -> list[bytes]:
-    """Return a multipart with bytes changed, inserted, left out, or repeated, but its topic kept: others drop it."""
+    """Returns a multipart with bytes changed, inserted, left out, or repeated, but its topic kept: others drop it."""
     pieces = list(pieces)
     for _ in range(dice.randint(1, 4)):
         at = dice.randrange(1, len(pieces))
@@ -46,7 +46,7 @@ def mutated(dice: Random, pieces: list[bytes]) -> list[bytes]:
 
 
 def known_messages() -> list[list[bytes]]:
-    """Return one message of each of some streams, of a node `stranger`."""
+    """Returns one message of each of some streams, of a node `stranger`."""
     own: dict[str, object] = {"node": "stranger", "capture_ns": time.time_ns(), "frame_id": 7}
     camera = {"width": 8, "height": 6, "matrix": [8.0, 0.0, 3.5, 0.0, 8.0, 2.5, 0.0, 0.0, 1.0]}
     camera |= {"distortion_model": "plumb_bob", "distortion": [0.0] * 5}

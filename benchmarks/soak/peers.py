@@ -40,15 +40,15 @@ class _Peer(ABC):
 
     @abstractmethod
     def send(self, message: list[bytes]) -> None:
-        """Send a message."""
+        """Sends a message."""
 
     @abstractmethod
     def receive(self) -> bytes | None:
-        """Return the time stamp of a message; None if none came for a moment."""
+        """Returns the time stamp of a message; None if none came for a moment."""
 
     @abstractmethod
     def close(self) -> None:
-        """Close both ends."""
+        """Closes both ends."""
 
 
 class Newest(_Peer):
@@ -59,16 +59,16 @@ class Newest(_Peer):
         self._receiver = Receiver([ports.endpoint(link_port)], [TOPIC.decode()])
 
     def send(self, message: list[bytes]) -> None:
-        """Send a message."""
+        """Sends a message."""
         self._publisher.send(message)
 
     def receive(self) -> bytes | None:
-        """Return the time stamp of the newest message."""
+        """Returns the time stamp of the newest message."""
         taken = self._receiver.latest(POLL_S)
         return None if taken is None else bytes(taken[TOPIC.decode()][1])
 
     def close(self) -> None:
-        """Close both ends."""
+        """Closes both ends."""
         self._receiver.close()
         self._publisher.close()
 
@@ -85,15 +85,15 @@ class Queued(_Peer):
         self._receiver.connect(ports.endpoint(link_port))
 
     def send(self, message: list[bytes]) -> None:
-        """Send a message."""
+        """Sends a message."""
         self._sender.send_multipart(message)
 
     def receive(self) -> bytes | None:
-        """Return the time stamp of the oldest message."""
+        """Returns the time stamp of the oldest message."""
         return self._receiver.recv_multipart()[1] if self._receiver.poll(round(1e3 * POLL_S)) else None
 
     def close(self) -> None:
-        """Close both ends."""
+        """Closes both ends."""
         self._context.destroy(0)
 
 
@@ -103,7 +103,7 @@ PEERS: dict[str, Callable[[int, int], _Peer]] = {"newest": Newest, "queued": Que
 def peers_on(
     thread: LoopThread, shape: Shape | None, profile: Profile, seed: int, *, cut_s: float = 0.0
 ) -> dict[str, Flow]:
-    """Have both send over links of a shape for the profile's time of load; return how messages flowed, by PEERS.
+    """Has both send over links of a shape for the profile's time of load; returns how messages flowed, by PEERS.
 
     Before that, they send for `cut_s` into links that are cut.
     """
@@ -125,7 +125,7 @@ def measure_peer(
     *,
     cut_s: float,
 ) -> Flow:
-    """Send messages for a while; `load` is their size in bytes, how many a second, and for how many seconds.
+    """Sends messages for a while; `load` is their size in bytes, how many a second, and for how many seconds.
 
     The link is cut for the first `cut_s` of these.
 
@@ -165,7 +165,7 @@ def _meet(pair: _Peer) -> None:
 
 @contextmanager
 def _cut(link: Link, seconds: float) -> Iterator[None]:
-    """Cut a link for the first seconds of a block, which lasts longer."""
+    """Cuts a link for the first seconds of a block, which lasts longer."""
     link.cut(seconds > 0)
     mending = threading.Timer(seconds, link.cut, (False,))
     mending.start()
@@ -178,7 +178,7 @@ def _cut(link: Link, seconds: float) -> Iterator[None]:
 
 @contextmanager
 def _receiving(pair: _Peer, seen: list[Seen]) -> Iterator[None]:
-    """Note what comes, in a thread, during the block."""
+    """Notes what comes, in a thread, during the block."""
     ending = threading.Event()
 
     def note() -> None:
@@ -199,7 +199,7 @@ def _receiving(pair: _Peer, seen: list[Seen]) -> Iterator[None]:
 
 @cache
 def message_bytes(size: tuple[int, int]) -> int:
-    """Return what colour and depth of one frame of a node take, coded as nodes do; `size` in pixels."""
+    """Returns what colour and depth of one frame of a node take, coded as nodes do; `size` in pixels."""
     frame = resized(RecordingReader(RECORDING)[0], size)
     depth = frame.depth
     coded = b"" if depth is None else encode_depth(depth.depth_m, depth.valid)

@@ -19,7 +19,7 @@ ROWS, A_ROW = 3, 14  # lines of names of faults, and names in one
 
 
 def draw_soak(report: SoakReport) -> str:
-    """Draw the courses of a report as text of an SVG file."""
+    """Draws the courses of a report as text of an SVG file."""
     panels = list(report.courses.items())
     bottom = TOP + len(panels) * (HEIGHT + GAP)
     svg = new_svg("Soak", (WIDTH, bottom))
@@ -52,7 +52,7 @@ class _Axes:
 
 
 def _name_faults(svg: ElementTree.Element, faults: Sequence[FaultRecord], axes: _Axes) -> None:
-    """Number the bands above the first panel, and list their names."""
+    """Numbers the bands above the first panel, and lists their names."""
     free = -math.inf
     for number, fault in enumerate(faults, start=1):
         x = axes.x(fault.began_s)
@@ -91,7 +91,7 @@ def _draw_ticks(svg: ElementTree.Element, axes: _Axes) -> None:
 
 
 def known_runs(values: Sequence[float | None]) -> list[list[int]]:
-    """Return the indices of known values, a list for each run; the usual step from one to the next ends none."""
+    """Returns the indices of known values, a list for each run; the usual step from one to the next ends none."""
     known = [index for index, value in enumerate(values) if value is not None]
     steps = sorted(later - earlier for earlier, later in pairwise(known))
     usual = steps[(len(steps) - 1) // 2] if steps else 1
@@ -119,7 +119,7 @@ def _path(svg: ElementTree.Element, runs: Sequence[Sequence[Point]], color: str)
 
 
 def nice_ceiling(value: float) -> float:
-    """Return the least of 1, 2, 5 times a power of ten that is no less than a value; 1 for none above 0."""
+    """Returns the least of 1, 2, 5 times a power of ten that is no less than a value; 1 for none above 0."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

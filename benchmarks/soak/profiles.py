@@ -87,7 +87,7 @@ PROFILES = {
 
 
 def choose_profile(name: str) -> Profile:
-    """Return a profile by its name.
+    """Returns a profile by its name.
 
     Raises:
         DeltalightError: there is none of that name.

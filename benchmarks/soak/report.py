@@ -75,7 +75,7 @@ class Bar:
 def worst(
     what: str, how: str, values: Sequence[float], bar: Bar, unit: str, *, smallest: bool = False
 ) -> Figure | None:
-    """Return the figure of the greatest of some values (or the smallest), with their range; None of none."""
+    """Returns the figure of the greatest of some values (or the smallest), with their range; None of none."""
     if not values:
         return None
     low, high = min(values), max(values)
@@ -90,7 +90,7 @@ def worst(
 
 
 def markdown(report: SoakReport, plot: str) -> str:
-    """Return the report as a page; `plot` is the name of the picture beside it."""
+    """Returns the report as a page; `plot` is the name of the picture beside it."""
     lines = [
         "# Soak",
         "",
@@ -110,13 +110,13 @@ def markdown(report: SoakReport, plot: str) -> str:
 
 
 def figure_rows(figures: Sequence[Figure]) -> list[str]:
-    """Return the lines of a table of figures, in Markdown."""
+    """Returns the lines of a table of figures, in Markdown."""
     head = ["| figure | how tested (times) | result | bar | met |", "|---|---|---|---|---|"]
     return [*head, *(_row(each) for each in figures)]
 
 
 def print_figures(title: str, figures: Sequence[Figure], where: str) -> None:
-    """Print a table of figures, and `where` the files are."""
+    """Prints a table of figures, and `where` the files are."""
     from rich.console import Console
     from rich.table import Table
 
@@ -134,7 +134,7 @@ def _row(figure: Figure) -> str:
 
 
 def _number(value: float) -> str:
-    """Return three significant digits, or all before the point."""
+    """Returns three significant digits, or all before the point."""
     return f"{value:.0f}" if abs(value) >= LARGE else f"{value:.3g}"
 
 
@@ -149,6 +149,6 @@ def _outcome(values: Mapping[str, Any]) -> str:
 
 
 def period_bar(profile: Profile) -> Bar:
-    """Return the bar of ages: two periods of a node."""
+    """Returns the bar of ages: two periods of a node."""
     limit_ms = 2 * profile.period_ms
     return Bar(f"< {limit_ms:.0f} ms (2 periods)", lambda value: value < limit_ms)

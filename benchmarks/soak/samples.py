@@ -48,7 +48,7 @@ class Sample:
 
 
 def read_process(process_id: int) -> ProcessSample:
-    """Return what /proc says (Linux).
+    """Returns what /proc says (Linux).
 
     Raises:
         OSError: there is no such process, or no /proc.
@@ -60,7 +60,7 @@ def read_process(process_id: int) -> ProcessSample:
 
 
 def processor_time_s(process_id: int) -> float:
-    """Return the processor time that a process used since its start, all threads together (/proc).
+    """Returns the processor time that a process used since its start, all threads together (/proc).
 
     Raises:
         OSError: there is no such process, or no /proc.
@@ -70,7 +70,7 @@ def processor_time_s(process_id: int) -> float:
 
 
 def require_proc(command: str) -> None:
-    """Check that a command can examine processes.
+    """Checks that a command can examine processes.
 
     Raises:
         DeltalightError: this is no Linux.
@@ -145,7 +145,7 @@ class Sampler:
 
 
 def parse_drops(lines: Sequence[str]) -> dict[str, int]:
-    """Return what all processes lost, by cause, of the text of `/metrics`."""
+    """Returns what all processes lost, by cause, of the text of `/metrics`."""
     found: dict[str, int] = {}
     for line in lines:
         if line.startswith(DROPS):
@@ -156,14 +156,14 @@ def parse_drops(lines: Sequence[str]) -> dict[str, int]:
 
 
 def of_process(samples: Sequence[Sample], name: str) -> list[tuple[float, ProcessSample]]:
-    """Return the samples of one process with their times."""
+    """Returns the samples of one process with their times."""
     return [(each.at_s, each.processes[name]) for each in samples if name in each.processes]
 
 
 def steady_spans(
     samples: Sequence[Sample], is_calm: Callable[[float], bool], settle_s: float
 ) -> list[tuple[str, list[Sample]]]:
-    """Return the calm samples of each process by its name: one list for each id, without its first `settle_s`."""
+    """Returns the calm samples of each process by its name: one list for each id, without its first `settle_s`."""
     spans: dict[tuple[str, int], list[Sample]] = {}
     began: dict[tuple[str, int], float] = {}
     for sample in samples:
@@ -176,7 +176,7 @@ def steady_spans(
 
 
 def objects_of_server(samples: Sequence[Sample], settle_s: float) -> list[list[int]]:
-    """Return the numbers of GL objects of each render server after its first `settle_s`, if there are two or more."""
+    """Returns the numbers of GL objects of each render server after its first `settle_s`, if two or more."""
     spans = steady_spans(samples, lambda _at_s: True, settle_s)
     servers = [span for name, span in spans if name == SERVER]
     counts = [[each.gl_objects for each in span if each.gl_objects is not None] for span in servers]

@@ -20,7 +20,7 @@ class _Spare:
     used: deque[tuple[float, float]] = field(default_factory=deque)
 
     def is_quiet(self, now_s: float) -> bool:
-        """Look at it, and return whether it has been quiet for long enough."""
+        """Looks at it, and returns whether it has been quiet for long enough."""
         self.used.append((now_s, processor_time_s(self.process_id)))
         while len(self.used) > 1 and self.used[1][0] <= now_s - QUIET_S:
             self.used.popleft()
@@ -29,7 +29,7 @@ class _Spare:
 
 
 def wait_for_spare(station: Station, name: str, patience_s: float) -> float | None:
-    """Wait until the spare of a process has nothing left to prepare; return the seconds until then.
+    """Waits until the spare of a process has nothing left to prepare; returns the seconds until then.
 
     It has not while it uses the processor. None once so much time is up without.
     """

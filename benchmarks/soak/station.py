@@ -53,7 +53,7 @@ class Ports:
 
     @classmethod
     def private(cls, nodes: int) -> "Ports":
-        """Choose free ones."""
+        """Chooses free ones."""
         found = ports.private_ports(2 * nodes + 4)
         return cls(found[:nodes], found[nodes : 2 * nodes], *found[2 * nodes :])
 
@@ -79,11 +79,11 @@ class Station:
         )
 
     def start(self) -> None:
-        """Start to watch the processes."""
+        """Starts to watch the processes."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop watching them, before their supervisor ends them."""
+        """Stops watching them, before their supervisor ends them."""
         self._ending.set()
         self._thread.join()
         self.client.close()
@@ -99,28 +99,28 @@ class Station:
         return [*self.node_names, SERVER, WEB]
 
     def process_id(self, name: str) -> int:
-        """Return the id of the process of that name which was started last."""
+        """Returns the id of the process of that name which was started last."""
         return self._supervisor.process_ids()[name]
 
     def spare_id(self, name: str) -> int | None:
-        """Return the id of the spare that waits to take the place of a process, None if there is none."""
+        """Returns the id of the spare that waits to take the place of a process, None if there is none."""
         return self._supervisor.spare_ids().get(name)
 
     def restarts(self) -> dict[str, int]:
-        """Return how often each process was started again."""
+        """Returns how often each process was started again."""
         return self._supervisor.restarts()
 
     def deaths(self) -> dict[str, int]:
-        """Return how often each process died that nobody killed."""
+        """Returns how often each process died that nobody killed."""
         return {name: count - self.kills.get(name, 0) for name, count in self.restarts().items()}
 
     def kill(self, name: str) -> None:
-        """Kill a process at once (SIGKILL)."""
+        """Kills a process at once (SIGKILL)."""
         self.kills[name] = self.kills.get(name, 0) + 1
         os.kill(self.process_id(name), signal.SIGKILL)
 
     def check(self) -> None:
-        """Raise what ended the supervisor.
+        """Raises what ended the supervisor.
 
         Raises:
             DeltalightError: a process refused its input.
@@ -142,7 +142,7 @@ class Station:
 
 @contextmanager
 def running_station(profile: Profile, thread: LoopThread, seed: int) -> Iterator[Station]:
-    """Start a station with a data folder of its own; all of it ends with the block.
+    """Starts a station with a data folder of its own; all of it ends with the block.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or no free ports.
@@ -175,7 +175,7 @@ def running_station(profile: Profile, thread: LoopThread, seed: int) -> Iterator
 def write_take(
     path: Path, size: tuple[int, int], frames_per_s: float, frames: Sequence[int] = STANDING
 ) -> None:
-    """Write what the nodes replay: frames of the demo in which nothing moves but noise, at another size and rate.
+    """Writes what the nodes replay: frames of the demo in which nothing moves but noise, at another size and rate.
 
     Pictures before and after a fault can be compared. `frames` are their numbers in the demo's recording.
 
@@ -192,7 +192,7 @@ def write_take(
 
 
 def resized(frame: SensorFrame, size: tuple[int, int]) -> SensorFrame:
-    """Return a frame whose colour and registered depth have another size (width, height, pixels)."""
+    """Returns a frame whose colour and registered depth have another size (width, height, pixels)."""
     camera, depth = frame.camera.resized(*size), frame.depth
     color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
     if depth is not None:
@@ -201,7 +201,7 @@ def resized(frame: SensorFrame, size: tuple[int, int]) -> SensorFrame:
 
 
 def soaked_scene(profile: Profile) -> SceneDocument:
-    """Return the demo's scene as the profile changes it."""
+    """Returns the demo's scene as the profile changes it."""
     scene = demo_scene("dvct")
     document = scene.model_dump(mode="json")
     document["method"] |= profile.method
@@ -211,7 +211,7 @@ def soaked_scene(profile: Profile) -> SceneDocument:
 
 
 def source_of(profile: Profile, folder: Path) -> tuple[str, Path]:
-    """Return what the nodes show, and the configuration file of all processes."""
+    """Returns what the nodes show, and the configuration file of all processes."""
     if not profile.is_synthetic:
         take = folder / "take.mcap"
         write_take(take, profile.size, profile.frames_per_s)
@@ -223,7 +223,7 @@ def source_of(profile: Profile, folder: Path) -> tuple[str, Path]:
 
 
 def _specs(places: Ports, plan: HostPlan) -> list[ChildSpec]:
-    """Return the nodes, the render server, which reads them all, and the web process."""
+    """Returns the nodes, the render server, which reads them all, and the web process."""
     plan = replace(
         plan,
         node_port=places.links[0],
@@ -251,5 +251,5 @@ def _node(plan: HostPlan, number: int, port: int) -> ChildSpec:
 
 
 def camera_of(node_name: str) -> str:
-    """Return the name in a node's topics, which is also that of its camera, by the name of its process."""
+    """Returns the name in a node's topics, which is also that of its camera, by the name of its process."""
     return node_name.replace(" ", "")

@@ -21,7 +21,7 @@ RECORDED_S = (1.0, 4.0)  # the least and the most before the kill
 
 
 def kill_recorder(node_port: int, dice: Random) -> dict[str, Any]:
-    """Record a node, kill the recorder at a random moment, close its file and compare.
+    """Records a node, kills the recorder at a random moment, closes its file and compares.
 
     `lost_s` runs from the last frame's capture to the kill, so that one period of the node is part of it.
 

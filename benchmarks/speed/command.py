@@ -22,13 +22,13 @@ from deltalight.protocol.files import write_bytes
 
 
 def run_speed(job: SpeedJob, budget_ms: float, *, end_to_end: bool, out: Path | None, as_json: bool) -> None:
-    """Measure, write the report to `out` if given after every motion, and print it, also if it is stopped before."""
+    """Measures, writes the report to `out` if given after every motion, and prints it, also if stopped before."""
     with _kept(out, as_json=as_json) as keep, _progress() as progress:
         measure_speed(job, budget_ms, progress, keep, end_to_end=end_to_end)
 
 
 def run_roofline(job: RooflineJob, *, out: Path | None, as_json: bool) -> None:
-    """Count, write the report to `out` if given after every motion, and print it, also if it is stopped before."""
+    """Counts, writes the report to `out` if given after every motion, and prints it, also if it is stopped before."""
     with _kept(out, as_json=as_json) as keep, _progress() as progress:
         count_roofline(job, progress, keep)
 
@@ -63,7 +63,7 @@ def _print_speed(report: SpeedReport, *, as_json: bool) -> None:
 
 
 def run_counts(job: SpeedJob, *, gpu_paths: bool, out: Path | None, as_json: bool) -> None:
-    """Count, write the report to `out` if given, and print it."""
+    """Counts, writes the report to `out` if given, and prints it."""
     with _progress() as progress:
         report = count_frames(job, progress, gpu_paths=gpu_paths)
     put_report(
@@ -72,7 +72,7 @@ def run_counts(job: SpeedJob, *, gpu_paths: bool, out: Path | None, as_json: boo
 
 
 def run_kernels(job: SpeedJob, *, out: Path | None, as_json: bool) -> None:
-    """Time kernels one by one, write the report to `out` if given, and print it."""
+    """Times kernels one by one, writes the report to `out` if given, and prints it."""
     with _progress() as progress:
         report = time_kernels(job, progress)
     put_report(
@@ -89,7 +89,7 @@ def run_sweeps(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure the dissertation's sweeps, write them to `out` if given, and print them."""
+    """Measures the dissertation's sweeps, writes them to `out` if given, and prints them."""
     with _progress() as progress:
         measured = measure_sweeps(frames, size, device, progress, full=full)
     put_report(
@@ -101,7 +101,7 @@ def run_sweeps(
 
 
 def run_comparison(before: Path, after: Path, *, as_json: bool) -> None:
-    """Compare two reports and print the comparison."""
+    """Compares two reports and prints the comparison."""
     rows = compare_reports(before, after)
     if as_json:
         print(dumps([{**asdict(row), "ratio": row.ratio, "slower": row.is_slower} for row in rows], indent=2))

@@ -36,7 +36,7 @@ class Row:
 
 
 def compare_reports(before: Path, after: Path) -> list[Row]:
-    """Compare the medians of all motions that both reports have.
+    """Compares the medians of all motions that both reports have.
 
     Raises:
         DeltalightError: a file is no report, or the two are of different machines or sizes, or share no motion.
@@ -50,7 +50,7 @@ def compare_reports(before: Path, after: Path) -> list[Row]:
 
 
 def require_alike(old: SpeedReport, new: SpeedReport) -> None:
-    """Check that times of two reports may stand beside each other.
+    """Checks that times of two reports may stand beside each other.
 
     Raises:
         DeltalightError: they are of different machines or picture sizes.
@@ -77,7 +77,7 @@ def _common(old: Mapping[str, object], new: Mapping[str, object]) -> list[str]:
 
 
 def medians(found: MotionFigures) -> dict[str, float]:
-    """Return the medians (ms) of a motion's frame, of what lies outside its stages, and of each stage."""
+    """Returns the medians (ms) of a motion's frame, of what lies outside its stages, and of each stage."""
     whole = {"frame": found.frame_ms, "submit to picture": found.picture_ms, "stages": found.stages_ms}
     times = {**whole, "outside stages": found.outside_ms}
     stages = {f"  {name}": stage.ms for name, stage in found.stages.items()}
@@ -85,7 +85,7 @@ def medians(found: MotionFigures) -> dict[str, float]:
 
 
 def print_comparison(rows: list[Row], console: Console) -> None:
-    """Print a table for each motion by each method."""
+    """Prints a table for each motion by each method."""
     for method, motion in dict.fromkeys((row.method, row.motion) for row in rows):
         table = figure_table(f"{method}: {motion}", ("Stage",), ("A ms", "B ms", "B / A", ""))
         for row in rows:

@@ -53,7 +53,7 @@ class CountsReport(StrictModel):
 
 
 def count_frames(job: SpeedJob, progress: Progress, *, gpu_paths: bool = False) -> CountsReport:
-    """Count every motion by every method; with `gpu_paths`, as on a GPU also where there is none.
+    """Counts every motion by every method; with `gpu_paths`, as on a GPU also where there is none.
 
     Raises:
         DeltalightError: no OpenGL, or missing demo files.
@@ -80,7 +80,7 @@ def count_frames(job: SpeedJob, progress: Progress, *, gpu_paths: bool = False) 
 
 
 def count_motion(renderer: SceneRenderer, steps: Sequence[Step], frames: int) -> FrameCounts:
-    """Render all but the last 2 `frames` steps to warm up, then count as many, then time as many without the GPU."""
+    """Renders all but the last 2 `frames` steps to warm up, counts as many, then times as many without the GPU."""
     reads = ReadBacks()
     for step in steps[: -2 * frames]:
         time_step(renderer, step)
@@ -94,7 +94,7 @@ def count_motion(renderer: SceneRenderer, steps: Sequence[Step], frames: int) ->
 
 
 def _python_times(renderer: SceneRenderer, step: Step) -> tuple[float, float]:
-    """Return how long a step takes, and the processor time of this thread in it, ms."""
+    """Returns how long a step takes, and the processor time of this thread in it, ms."""
     started_s = time.thread_time()
     frame_ms = time_step(renderer, step).frame_ms
     return frame_ms, 1000 * (time.thread_time() - started_s)
@@ -105,7 +105,7 @@ def _per_frame(counts: GpuCounts, frames: int) -> dict[str, float]:
 
 
 def print_counts(report: CountsReport, console: Console) -> None:
-    """Print a table for each method, one column per motion."""
+    """Prints a table for each method, one column per motion."""
     width, height = report.size
     console.print(f"{report.renderer}, {width}x{height}, means of {report.frames} frames")
     for method, motions in report.methods.items():

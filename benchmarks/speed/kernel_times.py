@@ -123,7 +123,7 @@ class KernelTimes:
 
 
 def time_kernels(job: SpeedJob, progress: Progress) -> KernelsReport:
-    """Time the kernels of every motion by every method.
+    """Times the kernels of every motion by every method.
 
     Raises:
         DeltalightError: no OpenGL, or missing demo files.
@@ -150,7 +150,7 @@ def time_kernels(job: SpeedJob, progress: Progress) -> KernelsReport:
 
 
 def time_motion(gpu: GpuContext, renderer: SceneRenderer, steps: Sequence[Step]) -> list[KernelFigures]:
-    """Render the steps, and sum up what their kernels take; those that take most come first."""
+    """Renders the steps, and sums up what their kernels take; those that take most come first."""
     times = KernelTimes(gpu)
     frames = []
     with times.watching():
@@ -179,7 +179,7 @@ def _figures(stage: str, kernel: str, frames: Sequence[Sequence[float]]) -> Kern
 
 
 def print_kernels(report: KernelsReport, console: Console) -> None:
-    """Print a table for each motion by each method."""
+    """Prints a table for each motion by each method."""
     width, height = report.size
     console.print(f"{report.renderer}, {width}x{height}, {report.frames} frames of each motion")
     for method, motions in report.methods.items():

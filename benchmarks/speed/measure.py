@@ -50,7 +50,7 @@ class SpeedJob:
     device: int | None = None
 
     def scenes(self) -> dict[str, SceneDocument]:
-        """Return the demo's scene for each method.
+        """Returns the demo's scene for each method.
 
         Raises:
             DeltalightError: the demo's files are missing.
@@ -84,7 +84,7 @@ def measure_speed(
     end_to_end: bool,
     take: Take | None = None,
 ) -> SpeedReport:
-    """Measure every motion by every method; frames that take longer than `budget_ms` are late.
+    """Measures every motion by every method; frames that take longer than `budget_ms` are late.
 
     `keep` is given the report so far after every motion, so that nothing is lost where a run is stopped. `take`: the
     frames, if they have been prepared.
@@ -170,7 +170,7 @@ class _Run:
     keep: Keep
 
     def measure(self, name: str, scene: SceneDocument) -> None:
-        """Measure one method, its motions by one renderer."""
+        """Measures one method, its motions by one renderer."""
         with rendering(self.gpu, scene) as renderer:
             renderer.render(self.take.standing[0])
             notices = list(renderer.notices)  # those of the demo itself; other lights bring further ones
@@ -181,7 +181,7 @@ class _Run:
                 self.shown.motion(name, motion, motions[motion])
 
     def add(self, name: str, **figures: object) -> None:
-        """Put figures of a method into the report, and hand that on."""
+        """Puts figures of a method into the report, and hands that on."""
         known = dict(self.report.methods[name]) if name in self.report.methods else {}
         self.report.methods[name] = MethodFigures.model_validate({**known, **figures})
         self.keep(self.report)
@@ -199,7 +199,7 @@ class _Run:
 
 
 def warm_up(gpu: GpuContext, renderer: SceneRenderer, steps: Iterator[Step]) -> None:
-    """Render steps until drivers have compiled and a GPU runs at its full clock."""
+    """Renders steps until drivers have compiled and a GPU runs at its full clock."""
     until_s = time.monotonic() + (0.0 if gpu.is_software else GPU_WARM_UP_S)
     for number, step in enumerate(steps, start=1):
         time_step(renderer, step)
@@ -208,7 +208,7 @@ def warm_up(gpu: GpuContext, renderer: SceneRenderer, steps: Iterator[Step]) -> 
 
 
 def time_step(renderer: SceneRenderer, step: Step) -> FrameTimes:
-    """Render one step and wait for its picture."""
+    """Renders one step and waits for its picture."""
     started_s = time.perf_counter()
     if step.scene is not renderer.scene:
         renderer.set_scene(step.scene)
@@ -226,7 +226,7 @@ def time_step(renderer: SceneRenderer, step: Step) -> FrameTimes:
 
 
 def _stage_times(graph: Graph | None) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the newest frame's times by stage, and the CPU's to issue them, ms.
+    """Returns the newest frame's times by stage, and the CPU's to issue them, ms.
 
     Timer queries are otherwise read some frames late.
     """
@@ -239,7 +239,7 @@ def _stage_times(graph: Graph | None) -> tuple[dict[str, float], dict[str, float
 def motion_figures(
     times: Sequence[FrameTimes], moved: Mapping[str, int], peaks: Peaks, budget_ms: float
 ) -> MotionFigures:
-    """Sum up the frames of a motion; `moved`: bytes that each stage reads and writes."""
+    """Sums up the frames of a motion; `moved`: bytes that each stage reads and writes."""
     names = dict.fromkeys(name for each in times for name in each.stages_ms)
     return MotionFigures(
         frame_ms=Spread.of([each.frame_ms for each in times]),

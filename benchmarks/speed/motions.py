@@ -59,7 +59,7 @@ class Take:
     swing: Sequence[ViewFrame]
 
     def at(self, size: tuple[int, int] | None) -> "Take":
-        """Return the frames as a camera of that size (width, height) takes them; None: as they are.
+        """Returns the frames as a camera of that size (width, height) takes them; None: as they are.
 
         So no frame is resized while it is timed.
         """
@@ -72,7 +72,7 @@ class Take:
 
 
 def prepare_take(progress: Progress) -> Take:
-    """Read the demo's recording and clean its depth; the poses are those of the marker board.
+    """Reads the demo's recording and cleans its depth; the poses are those of the marker board.
 
     Raises:
         DeltalightError: the recording is missing.
@@ -85,7 +85,7 @@ def prepare_take(progress: Progress) -> Take:
 
 
 def parse_motions(text: str) -> list[str]:
-    """Parse names of MOTIONS, separated by commas.
+    """Parses names of MOTIONS, separated by commas.
 
     Raises:
         DeltalightError: an unknown name, or one that is written twice.
@@ -102,7 +102,7 @@ def parse_motions(text: str) -> list[str]:
 
 
 def steps_of(motion: str, take: Take, scene: SceneDocument, frames: int | None = None) -> Iterator[Step]:
-    """Yield that many frames of a motion, None: without end; each is a new object with a capture time of its own."""
+    """Yields that many frames of a motion, None: without end; each is a new object with a capture time of its own."""
     for number, step in enumerate(islice(MOTIONS[motion](take, scene), frames)):
         frame = replace(step.frame, frame_id=number, timestamp_ns=(number + 1) * FRAME_NS)
         yield Step(frame, step.scene)
@@ -136,14 +136,14 @@ def arm_reaches(take: Take, scene: SceneDocument) -> Iterator[Step]:
 
 
 def _reach(step: int) -> float:
-    """Return how far the arm reaches, as a fraction of the width: evenly out and back."""
+    """Returns how far the arm reaches, as a fraction of the width: evenly out and back."""
     out = 1 - abs(2 * step / ARM_STEPS - 1)
     least, greatest = ARM_REACH
     return least + (greatest - least) * out
 
 
 def with_arm(frame: ViewFrame, reach: float) -> ViewFrame:
-    """Paint a slanted capsule into a frame's colour and depth; `reach` is a fraction of the picture's width."""
+    """Paints a slanted capsule into a frame's colour and depth; `reach` is a fraction of the picture's width."""
     assert frame.depth is not None
     height, width = frame.color.shape[:2]
     entry = np.array([width, 0.9 * height])
@@ -161,7 +161,7 @@ def with_arm(frame: ViewFrame, reach: float) -> ViewFrame:
 def _on_capsule(
     entry: Float64[np.ndarray, "2"], tip: Float64[np.ndarray, "2"], radius_px: float, shape: tuple[int, int]
 ) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-    """Return for each pixel its place along the axis (0 entry, 1 tip), and its distance from it in radii."""
+    """Returns for each pixel its place along the axis (0 entry, 1 tip), and its distance from it in radii."""
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
     axis = tip - entry
     along = ((x - entry[0]) * axis[0] + (y - entry[1]) * axis[1]) / (axis @ axis)

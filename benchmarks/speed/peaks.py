@@ -22,12 +22,12 @@ FLOPS_OF_ROUND = 32
 
 
 def measure_peaks(gpu: GpuContext) -> Peaks:
-    """Measure bandwidth by copying a large buffer, arithmetic by a loop of products and sums."""
+    """Measures bandwidth by copying a large buffer, arithmetic by a loop of products and sums."""
     return Peaks(bytes_per_s=_bandwidth(gpu), flops_per_s=_arithmetic(gpu))
 
 
 def _bandwidth(gpu: GpuContext) -> float:
-    """Return bytes a second, read and written ones together."""
+    """Returns bytes a second, read and written ones together."""
     source, target = (gpu.ctx.buffer(reserve=COPIED_BYTES) for _ in range(2))
     kernel = Kernel(gpu, SHADERS / "copy")
     best_s = _fastest_s(gpu, lambda: kernel.run((COPIED_BYTES // 16,), Source=source, Target=target))
@@ -36,7 +36,7 @@ def _bandwidth(gpu: GpuContext) -> float:
 
 
 def _arithmetic(gpu: GpuContext) -> float:
-    """Return single-precision operations a second; a product and a sum are two."""
+    """Returns single-precision operations a second; a product and a sum are two."""
     threads = SOFTWARE_THREADS if gpu.is_software else THREADS
     result = gpu.ctx.buffer(reserve=4 * threads)
     kernel = Kernel(gpu, SHADERS / "multiply_add", ROUNDS=ROUNDS)
@@ -46,7 +46,7 @@ def _arithmetic(gpu: GpuContext) -> float:
 
 
 def _fastest_s(gpu: GpuContext, work: Callable[[], None]) -> float:
-    """Return the shortest time of some runs after one that warms up, on the clock that times the stages."""
+    """Returns the shortest time of some runs after one that warms up, on the clock that times the stages."""
     timers = PassTimers(gpu)
     work()
     times_ms = []
@@ -60,7 +60,7 @@ def _fastest_s(gpu: GpuContext, work: Callable[[], None]) -> float:
 
 
 def stage_bytes(graph: Graph) -> dict[str, int]:
-    """Return for each stage that ever ran the bytes of all that its resources hold, each once, without mip levels."""
+    """Returns for each stage that ever ran the bytes that its resources hold, each once, without mip levels."""
     stages = [stage for stage in graph.report() if not stage.is_value]
     return {stage.name: _bytes_of(graph, stage) for stage in stages if _has_run(graph, stage)}
 

@@ -115,7 +115,7 @@ class SpeedReport(StrictModel):
 
 
 def read_report(path: Path) -> SpeedReport:
-    """Read a report that `bench speed --out` wrote.
+    """Reads a report that `bench speed --out` wrote.
 
     Raises:
         DeltalightError: the file cannot be read, or is something else.

@@ -190,7 +190,7 @@ class Measured:
     refused: Mapping[str, str] = field(default_factory=dict)
 
     def column_ms(self, point: Point, stages: Sequence[str]) -> float | None:
-        """Return the summed medians of the stages that ran; None if none did."""
+        """Returns the summed medians of the stages that ran; None if none did."""
         found = self.figures(point)
         if found is None:
             return None
@@ -200,12 +200,12 @@ class Measured:
         return sum(times) if times else None
 
     def figures(self, point: Point) -> MotionFigures | None:
-        """Return what was measured at a point; None: nothing of that size, or refused."""
+        """Returns what was measured at a point; None: nothing of that size, or refused."""
         report = None if point.method is None else self.reports.get(point.method)
         return None if report is None else report.methods[str(point.method)].motions[self.sweep.motion]
 
     def frame_ms(self, point: Point) -> float | None:
-        """Return the median of the whole frames; None as in `figures`."""
+        """Returns the median of the whole frames; None as in `figures`."""
         found = self.figures(point)
         return None if found is None else found.frame_ms.median
 
@@ -213,7 +213,7 @@ class Measured:
 def measure_sweeps(
     frames: int, size: tuple[int, int] | None, device: int | None, progress: Progress, *, full: bool
 ) -> list[Measured]:
-    """Measure the small points of every sweep, or all; what this machine refuses is listed with the reason.
+    """Measures the small points of every sweep, or all; what this machine refuses is listed with the reason.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a machine that refuses every size.
@@ -252,7 +252,7 @@ def _measured(  # noqa: PLR0917 (as the command has them)
 
 
 def print_sweeps(measured: Sequence[Measured], console: Console) -> None:
-    """Print a table of each sweep, ms: our times and, after them, the published ones ([D]); then what was refused."""
+    """Prints a table of each sweep, ms: our times, then the published ones ([D]); after that, what was refused."""
     for each in measured:
         headings = [text for name in each.sweep.columns for text in (name, "[D]")]
         table = figure_table(f"{each.sweep.title}, ms", ("Size",), (*headings, "frame"))
@@ -274,7 +274,7 @@ def _shown(time_ms: float | None, digits: int) -> str:
 
 
 def as_data(measured: Sequence[Measured]) -> dict[str, Any]:
-    """Return the times as JSON; null where nothing was published, no such stage ran, or the machine refused."""
+    """Returns the times as JSON; null where nothing was published, no such stage ran, or the machine refused."""
     first = next(report for each in measured for report in each.reports.values())
     return {
         "report": "deltalight bench sweep",

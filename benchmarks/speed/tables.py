@@ -12,7 +12,7 @@ MISSING = "–"
 
 
 def print_report(report: SpeedReport, console: Console) -> None:
-    """Print how long frames took, then each method's stages, a table for each motion."""
+    """Prints how long frames took, then each method's stages, a table for each motion."""
     width, height = report.size
     console.print(f"{report.machine}, {width}x{height}, {report.frames} frames of each motion")
     console.print(
@@ -26,7 +26,7 @@ def print_report(report: SpeedReport, console: Console) -> None:
 
 
 def figure_table(title: str, names: Sequence[str], figures: Sequence[str]) -> Table:
-    """Return an empty table that fits into a narrow terminal: names to the left, figures to the right."""
+    """Returns an empty table that fits into a narrow terminal: names to the left, figures to the right."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in names:
         table.add_column(name, overflow="fold", min_width=6)
@@ -36,7 +36,7 @@ def figure_table(title: str, names: Sequence[str], figures: Sequence[str]) -> Ta
 
 
 def frames_table(report: SpeedReport) -> Table:
-    """Return the frames' times: one row for each motion by each method."""
+    """Returns the frames' times: one row for each motion by each method."""
     headings = ("median", "p95", "picture", "submit", "stages", "outside", f"over {report.budget_ms:g}")
     table = figure_table("Frames, ms", ("Method", "Motion"), headings)
     for method, figures in report.methods.items():
@@ -52,7 +52,7 @@ def _frame_cells(found: MotionFigures, frames: int) -> list[str]:
 
 
 def stages_table(title: str, found: MotionFigures) -> Table:
-    """Return the stages of one motion in the order in which they ran; with arithmetic, if it was counted."""
+    """Returns the stages of one motion in the order in which they ran; with arithmetic, if it was counted."""
     counts = any(stage.flops is not None for stage in found.stages.values())
     counted, timed = (
         ("MB", "MFLOP", "special", "flops ms", "floor ms"),
@@ -75,7 +75,7 @@ def _run_cells(stage: StageFigures) -> tuple[str, str, str]:
 
 
 def _arithmetic_cells(stage: StageFigures) -> tuple[str, str, str]:
-    """Return operations, the fraction of special functions among them, and what they take at the peak."""
+    """Returns operations, the fraction of special functions among them, and what they take at the peak."""
     if stage.flops is None or stage.special_functions is None:
         return MISSING, MISSING, MISSING
     total = stage.flops + stage.special_functions

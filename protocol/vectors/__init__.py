@@ -13,12 +13,12 @@ FOLDER = Path(__file__).parent
 
 
 def frame_pieces(pieces: Sequence[bytes]) -> bytes:
-    """Return the bytes of a `.bin` file from the pieces of a multipart."""
+    """Returns the bytes of a `.bin` file from the pieces of a multipart."""
     return b"".join(struct.pack("<I", len(piece)) + piece for piece in pieces)
 
 
 def unframe_pieces(data: bytes) -> list[bytes]:
-    """Return the pieces of a multipart from the bytes of a `.bin` file."""
+    """Returns the pieces of a multipart from the bytes of a `.bin` file."""
     pieces, place = [], 0
     while place < len(data):
         (length,) = struct.unpack_from("<I", data, place)

@@ -65,7 +65,7 @@ Example = tuple[str, Message, Sequence[bytes], Sequence[Sequence[float]]]
 
 
 def main() -> None:
-    """Write every vector into the folder of this module."""
+    """Writes every vector into the folder of this module."""
     examples = [
         *_color_examples(),
         *_fisheye_examples(),

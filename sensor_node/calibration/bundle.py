@@ -46,7 +46,7 @@ def refine(
     views: Sequence[View],
     poses: Sequence[Float64[np.ndarray, "4 4"]],
 ) -> Bundle:
-    """Minimise the squared distances in pixels over the lens and the poses.
+    """Minimises the squared distances in pixels over the lens and the poses.
 
     Args:
         make_lens: creates the lens of a list of parameters.

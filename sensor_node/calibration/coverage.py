@@ -32,7 +32,7 @@ class Coverage:
         return float((self.points[self.counted] > 0).mean()) if self.counted.any() else 0.0
 
     def text(self) -> str:
-        """Return the grid with a character per cell: points in it, 9 = nine or more, `.` = none, space = dark."""
+        """Returns the grid with a character per cell: points in it, 9 = nine or more, `.` = none, space = dark."""
         rows = []
         for counts, inside in zip(self.points, self.counted, strict=True):
             rows.append(" ".join(_mark(int(n), bool(is_in)) for n, is_in in zip(counts, inside, strict=True)))
@@ -48,7 +48,7 @@ def _mark(points: int, counted: bool) -> str:
 def measure_coverage(
     views: Sequence[View], size: tuple[int, int], circle: tuple[Float64[np.ndarray, "2"], float] | None = None
 ) -> Coverage:
-    """Count the points of views in the cells of a picture.
+    """Counts the points of views in the cells of a picture.
 
     Args:
         views: views of the target.
@@ -71,7 +71,7 @@ def measure_coverage(
 
 
 def image_circle(brightest: UInt8[np.ndarray, "h w"], centre: Float64[np.ndarray, "2"]) -> float | None:
-    """Return the radius in pixels about `centre` that light reaches, None if it fills the picture.
+    """Returns the radius in pixels about `centre` that light reaches, None if it fills the picture.
 
     Uses the median over each ring of each pixel's brightest value, so that a dark thing on one side does not count.
     """
@@ -92,7 +92,7 @@ def image_circle(brightest: UInt8[np.ndarray, "h w"], centre: Float64[np.ndarray
 def draw_coverage(
     brightest: UInt8[np.ndarray, "h w"], fit: LensFit, coverage: Coverage
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture with seen cells in green, unseen ones in red, and all points."""
+    """Returns the picture with seen cells in green, unseen ones in red, and all points."""
     picture = cv2.cvtColor(brightest // 2, cv2.COLOR_GRAY2RGB)
     height, width = brightest.shape
     rows, columns = coverage.points.shape
@@ -107,7 +107,7 @@ def draw_coverage(
 
 
 def draw_misses(brightest: UInt8[np.ndarray, "h w"], fit: LensFit) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture with an arrow from each found point to its predicted position, enlarged."""
+    """Returns the picture with an arrow from each found point to its predicted position, enlarged."""
     picture = cv2.cvtColor(brightest // 2, cv2.COLOR_GRAY2RGB)
     enlarged = ARROW_FRACTION * picture.shape[1] / max(fit.rms_px, 1e-6)
     for view, misses in zip(fit.views, fit.misses, strict=True):

@@ -49,7 +49,7 @@ class DepthPlacement(NamedTuple):
 
 
 def depth_views(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[DepthView]:
-    """Yield the frames with depth in which the colour camera sees the board."""
+    """Yields the frames with depth in which the colour camera sees the board."""
     detector = None
     for frame in frames:
         detector = detector or BoardDetector(board, frame.camera, frame.response)
@@ -59,7 +59,7 @@ def depth_views(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[Dep
 
 
 def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose) -> DepthPlacement:
-    """Return the depth_from_rgb that puts the measured planes into the board's plane, by Gauss-Newton.
+    """Returns the depth_from_rgb that puts the measured planes into the board's plane, by Gauss-Newton.
 
     Each view counts as four points of the plane fitted to its depth, because depth errors are common to a picture.
 
@@ -92,7 +92,7 @@ def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose
 def _equations(
     seen: list[tuple[DepthView, Float64[np.ndarray, "4 3"]]], rgb_from_depth: Pose
 ) -> tuple[Float64[np.ndarray, "m 6"], Float64[np.ndarray, " m"]]:
-    """Return the heights of the patches' points over the board, and their derivatives by the sensor's motion."""
+    """Returns the heights of the patches' points over the board, and their derivatives by the sensor's motion."""
     rows, misses = [], []
     for view, patch in seen:
         points = patch @ rgb_from_depth[:3, :3].T + rgb_from_depth[:3, 3]
@@ -103,7 +103,7 @@ def _equations(
 
 
 def _points(depth: DepthImage) -> Float64[np.ndarray, "n 3"]:
-    """Return some of the points of a depth image, in its camera's frame, evenly over the image."""
+    """Returns some of the points of a depth image, in its camera's frame, evenly over the image."""
     step = int(np.ceil(np.sqrt(depth.depth_m.size / MOST_POINTS)))
     few = (slice(None, None, step), slice(None, None, step))
     known = (depth.valid & (depth.depth_m > 0))[few]
@@ -114,7 +114,7 @@ def _points(depth: DepthImage) -> Float64[np.ndarray, "n 3"]:
 def _patch(
     points: Float64[np.ndarray, "n 3"], view: DepthView, board: BoardSpec, rgb_from_depth: Pose
 ) -> Float64[np.ndarray, "4 3"] | None:
-    """Return four corners (in the depth sensor's frame) of the plane measured on the board."""
+    """Returns four corners (in the depth sensor's frame) of the plane measured on the board."""
     placed = view.world_from_camera @ rgb_from_depth
     world = points @ placed[:3, :3].T + placed[:3, 3]
     outline = board.sheet_outline()

@@ -38,7 +38,7 @@ class Placement(NamedTuple):
 
 
 def fisheye_in_world(pictures: FisheyePictures, board: MarkerBoard) -> Pose | None:
-    """Return world_from_fisheye by the board in a fish-eye picture (of a bracket: the first one that shows it)."""
+    """Returns world_from_fisheye by the board in a fish-eye picture (of a bracket: the first one that shows it)."""
     for picture in pictures.pictures:
         if picture.dtype == np.uint8:
             pose = _board_pose(picture, pictures.calibration.lens, board)
@@ -62,7 +62,7 @@ def _board_pose(color: UInt8[np.ndarray, "h w 3"], lens: FisheyeLens, board: Mar
 
 
 def world_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[Pose]:
-    """Yield the pose of a fixed fish-eye camera from each of its pictures that shows the board."""
+    """Yields the pose of a fixed fish-eye camera from each of its pictures that shows the board."""
     target, last = MarkerBoard(board), None
     for frame in frames:
         if frame.fisheye is not None and frame.fisheye is not last:
@@ -73,7 +73,7 @@ def world_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) ->
 
 
 def rgb_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[Pose]:
-    """Yield the transform from each moment (within 20 ms) at which both cameras see the board."""
+    """Yields the transform from each moment (within 20 ms) at which both cameras see the board."""
     target, detector = MarkerBoard(board), None
     for frame in frames:
         if frame.fisheye is None or abs(frame.timestamp_ns - frame.fisheye.timestamp_ns) > MAX_PAIRING_NS:
@@ -86,7 +86,7 @@ def rgb_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) -> I
 
 
 def mean_placement(poses: Sequence[Pose], name: str) -> Placement:
-    """Return the mean of poses without outliers; `name` names the transform in sentences.
+    """Returns the mean of poses without outliers; `name` names the transform in sentences.
 
     Raises:
         DeltalightError: there are too few poses, or they differ too much.

@@ -52,11 +52,11 @@ class LensFit:
 
 
 def rms(misses: Float64[np.ndarray, "n 2"]) -> float:
-    """Return the root mean square length of 2-D differences."""
+    """Returns the root mean square length of 2-D differences."""
     return float(np.sqrt(np.mean(np.sum(misses**2, axis=-1))))
 
 
 def noise_px(misses: Float64[np.ndarray, "n 2"], parameters: int) -> float:
-    """Return the standard deviation of one coordinate of a point, from the residuals of a fit."""
+    """Returns the standard deviation of one coordinate of a point, from the residuals of a fit."""
     freedom = max(misses.size - parameters, 1)
     return max(float(np.sqrt(np.sum(misses**2) / freedom)), LEAST_NOISE_PX)

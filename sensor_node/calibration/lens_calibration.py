@@ -50,7 +50,7 @@ class LensResult:
 
 
 def calibrate_lens(collected: ViewCollector, target: Target, kind: LensKind) -> LensResult:
-    """Fit a lens: first to the points as found, then to points refined with it, without the bad views.
+    """Fits a lens: first to the points as found, then to points refined with it, without the bad views.
 
     Raises:
         DeltalightError: there are too few views, or no lens fits them.
@@ -98,7 +98,7 @@ def _with_circle(lens: EquidistantLens | OcamLens, radius: float | None) -> Equi
 
 
 def fit_without_bad(fitter: Fitter, views: Sequence[View], size: tuple[int, int]) -> LensFit:
-    """Fit a lens, discarding misidentified points and then bad views until all are good.
+    """Fits a lens, discarding misidentified points and then bad views until all are good.
 
     Raises:
         DeltalightError: no lens fits.
@@ -121,7 +121,7 @@ def fit_without_bad(fitter: Fitter, views: Sequence[View], size: tuple[int, int]
 
 
 def _without_outliers(view: View, misses: Float64[np.ndarray, "n 2"] | None) -> View:
-    """Return the view without points whose residuals are far larger than the others; unchanged if these are many."""
+    """Returns the view without points whose residuals are far larger than the others; unchanged if these are many."""
     if misses is None:
         return view
     distances = np.linalg.norm(misses, axis=1)
@@ -130,7 +130,7 @@ def _without_outliers(view: View, misses: Float64[np.ndarray, "n 2"] | None) -> 
 
 
 def _bad_views(fit: LensFit) -> dict[str, str]:
-    """Return views whose residuals are far larger than the others, with the reason."""
+    """Returns views whose residuals are far larger than the others, with the reason."""
     errors = fit.view_rms_px
     median = float(np.median(errors))
     limit = max(GOOD_PX, BAD_MEDIANS * median)
@@ -142,7 +142,7 @@ def _bad_views(fit: LensFit) -> dict[str, str]:
 
 
 def require_good(result: LensResult) -> None:
-    """Refuse a calibration that would mislead.
+    """Refuses a calibration that would mislead.
 
     Raises:
         DeltalightError: the first reason, and what to do.

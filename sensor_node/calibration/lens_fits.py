@@ -29,7 +29,7 @@ CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-10)
 
 
 def fit_pinhole(views: Sequence[View], size: tuple[int, int], coefficients: int) -> LensFit:
-    """Fit `plumb_bob` with 5 or 8 coefficients."""
+    """Fits `plumb_bob` with 5 or 8 coefficients."""
     flags = cv2.CALIB_RATIONAL_MODEL if coefficients == 8 else 0
     try:
         _, matrix, distortion, turns, shifts, spread, _, _ = cv2.calibrateCameraExtended(
@@ -59,7 +59,7 @@ def fit_pinhole(views: Sequence[View], size: tuple[int, int], coefficients: int)
 
 
 def fit_equidistant(views: Sequence[View], size: tuple[int, int]) -> LensFit:
-    """Fit Kannala & Brandt's lens, also to points beyond 90 degrees.
+    """Fits Kannala & Brandt's lens, also to points beyond 90 degrees.
 
     `cv2.fisheye.calibrate` is not used: its initialisation fails on views that reach the rim of the picture, and the
     view that it then names is random (of sixteen views of a good set it accepted none as culprit).
@@ -76,14 +76,14 @@ def fit_equidistant(views: Sequence[View], size: tuple[int, int]) -> LensFit:
 
 
 def _ideal_lens(size: tuple[int, int], focal_fraction: float) -> Float64[np.ndarray, "8"]:
-    """Return the parameters of an exactly equidistant lens with its axis in the middle of the picture."""
+    """Returns the parameters of an exactly equidistant lens with its axis in the middle of the picture."""
     width, height = size
     focal = focal_fraction * width
     return np.array([focal, focal, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0])
 
 
 def _start_error(views: Sequence[View], maker: LensMaker, numbers: Float64[np.ndarray, " k"]) -> float:
-    """Return the median over the views of the rms of an unrefined lens; infinite for views out of its reach."""
+    """Returns the median over the views of the rms of an unrefined lens; infinite for views out of its reach."""
     errors = [placed.rms_px for placed in _placed(views, maker, numbers)[0]]
     return float(np.median([*errors, *[np.inf] * (len(views) - len(errors))]))
 
@@ -95,7 +95,7 @@ def _equidistant_numbers(lens: EquidistantLens) -> Float64[np.ndarray, "8"]:
 
 
 def fit_ocam(views: Sequence[View], size: tuple[int, int]) -> LensFit:
-    """Fit Scaramuzza's lens (polynomial of degree 4, centre, affine part) from an equidistant start."""
+    """Fits Scaramuzza's lens (polynomial of degree 4, centre, affine part) from an equidistant start."""
     equidistant = fit_equidistant(views, size)
     assert isinstance(equidistant.lens, EquidistantLens)
     numbers = _ocam_numbers(equidistant.lens)
@@ -115,7 +115,7 @@ class _Placed(NamedTuple):
 def _refined(
     maker: LensMaker, numbers: Float64[np.ndarray, " k"], focal: tuple[int, ...], views: Sequence[View]
 ) -> LensFit:
-    """Refine a lens and all poses; `focal` lists the parameters that are focal lengths."""
+    """Refines a lens and all poses; `focal` lists the parameters that are focal lengths."""
     placed, refused = _placed(views, maker, numbers)
     if len(placed) < LEAST_START:
         raise _no_start(views)
@@ -131,7 +131,7 @@ def _refined(
 def _placed(
     views: Sequence[View], maker: LensMaker, numbers: Float64[np.ndarray, " k"]
 ) -> tuple[list[_Placed], list[tuple[str, str]]]:
-    """Return the views with their poses by a lens, and those that it does not reach."""
+    """Returns the views with their poses by a lens, and those that it does not reach."""
     placed, refused = [], []
     for view in views:
         margin = view.gray.shape[1]
@@ -164,7 +164,7 @@ def _equidistant_maker(size: tuple[int, int]) -> LensMaker:
 
 
 def _ocam_maker(size: tuple[int, int]) -> LensMaker:
-    """Return a maker whose parameters are the polynomial in units of half the width, the centre, and c d.
+    """Returns a maker whose parameters are the polynomial in units of half the width, the centre, and c d.
 
     These units make all parameters similar in size. e stays 0: the rotation about the axis that it would add is the
     same as one of all poses.
@@ -183,7 +183,7 @@ def _ocam_maker(size: tuple[int, int]) -> LensMaker:
 
 
 def _ocam_numbers(lens: EquidistantLens) -> Float64[np.ndarray, " k"]:
-    """Return the least-squares polynomial of z over the radius of an equidistant lens within the picture."""
+    """Returns the least-squares polynomial of z over the radius of an equidistant lens within the picture."""
     fx, fy, x, y = lens.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     unit = lens.width / 2
     radii = np.linspace(0.02, min(lens.largest_radius * fx, 0.999 * (lens.width - x)) / unit, 200)

@@ -64,7 +64,7 @@ class PaperAlbedo(NamedTuple):
 
 
 def read_bracket(folder: Path, eye: Eye) -> Bracket:
-    """Read a bracket: a folder whose rgb.txt or fisheye.txt has exposures (third column), or pictures with EXIF.
+    """Reads a bracket: a folder whose rgb.txt or fisheye.txt has exposures (third column), or pictures with EXIF.
 
     Raises:
         DeltalightError: no such folder, or a picture without exposure.
@@ -103,7 +103,7 @@ def _exif_exposure(path: Path) -> float | None:
 
 
 def calibrate_response(bracket: Bracket) -> Response:
-    """Return the response of the camera that took a bracket.
+    """Returns the response of the camera that took a bracket.
 
     Raises:
         DeltalightError: there are too few exposures, or the pictures do not show the same light.
@@ -128,7 +128,7 @@ def _require_exposures(exposures_s: Sequence[float]) -> None:
 
 
 def bracket_residual(bracket: Bracket, table: Float32[np.ndarray, "256 3"]) -> float:
-    """Return the rms relative difference between the light that the exposures of one pixel indicate."""
+    """Returns the rms relative difference between the light that the exposures of one pixel indicate."""
     squares, count = 0.0, 0
     logs = np.log(np.maximum(decode_lut(table), 1e-9))
     order = np.argsort(bracket.exposures_s)
@@ -144,7 +144,7 @@ def bracket_residual(bracket: Bracket, table: Float32[np.ndarray, "256 3"]) -> f
 
 
 def paper_albedo(frames: Iterable[SensorFrame], board: BoardSpec, card: GreyCard) -> PaperAlbedo:
-    """Return the albedo of the board's paper, measured with a card of known albedo that lies on or beside it.
+    """Returns the albedo of the board's paper, measured with a card of known albedo that lies on or beside it.
 
     Light varies over the sheet: the logarithm of the paper's light is fitted by a plane over the gaps between the
     markers, and compared with the card at the card's position.
@@ -196,7 +196,7 @@ def _ratio(
     board: BoardSpec,
     card: GreyCard,
 ) -> tuple[float, float]:
-    """Return the paper's light over the card's at the card's position, and the relative misfit of the plane."""
+    """Returns the paper's light over the card's at the card's position, and the relative misfit of the plane."""
     outline = card.outline()
     card_light = _light(frame, world_from_camera, _shrunk(outline, CARD_INSET))
     patches = [patch for patch in board.paper_patches() if not _is_covered(patch, card)]
@@ -218,7 +218,7 @@ def _ratio(
 def _light(
     frame: SensorFrame, world_from_camera: Float64[np.ndarray, "4 4"], quad: Float64[np.ndarray, "4 3"]
 ) -> float | None:
-    """Return the mean linear luminance of a quad on the sheet; None if it leaves the picture or is clipped."""
+    """Returns the mean linear luminance of a quad on the sheet; None if it leaves the picture or is clipped."""
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     s, t = (grid.reshape(-1, 1) for grid in np.meshgrid(steps, steps))
     points = quad[0] + s * (quad[1] - quad[0]) + t * (quad[3] - quad[0])
@@ -250,7 +250,7 @@ def _is_covered(patch: Float64[np.ndarray, "4 3"], card: GreyCard) -> bool:
 
 
 def parse_card(text: str, albedo: float) -> GreyCard:
-    """Return the card described by `x0,y0,x1,y1` (two opposite corners, metres in the board's frame).
+    """Returns the card described by `x0,y0,x1,y1` (two opposite corners, metres in the board's frame).
 
     Raises:
         DeltalightError: not four numbers, no area, or no valid albedo.

@@ -42,7 +42,7 @@ class Series(NamedTuple):
 
 
 def open_series(source: str, eye: Eye) -> Series:
-    """Open the pictures of one eye.
+    """Opens the pictures of one eye.
 
     Args:
         source: a folder of pictures, a pattern such as `shots/left*.jpg`, a dataset folder, an .mcap recording, or a
@@ -138,14 +138,14 @@ def _live(source: str, eye: Eye) -> Generator[Picture]:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Return a sort key by which shot2 comes before shot10."""
+    """Returns a sort key by which shot2 comes before shot10."""
     return [(int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", path.name)]
 
 
 def collect_views(
     series: Series, target: Target, *, enough: int, tell: Callable[[ViewCollector, bool], None]
 ) -> ViewCollector:
-    """Examine all pictures of a series, or a live camera's until there are `enough` views or Ctrl-C.
+    """Examines all pictures of a series, or a live camera's until there are `enough` views or Ctrl-C.
 
     Args:
         series: the pictures.

@@ -12,7 +12,7 @@ from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz, wxyz_fro
 def target_pose(
     points: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "4 4"] | None:
-    """Return camera_from_target, or None if the points are collinear or seen from behind.
+    """Returns camera_from_target, or None if the points are collinear or seen from behind.
 
     The directions are rotated so that their mean is the axis: a flat target fills less than a half space, so there
     they are the rays of a pinhole camera whatever the lens. Of the two solutions of the planar ambiguity the one with
@@ -48,7 +48,7 @@ def target_pose(
 
 
 def _turn_to_axis(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation that takes a direction to +z."""
+    """Returns the rotation that takes a direction to +z."""
     z = direction / np.linalg.norm(direction)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -56,7 +56,7 @@ def _turn_to_axis(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3
 
 
 def mean_pose(poses: Sequence[Float64[np.ndarray, "4 4"]]) -> Float64[np.ndarray, "4 4"]:
-    """Return the mean pose: median of the translations, mean of the rotations.
+    """Returns the mean pose: median of the translations, mean of the rotations.
 
     The mean rotation's quaternion is the eigenvector of the sum of the outer products (Markley et al. 2007).
     """
@@ -69,7 +69,7 @@ def mean_pose(poses: Sequence[Float64[np.ndarray, "4 4"]]) -> Float64[np.ndarray
 def pose_offsets(
     poses: Sequence[Float64[np.ndarray, "4 4"]], mean: Float64[np.ndarray, "4 4"]
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Return the distance of each pose from the mean: metres and degrees."""
+    """Returns the distance of each pose from the mean: metres and degrees."""
     metres = np.array([np.linalg.norm(pose[:3, 3] - mean[:3, 3]) for pose in poses])
     turns = [np.linalg.norm(cv2.Rodrigues(mean[:3, :3].T @ pose[:3, :3])[0]) for pose in poses]
     return metres, np.degrees(turns)

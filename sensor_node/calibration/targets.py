@@ -39,10 +39,10 @@ class Target(Protocol):
         """All points in metres, in the target's frame."""
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
-        """Find the target in a picture of an uncalibrated camera."""
+        """Finds the target in a picture of an uncalibrated camera."""
 
     def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
-        """Return the same points, refined with the nearly known lens."""
+        """Returns the same points, refined with the nearly known lens."""
 
 
 class Chessboard:
@@ -59,7 +59,7 @@ class Chessboard:
         return self._points
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
-        """Find all inner corners, or none."""
+        """Finds all inner corners, or none."""
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, corners = cv2.findChessboardCorners(gray, self._size, flags=flags)
         if not found:
@@ -68,14 +68,14 @@ class Chessboard:
         return Sighting(np.arange(len(start)), self._saddles(gray, start))
 
     def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
-        """Return the sighting unchanged: a saddle point does not depend on the lens."""
+        """Returns the sighting unchanged: a saddle point does not depend on the lens."""
         del gray, camera
         return sighting
 
     def _saddles(
         self, gray: UInt8[np.ndarray, "h w"], start: Float32[np.ndarray, "n 2"]
     ) -> Float64[np.ndarray, "n 2"]:
-        """Refine each corner in its own window, because squares get small towards the rim of a fish-eye."""
+        """Refines each corner in its own window, because squares get small towards the rim of a fish-eye."""
         grid = start.reshape(self._size[1], self._size[0], 2)
         steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
         gaps = np.minimum(_least_beside(steps[0], 0), _least_beside(steps[1], 1)).ravel()
@@ -104,7 +104,7 @@ class MarkerBoard:
         return self._points
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
-        """Find the board's markers, or on a ChArUco board the inner corners beside them."""
+        """Finds the board's markers, or on a ChArUco board the inner corners beside them."""
         quads = self._finder.quads(gray, self._first)
         if not quads:
             return None
@@ -119,7 +119,7 @@ class MarkerBoard:
         return self.refined(gray, start, CameraModel(width, height, matrix))
 
     def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
-        """Fit the markers' edges, straightened by the lens model."""
+        """Fits the markers' edges, straightened by the lens model."""
         if self.board.type == "charuco":
             return sighting
         # Paper and ink are grey, so their grey code decodes to linear light.
@@ -131,7 +131,7 @@ class MarkerBoard:
 
 
 def parse_target(text: str | None, known: BoardSpec | None, folders: Sequence[Path | None]) -> Target:
-    """Return the target that `--target` names, or by default the known board.
+    """Returns the target that `--target` names, or by default the known board.
 
     Args:
         text: `chessboard:COLUMNSxROWS:SQUARE_M` (inner corners, metres) or the path of a board.yaml.
@@ -163,7 +163,7 @@ def parse_target(text: str | None, known: BoardSpec | None, folders: Sequence[Pa
 
 
 def _least_beside(steps: Float64[np.ndarray, "r c"], axis: int) -> Float64[np.ndarray, "r c"]:
-    """Return the distance to the nearer neighbour along an axis, for every corner of the grid."""
+    """Returns the distance to the nearer neighbour along an axis, for every corner of the grid."""
     ends = [(1, 0) if each == axis else (0, 0) for each in (0, 1)]
     starts = [(0, 1) if each == axis else (0, 0) for each in (0, 1)]
     pads = [np.pad(steps, width, constant_values=np.inf) for width in (ends, starts)]

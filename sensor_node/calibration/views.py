@@ -39,12 +39,12 @@ class View:
     moment: int
 
     def refined(self, target: Target, camera: CameraModel) -> "View":
-        """Return the view with its points refined by the nearly known lens."""
+        """Returns the view with its points refined by the nearly known lens."""
         sighting = target.refined(self.gray, Sighting(self.numbers, self.pixels), camera)
         return replace(self, pixels=sighting.pixels)
 
     def only(self, kept: Bool[np.ndarray, " n"]) -> "View":
-        """Return the view with some of its points."""
+        """Returns the view with some of its points."""
         return replace(self, numbers=self.numbers[kept], points=self.points[kept], pixels=self.pixels[kept])
 
 
@@ -68,7 +68,7 @@ class ViewCollector:
         return (0, 0) if self.brightest is None else (self.brightest.shape[1], self.brightest.shape[0])
 
     def add(self, picture: Picture) -> bool:
-        """Examine the next picture; return whether it was taken as a view.
+        """Examines the next picture; returns whether it was taken as a view.
 
         Raises:
             DeltalightError: its size differs from the earlier ones.
@@ -108,7 +108,7 @@ class ViewCollector:
 
 
 def _apart_px(first: View, second: View) -> float:
-    """Return the mean distance between the points that both views show; infinite if there are none."""
+    """Returns the mean distance between the points that both views show; infinite if there are none."""
     _, ours, theirs = np.intersect1d(first.numbers, second.numbers, return_indices=True)
     if not len(ours):
         return float("inf")

@@ -16,13 +16,13 @@ class AccompaniedCamera(Camera):
 
     @abstractmethod
     def _completed(self, frame: SensorFrame) -> SensorFrame:
-        """Return the camera's newest frame with what the device found."""
+        """Returns the camera's newest frame with what the device found."""
 
     def _opened(self) -> None:
-        """Take over what the device tells of the camera, once both are open; what this raises closes them again."""
+        """Takes over what the device tells of the camera, once both are open; what this raises closes them again."""
 
     def open(self) -> None:
-        """Open both.
+        """Opens both.
 
         Raises:
             DeltalightError: one of them cannot be opened.
@@ -38,30 +38,30 @@ class AccompaniedCamera(Camera):
             self._stack = stack.pop_all()
 
     def close(self) -> None:
-        """Close both."""
+        """Closes both."""
         self._stack.close()
 
     def read(self) -> SensorFrame:
-        """Wait for the camera's next frame."""
+        """Waits for the camera's next frame."""
         return self._completed(self._camera.read())
 
     def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the camera's newest frame at once."""
+        """Returns the camera's newest frame at once."""
         return self._completed(self._camera.read_latest(max_age_s))
 
     def imu_samples(self) -> list[ImuSample]:
-        """Return what the camera's inertial unit measured since the last call."""
+        """Returns what the camera's inertial unit measured since the last call."""
         return self._camera.imu_samples()
 
     def interrupt(self) -> None:
-        """End a waiting `read`."""
+        """Ends a waiting `read`."""
         self._camera.interrupt()
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the camera's exposure."""
+        """Locks the camera's exposure."""
         self._camera.set_exposure(seconds)
 
     @property
     def capture_ns(self) -> int:
-        """Capture time of the camera's frame, in ns since 1970 by this host's clock."""
+        """Captures time of the camera's frame, in ns since 1970 by this host's clock."""
         return self._camera.capture_ns

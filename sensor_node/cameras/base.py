@@ -60,15 +60,15 @@ class Camera(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Start capture."""
+        """Starts capture."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop capture and release the device; idempotent."""
+        """Stops capture and releases the device; idempotent."""
 
     @abstractmethod
     def read(self) -> SensorFrame:
-        """Wait for the next frame and return it, without skipping any.
+        """Waits for the next frame and returns it, without skipping any.
 
         Raises:
             EndOfStream: there are no further frames.
@@ -76,7 +76,7 @@ class Camera(ABC):
 
     @abstractmethod
     def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the newest frame at once, skipping older ones.
+        """Returns the newest frame at once, skipping older ones.
 
         Raises:
             StaleFrameError: the newest frame is older than `max_age_s` seconds.
@@ -86,11 +86,11 @@ class Camera(ABC):
     @property
     @abstractmethod
     def capture_ns(self) -> int:
-        """Capture time of the last returned frame, in ns since 1970 by this host's clock."""
+        """Captures time of the last returned frame, in ns since 1970 by this host's clock."""
 
     @abstractmethod
     def interrupt(self) -> None:
-        """Make a waiting `read`, and later ones, end at once with EndOfStream; callable from any thread."""
+        """Makes a waiting `read`, and later ones, end at once with EndOfStream; callable from any thread."""
 
     @property
     def state(self) -> StreamState | None:
@@ -98,11 +98,11 @@ class Camera(ABC):
         return None
 
     def imu_samples(self) -> list[ImuSample]:
-        """Return the inertial unit's measurements since the last call, at most the last seconds."""
+        """Returns the inertial unit's measurements since the last call, at most the last seconds."""
         return []
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure; it takes effect some frames later.
+        """Locks the exposure; it takes effect some frames later.
 
         Raises:
             DeltalightError: the exposure of this camera cannot be set.

@@ -9,12 +9,12 @@ from deltalight.sensor_node.cameras.drivers import load_drivers
 
 
 def list_cameras() -> list[FoundCamera]:
-    """Return the live cameras of this machine; takes about a second where the OAK SDK is installed."""
+    """Returns the live cameras of this machine; takes about a second where the OAK SDK is installed."""
     return list(discover().cameras)
 
 
 def discover(root: Path = Path("/")) -> Discovery:
-    """Ask every driver for its cameras, which it finds in the file system below `root` or through its SDK."""
+    """Asks every driver for its cameras, which it finds in the file system below `root` or through its SDK."""
     drivers = load_drivers()
     cameras: list[FoundCamera] = []
     missing: list[MissingSupport] = []

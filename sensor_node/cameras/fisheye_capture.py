@@ -48,7 +48,7 @@ class FisheyeCapture:
         self._thread = threading.Thread(target=self._run, name="fisheye", daemon=True)
 
     def __enter__(self) -> Self:
-        """Open the camera and start capture.
+        """Opens the camera and starts capture.
 
         Raises:
             DeltalightError: the camera cannot be opened.
@@ -60,14 +60,14 @@ class FisheyeCapture:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop and close the camera."""
+        """Stops and closes the camera."""
         self._closing.set()
         self._camera.interrupt()
         self._thread.join()
         self._camera.close()
 
     def newest(self) -> FisheyePictures | None:
-        """Return the newest pictures (the same object until there are newer ones); None if there are none yet."""
+        """Returns the newest pictures (the same object until there are newer ones); None if there are none yet."""
         return self._newest
 
     @property
@@ -94,7 +94,7 @@ class FisheyeCapture:
         return self._pictures([self._exposed(exposure_s) for exposure_s in self._exposures_s])
 
     def _exposed(self, exposure_s: float) -> SensorFrame:
-        """Set an exposure and return the first frame that has it."""
+        """Sets an exposure and returns the first frame that has it."""
         self._camera.set_exposure(exposure_s)
         if not self._camera.exposure_is_measured:
             changed_ns = time.time_ns()

@@ -49,7 +49,7 @@ class LiveCalibration:
 
 
 def load_calibration(folder: Path | None, board: BoardSpec | None = None) -> LiveCalibration:
-    """Read a calibration folder (YAML files in it, or in its `calibration` as `deltalight calibrate` writes them).
+    """Reads a calibration folder (YAML files in it, or in its `calibration` as `deltalight calibrate` writes them).
 
     `board` replaces its board.yaml.
 
@@ -88,7 +88,7 @@ def _positive(info: dict[str, object], key: str, path: Path) -> float | None:
 def colour_camera(
     source: str, known: CameraModel | None, settings: CameraSettings, *, calibrated: bool
 ) -> CameraModel:
-    """Return the colour camera at its capture size; without calibration a nominal one, if allowed.
+    """Returns the colour camera at its capture size; without calibration a nominal one, if allowed.
 
     Raises:
         DeltalightError: there is no calibration, or its aspect ratio differs.
@@ -112,7 +112,7 @@ def colour_camera(
 
 
 def capture_size(known: CameraModel | None, settings: CameraSettings) -> tuple[int, int]:
-    """Return (width, height) of capture: as set, else as calibrated, else 1280x720."""
+    """Returns (width, height) of capture: as set, else as calibrated, else 1280x720."""
     default = (1280, 720) if known is None else (known.width, known.height)
     return settings.width or default[0], settings.height or default[1]
 
@@ -128,17 +128,17 @@ class HostClock:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     def stamp(self, monotonic_ns: int) -> int:
-        """Return the time of a frame by the camera's own clock, in ns since 1970."""
+        """Returns the time of a frame by the camera's own clock, in ns since 1970."""
         return monotonic_ns + self._offset_ns
 
     @staticmethod
     def now(monotonic_ns: int) -> int:
-        """Return the same moment in ns since 1970 by the host's current clock."""
+        """Returns the same moment in ns since 1970 by the host's current clock."""
         return time.time_ns() - (time.monotonic_ns() - monotonic_ns)
 
     @staticmethod
     def plausible(driver_ns: int, grabbed_ns: int) -> int:
-        """Return the driver's capture time if it is of this clock and recent, else when the frame was grabbed."""
+        """Returns the driver's capture time if it is of this clock and recent, else when the frame was grabbed."""
         return driver_ns if 0 <= grabbed_ns - driver_ns < PLAUSIBLE_AGE_NS else grabbed_ns
 
 
@@ -153,14 +153,14 @@ class LiveCamera(Camera):
 
     @abstractmethod
     def capture(self) -> SensorFrame:
-        """Wait for the next frame and note when it was captured (`note_capture`).
+        """Waits for the next frame and notes when it was captured (`note_capture`).
 
         Raises:
             CameraFailure: it gives none.
         """
 
     def read(self) -> SensorFrame:
-        """Wait for the next frame of the device; it buffers few, so keep reading."""
+        """Waits for the next frame of the device; it buffers few, so keep reading."""
         if self._interrupted.is_set():
             raise EndOfStream
         try:
@@ -171,7 +171,7 @@ class LiveCamera(Camera):
             raise
 
     def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the newest frame, skipping older ones that the driver still buffers."""
+        """Returns the newest frame, skipping older ones that the driver still buffers."""
         for _ in range(DRIVER_BUFFERS + 1):
             frame = self.read()
             age_s = (time.monotonic_ns() - self._capture_monotonic_ns) / 1e9
@@ -192,9 +192,9 @@ class LiveCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """Capture time of the last returned frame, in ns since 1970 by this host's current clock."""
+        """Captures time of the last returned frame, in ns since 1970 by this host's current clock."""
         return self.clock.now(self._capture_monotonic_ns)
 
     def interrupt(self) -> None:
-        """Make later `read`s end; one that waits for the driver ends with its frame or the driver's time-out."""
+        """Makes later `read`s end; one that waits for the driver ends with its frame or the driver's time-out."""
         self._interrupted.set()

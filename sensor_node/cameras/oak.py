@@ -62,7 +62,7 @@ class OakCamera(LiveCamera):
         self._iso = DEFAULT_ISO
 
     def open(self) -> None:
-        """Boot the device, read its lens from the first picture, and lock exposure and white balance as set.
+        """Boots the device, reads its lens from the first picture, and locks exposure and white balance as set.
 
         Raises:
             CameraFailure: it is absent or does not start.
@@ -83,20 +83,20 @@ class OakCamera(LiveCamera):
             raise
 
     def close(self) -> None:
-        """Release the device."""
+        """Releases the device."""
         if self._streams is not None:
             self.unpaired += self._pairing.unpaired
         self._streams = None
         self._device.close()
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure, at the sensitivity (ISO) of the newest picture."""
+        """Locks the exposure, at the sensitivity (ISO) of the newest picture."""
         control = load_depthai().CameraControl()
         control.setManualExposure(round(seconds * 1e6), self._iso)
         self._device.send(control)
 
     def capture(self) -> SensorFrame:
-        """Wait for the next picture, with its depth if that arrives in time."""
+        """Waits for the next picture, with its depth if that arrives in time."""
         picture, depth = self._pair()
         self.note_capture(nanoseconds(picture.getTimestamp()))
         self._iso = picture.getSensitivity() or self._iso
@@ -114,7 +114,7 @@ class OakCamera(LiveCamera):
         )
 
     def imu_samples(self) -> list[ImuSample]:
-        """Return the IMU's measurements since the last call, at most the last seconds."""
+        """Returns the IMU's measurements since the last call, at most the last seconds."""
         queue = None if self._streams is None else self._streams.imu
         if queue is None or queue.isClosed():
             return []
@@ -160,7 +160,7 @@ class OakCamera(LiveCamera):
         self._device.send(control)
 
     def _pair(self) -> tuple[Any, Any]:
-        """Wait for the next picture and its depth (messages of the SDK)."""
+        """Waits for the next picture and its depth (messages of the SDK)."""
         dai, streams = load_depthai(), self._streams
         while streams is not None and not self._interrupted.is_set():
             queues = [streams.color] if streams.depth is None else [streams.color, streams.depth]

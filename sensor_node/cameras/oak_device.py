@@ -46,7 +46,7 @@ class OakDevice:
         self._control: Any = None
 
     def open(self, settings: CameraSettings, size: tuple[int, int], *, with_depth: bool) -> OakStreams:
-        """Boot the device and start its pipeline; takes a few seconds.
+        """Boots the device and starts its pipeline; takes a few seconds.
 
         Raises:
             CameraFailure: no such device, no permission, in use, or it does not boot.
@@ -71,7 +71,7 @@ class OakDevice:
         return streams
 
     def close(self) -> None:
-        """Stop the pipeline and release the device."""
+        """Stops the pipeline and releases the device."""
         if self._pipeline is not None:
             self._pipeline.stop()
             self._pipeline.wait()
@@ -85,7 +85,7 @@ class OakDevice:
         return self._pipeline is not None and self._pipeline.isRunning() and not self._device.isClosed()
 
     def send(self, control: Any) -> None:  # noqa: ANN401 - a CameraControl of the SDK
-        """Send a control to the colour camera."""
+        """Sends a control to the colour camera."""
         self._control.send(control)
 
     def _find(self, dai: Any) -> Any:  # noqa: ANN401 - a DeviceInfo of the SDK
@@ -143,14 +143,14 @@ class OakDevice:
             control.setManualFocus(position)
 
     def _encoded(self, dai: Any, color: Any, fps: float) -> Any:  # noqa: ANN401
-        """Add a JPEG encoder on the device: a tenth of the bytes, which USB 2 and Ethernet can carry."""
+        """Adds a JPEG encoder on the device: a tenth of the bytes, which USB 2 and Ethernet can carry."""
         profile = dai.VideoEncoderProperties.Profile.MJPEG
         encoder = self._pipeline.create(dai.node.VideoEncoder)
         encoder.build(color, frameRate=fps, profile=profile, quality=JPEG_QUALITY)
         return _queue(encoder.out)
 
     def _aligned_depth(self, dai: Any, color: Any, settings: CameraSettings) -> Any:  # noqa: ANN401
-        """Add depth in mm, aligned to the colour camera; temporal filters are the node's task.
+        """Adds depth in mm, aligned to the colour camera; temporal filters are the node's task.
 
         Raises:
             DeltalightError: the settings ask for a network that the device cannot run.
@@ -186,7 +186,7 @@ class OakDevice:
         return stereo
 
     def _neural_depth(self, dai: Any, left: Any, right: Any, settings: CameraSettings) -> Any:  # noqa: ANN401
-        """Add the device's own network, which rectifies and scales the whole pictures itself."""
+        """Adds the device's own network, which rectifies and scales the whole pictures itself."""
         model = getattr(dai.DeviceModelZoo, f"NEURAL_DEPTH_{str(settings.neural_depth).upper()}")
         pair = (camera.requestFullResolutionOutput(fps=settings.fps) for camera in (left, right))
         return self._pipeline.create(dai.node.NeuralDepth).build(*pair, model)
@@ -200,5 +200,5 @@ class OakDevice:
 
 
 def _queue(output: Any, size: int = QUEUE_SIZE) -> Any:  # noqa: ANN401 - an Output of the SDK
-    """Create a queue in which a new message replaces the oldest if nobody reads."""
+    """Creates a queue in which a new message replaces the oldest if nobody reads."""
     return output.createOutputQueue(maxSize=size, blocking=False)

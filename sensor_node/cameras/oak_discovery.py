@@ -39,7 +39,7 @@ def _cameras(root: Path) -> list[FoundCamera]:
 
 
 def describe_camera(info: Any) -> FoundCamera:  # noqa: ANN401 - a DeviceInfo of the SDK
-    """Describe a device that the SDK sees."""
+    """Describes a device that the SDK sees."""
     dai = load_depthai()
     refused = info.status == dai.XLinkError_t.X_LINK_INSUFFICIENT_PERMISSIONS
     is_booted = info.state == dai.XLinkDeviceState.X_LINK_BOOTED

@@ -28,12 +28,12 @@ LONGEST_WAIT_FRAMES = 5
 
 
 def nanoseconds(time: timedelta) -> int:
-    """Return a time of the SDK in ns: CLOCK_MONOTONIC of the host, to the microsecond."""
+    """Returns a time of the SDK in ns: CLOCK_MONOTONIC of the host, to the microsecond."""
     return time // timedelta(microseconds=1) * 1000
 
 
 def camera_from_calibration(handler: Any, socket: Any, width: int, height: int) -> CameraModel:  # noqa: ANN401
-    """Return the camera of uncorrected pictures of a size that is cropped to its shape, then scaled.
+    """Returns the camera of uncorrected pictures of a size that is cropped to its shape, then scaled.
 
     Raises:
         DeltalightError: the device was not calibrated, or its lens model is not supported.
@@ -53,7 +53,7 @@ def camera_from_calibration(handler: Any, socket: Any, width: int, height: int) 
 
 
 def camera_from_picture(message: Message, *, corrected: bool) -> CameraModel | None:
-    """Return the camera that a picture reports; None if it reports none.
+    """Returns the camera that a picture reports; None if it reports none.
 
     `corrected` pictures were undistorted on the device; the camera they carry is the sensor's.
     """
@@ -76,7 +76,7 @@ def _lens(model: Any) -> Lens:  # noqa: ANN401 - an enumeration of the SDK
 
 
 def depth_noise_m(handler: Any, left: Any, right: Any, stereo_size: tuple[int, int]) -> float | None:  # noqa: ANN401
-    """Return the noise of stereo depth at 1 m: that of the disparity over focal length times baseline.
+    """Returns the noise of stereo depth at 1 m: that of the disparity over focal length times baseline.
 
     z = f b / d, so sigma_z = z^2 sigma_d / (f b).
     """
@@ -88,7 +88,7 @@ def depth_noise_m(handler: Any, left: Any, right: Any, stereo_size: tuple[int, i
 
 
 def picture_of(message: Message, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
-    """Return the RGB picture of an ImgFrame or of an EncodedFrame (MJPEG), with the JPEG's bytes of the latter."""
+    """Returns the RGB picture of an ImgFrame or of an EncodedFrame (MJPEG), with the JPEG's bytes of the latter."""
     if hasattr(message, "getBitrate"):
         data = bytes(message.getData())
         return decode_rgb(data, name), data
@@ -98,7 +98,7 @@ def picture_of(message: Message, name: str) -> tuple[UInt8[np.ndarray, "h w 3"],
 
 
 def depth_of(message: Message, camera: CameraModel, noise_sigma_m: float | None) -> DepthImage:
-    """Return the depth of a 16-bit ImgFrame in mm that is aligned with `camera`, possibly at another size."""
+    """Returns the depth of a 16-bit ImgFrame in mm that is aligned with `camera`, possibly at another size."""
     steps = np.asarray(message.getFrame(), np.uint16)
     height, width = steps.shape
     own = camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
@@ -106,13 +106,13 @@ def depth_of(message: Message, camera: CameraModel, noise_sigma_m: float | None)
 
 
 def exposure_of(message: Message) -> float | None:
-    """Return the exposure of a picture as reported by the sensor, in seconds."""
+    """Returns the exposure of a picture as reported by the sensor, in seconds."""
     seconds: float = message.getExposureTime().total_seconds()
     return seconds if seconds > 0 else None
 
 
 def imu_samples(message: Message, stamp: Any) -> list[ImuSample]:  # noqa: ANN401 - ns -> ns
-    """Return the readings of an IMUData message; `stamp` converts CLOCK_MONOTONIC to the time of the frames."""
+    """Returns the readings of an IMUData message; `stamp` converts CLOCK_MONOTONIC to the time of the frames."""
     samples = []
     for packet in message.packets:
         force, rate = packet.acceleroMeter, packet.gyroscope
@@ -140,15 +140,15 @@ class Pairing:
         self._depths: deque[tuple[int, Message]] = deque(maxlen=2 * LONGEST_WAIT_FRAMES)
 
     def add_picture(self, message: Message) -> None:
-        """Add a picture."""
+        """Adds a picture."""
         self._pictures.append((nanoseconds(message.getTimestamp()), message))
 
     def add_depth(self, message: Message) -> None:
-        """Add a depth image."""
+        """Adds a depth image."""
         self._depths.append((nanoseconds(message.getTimestamp()), message))
 
     def next(self) -> tuple[Message, Message | None] | None:
-        """Return the oldest picture with its depth, once it is certain whether there is any."""
+        """Returns the oldest picture with its depth, once it is certain whether there is any."""
         if not self._pictures:
             return None
         time_ns, picture = self._pictures[0]

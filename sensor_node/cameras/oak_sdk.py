@@ -20,7 +20,7 @@ INSTALL_HINT = install_command(f"depthai>={'.'.join(map(str, OLDEST))}")  # by i
 
 
 def sdk_version() -> str | None:
-    """Return the version of the SDK; None if it is not installed."""
+    """Returns the version of the SDK; None if it is not installed."""
     try:
         return version("depthai")
     except PackageNotFoundError:
@@ -28,7 +28,7 @@ def sdk_version() -> str | None:
 
 
 def load_depthai() -> Any:  # noqa: ANN401 - the SDK is optional, so its types are not at hand
-    """Import the SDK; the user's own environment variables take precedence.
+    """Imports the SDK; the user's own environment variables take precedence.
 
     Raises:
         DeltalightError: it is not installed, or too old.

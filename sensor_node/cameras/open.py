@@ -35,7 +35,7 @@ def open_camera(
     calibrated: bool = True,
     depth: bool = True,
 ) -> Camera:
-    """Return the camera that `source` names, not opened yet (it is a context manager).
+    """Returns the camera that `source` names, not opened yet (it is a context manager).
 
     Args:
         source: `synthetic`, a dataset folder, an .mcap recording, or a live camera: `uvc:0`,
@@ -88,7 +88,7 @@ def _kind(source: str) -> str:
 
 
 def open_fisheye(settings: FisheyeSettings, calibration: Path | None = None) -> FisheyeCapture:
-    """Return the camera that sees the light, not opened yet (it is a context manager).
+    """Returns the camera that sees the light, not opened yet (it is a context manager).
 
     `calibration` is the folder to search for fisheye.yaml if the settings name none.
 
@@ -120,7 +120,7 @@ def _fisheye_calibration(source: str, folder: Path | None) -> FisheyeCalibration
 
 
 def _of_fisheye(settings: CameraSettings, known: FisheyeCalibration | None) -> CameraSettings:
-    """Return settings with the lens's size; the folder's rgb.yaml belongs to another camera."""
+    """Returns settings with the lens's size; the folder's rgb.yaml belongs to another camera."""
     size = {} if known is None else {"width": known.lens.width, "height": known.lens.height}
     chosen = settings.model_dump(include={"width", "height"}, exclude_none=True)
     return settings.model_copy(update={"calibration": None, **size, **chosen})

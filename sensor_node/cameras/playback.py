@@ -80,17 +80,17 @@ class PlaybackCamera(Camera):
         self.depth_scale, self.notes = source.depth_scale, source.notes
 
     def open(self) -> None:
-        """Start the clock at the first frame."""
+        """Starts the clock at the first frame."""
         with self._changed:
             self._interrupted = False
             self._begin(self._index)
 
     def close(self) -> None:
-        """End any waiting `read`."""
+        """Ends any waiting `read`."""
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Make a waiting `read`, and every later one until `open`, end with EndOfStream."""
+        """Makes a waiting `read`, and every later one until `open`, end with EndOfStream."""
         with self._changed:
             self._interrupted = True
             self._changed.notify_all()
@@ -113,7 +113,7 @@ class PlaybackCamera(Camera):
             )
 
     def play(self) -> None:
-        """Resume, from the beginning if it is at the end (any thread)."""
+        """Resumes, from the beginning if it is at the end (any thread)."""
         with self._changed:
             if not self._playing:
                 self._playing = True
@@ -122,13 +122,13 @@ class PlaybackCamera(Camera):
                 self._begin(0 if is_at_end else self._index, is_shown=not is_at_end)
 
     def pause(self) -> None:
-        """Pause at the current frame (any thread)."""
+        """Pauses at the current frame (any thread)."""
         with self._changed:
             self._playing = False
             self._changed.notify_all()
 
     def seek(self, position_s: float) -> None:
-        """Continue at another position, seconds from the first frame, clamped to the recording (any thread).
+        """Continues at another position, seconds from the first frame, clamped to the recording (any thread).
 
         Raises:
             DeltalightError: the position is not a number.
@@ -138,13 +138,13 @@ class PlaybackCamera(Camera):
             self._begin(self._index_at(position_s))
 
     def step(self, frames: int) -> None:
-        """Go to the frame so many after the current one, or before it, within the recording (any thread)."""
+        """Goes to the frame so many after the current one, or before it, within the recording (any thread)."""
         with self._changed:
             self._jumped = True
             self._begin(min(max(self._index + frames, 0), len(self._times) - 1))
 
     def set_rate(self, rate: float) -> None:
-        """Play this many recorded seconds per second (any thread).
+        """Plays this many recorded seconds per second (any thread).
 
         Raises:
             DeltalightError: the rate is out of range.
@@ -154,7 +154,7 @@ class PlaybackCamera(Camera):
             self._begin(self._index, is_shown=self._is_shown)
 
     def read(self) -> SensorFrame:
-        """Wait for the next frame, or for the time to repeat the current one.
+        """Waits for the next frame, or for the time to repeat the current one.
 
         Raises:
             EndOfStream: the recording has ended, and does not stay there.
@@ -173,7 +173,7 @@ class PlaybackCamera(Camera):
         return self.read()
 
     def _wait(self) -> tuple[int, int]:
-        """Wait until a frame is due and return its index and time (monotonic ns).
+        """Waits until a frame is due and returns its index and time (monotonic ns).
 
         Commands may change both meanwhile.
         """
@@ -197,7 +197,7 @@ class PlaybackCamera(Camera):
         return self._following()
 
     def _following(self) -> tuple[int, int]:
-        """Return the next frame; if the replay is far behind, the newest that is due."""
+        """Returns the next frame; if the replay is far behind, the newest that is due."""
         index, due_ns, late_ns = self._index, self._due_ns, time.monotonic_ns() - self._due_ns
         if index == len(self._times) - 1:
             return 0, due_ns + int(self._period_ns / self._rate)
@@ -208,7 +208,7 @@ class PlaybackCamera(Camera):
         return following, due_ns + int((self._times[following] - self._times[index]) / self._rate)
 
     def _begin(self, index: int, *, is_shown: bool = False) -> None:
-        """Make a frame due now; unless it `is_shown` already, it is the target of a jump."""
+        """Makes a frame due now; unless it `is_shown` already, it is the target of a jump."""
         self._index, self._is_shown, self._due_ns = index, is_shown, time.monotonic_ns()
         self._changed.notify_all()
 
@@ -219,7 +219,7 @@ class PlaybackCamera(Camera):
         return max(int(np.searchsorted(self._times, wanted, "right")) - 1, 0)
 
     def _stamp_of(self, due_ns: int) -> int:
-        """Return this host's clock at a monotonic time, even after the clock was set."""
+        """Returns this host's clock at a monotonic time, even after the clock was set."""
         wall_ns = time.time_ns() - time.monotonic_ns()
         if abs(wall_ns - self._wall_ns) > CLOCK_STEP_NS:
             self._wall_ns = wall_ns
@@ -237,7 +237,7 @@ class _RisingNumbers:
         self._pictures: tuple[FisheyePictures, FisheyePictures] | None = None
 
     def __call__(self, frame: SensorFrame, index: int, capture_ns: int, *, jumped: bool) -> SensorFrame:
-        """Return frame `index`, due at `capture_ns`, renumbered; `jumped` if a command selected it."""
+        """Returns frame `index`, due at `capture_ns`, renumbered; `jumped` if a command selected it."""
         last, is_again = self._last, index == self._index
         if last is not None and (jumped or index <= self._index):
             gap_ns = JUMP_NS if jumped else capture_ns - self._capture_ns if is_again else self._period_ns
@@ -257,7 +257,7 @@ class _RisingNumbers:
         return self._last
 
     def _held(self, pictures: FisheyePictures) -> FisheyePictures:
-        """Return the restamped pictures, not before the last jump; the same object while they are current."""
+        """Returns the restamped pictures, not before the last jump; the same object while they are current."""
         if self._pictures is None or self._pictures[0] is not pictures:
             shown_ns = max(pictures.timestamp_ns + self._shift_ns, self._since_ns)
             self._pictures = pictures, replace(pictures, timestamp_ns=shown_ns)

@@ -55,7 +55,7 @@ class ReconnectingCamera(Camera):
         self._describe()
 
     def open(self) -> None:
-        """Open the camera and start reading.
+        """Opens the camera and starts reading.
 
         Raises:
             DeltalightError: it cannot be opened, or its driver still hangs in an earlier read.
@@ -73,14 +73,14 @@ class ReconnectingCamera(Camera):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop reading and release the device."""
+        """Stops reading and releases the device."""
         self.interrupt()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
             self._thread = self._thread if self._thread.is_alive() else None
 
     def interrupt(self) -> None:
-        """End a waiting `read` and the attempts to reopen the camera."""
+        """Ends a waiting `read` and the attempts to reopen the camera."""
         self._closing.set()
         self._inner.interrupt()
         with self._changed:
@@ -88,7 +88,7 @@ class ReconnectingCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """Capture time of the last returned frame, in ns since 1970 by this host's clock."""
+        """Captures time of the last returned frame, in ns since 1970 by this host's clock."""
         return self._capture_ns
 
     @property
@@ -108,7 +108,7 @@ class ReconnectingCamera(Camera):
             return StreamState("live", f"{self._name}: {remark}" if remark else "live")
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure between two frames.
+        """Locks the exposure between two frames.
 
         Raises:
             DeltalightError: the camera cannot, or it is disconnected.
@@ -124,12 +124,12 @@ class ReconnectingCamera(Camera):
             raise self._away() from None
 
     def imu_samples(self) -> list[ImuSample]:
-        """Return the inertial unit's measurements since the last call; none while the camera is disconnected."""
+        """Returns the inertial unit's measurements since the last call; none while the camera is disconnected."""
         with self._changed:
             return [] if self._fault is not None else self._inner.imu_samples()
 
     def read(self) -> SensorFrame:
-        """Wait for the next frame, however long the camera is disconnected."""
+        """Waits for the next frame, however long the camera is disconnected."""
         with self._changed:
             while not self._kept and not self._closing.is_set():
                 self._wait()
@@ -138,7 +138,7 @@ class ReconnectingCamera(Camera):
             return self._give(self._kept.popleft())
 
     def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the newest frame at once."""
+        """Returns the newest frame at once."""
         with self._changed:
             if self._closing.is_set():
                 raise EndOfStream
@@ -159,7 +159,7 @@ class ReconnectingCamera(Camera):
         return kept.frame
 
     def _wait(self) -> None:
-        """Wait for a frame; a stalled camera is told to end its read, which then counts as a failure."""
+        """Waits for a frame; a stalled camera is told to end its read, which then counts as a failure."""
         left_s = self._seen_at + self._stall_s - time.monotonic()
         if left_s <= 0 and self._fault is None and not self._is_given_up:
             self._is_given_up = True
@@ -206,7 +206,7 @@ class ReconnectingCamera(Camera):
             done.set_exception(error)
 
     def _refuse_exposure(self) -> None:
-        """Wake those who wait for an exposure that will not be set."""
+        """Wakes those who wait for an exposure that will not be set."""
         with self._changed:
             request, self._exposure = self._exposure, None
         if request is not None:
@@ -231,7 +231,7 @@ class ReconnectingCamera(Camera):
             self._numbering.restart()
 
     def _describe(self) -> None:
-        """Copy the camera's properties; a live one may know its lens only once it is open."""
+        """Copies the camera's properties; a live one may know its lens only once it is open."""
         inner = self._inner
         if hasattr(inner, "camera"):
             self.camera = inner.camera

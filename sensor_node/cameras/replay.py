@@ -47,20 +47,20 @@ class PacedCamera(Camera):
 
     @abstractmethod
     def frame_at(self, index: int) -> SensorFrame:
-        """Return frame `index` of the first round, as recorded."""
+        """Returns frame `index` of the first round, as recorded."""
 
     def open(self) -> None:
-        """Start the clock at the first frame."""
+        """Starts the clock at the first frame."""
         self._next = 0
         self._interrupted.clear()
         self._opened_ns, self._opened_monotonic_ns = time.time_ns(), time.monotonic_ns()
 
     def close(self) -> None:
-        """End any waiting `read`."""
+        """Ends any waiting `read`."""
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Make a waiting `read`, and every later one until `open`, end with EndOfStream."""
+        """Makes a waiting `read`, and every later one until `open`, end with EndOfStream."""
         self._interrupted.set()
 
     @property
@@ -69,7 +69,7 @@ class PacedCamera(Camera):
         return self._capture_ns
 
     def read(self) -> SensorFrame:
-        """Wait until the next frame is due and return it."""
+        """Waits until the next frame is due and returns it."""
         if self._interrupted.is_set() or (not self._loop and self._next >= len(self._times)):
             raise EndOfStream
         if self._realtime and self._loop and self._elapsed_ns() - self._due_ns(self._next) > LATE_NS:
@@ -80,7 +80,7 @@ class PacedCamera(Camera):
         return self._take(self._next)
 
     def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the newest frame that is due; without real time, the next one."""
+        """Returns the newest frame that is due; without real time, the next one."""
         if not self._realtime:
             return self.read()
         if self._interrupted.is_set():
@@ -98,7 +98,7 @@ class PacedCamera(Camera):
         return time.monotonic_ns() - self._opened_monotonic_ns
 
     def _due_ns(self, number: int) -> int:
-        """Return the time after `open` at which frame `number`, counted over all rounds, is due."""
+        """Returns the time after `open` at which frame `number`, counted over all rounds, is due."""
         rounds, index = divmod(number, len(self._times))
         return rounds * self._round_ns + int(self._times[index] - self._times[0])
 
@@ -132,7 +132,7 @@ class PacedCamera(Camera):
         )
 
     def _fisheye_of_round(self, pictures: FisheyePictures, later_ns: int) -> FisheyePictures:
-        """Return the pictures with the time of this round, the same object while they are current."""
+        """Returns the pictures with the time of this round, the same object while they are current."""
         known = self._repeated
         if known is None or known[0] is not pictures or known[1] != later_ns:
             shifted = replace(pictures, timestamp_ns=pictures.timestamp_ns + later_ns)
@@ -168,5 +168,5 @@ class ReplayCamera(PacedCamera):
         self.depth_scale, self.notes = source.depth_scale, source.notes
 
     def frame_at(self, index: int) -> SensorFrame:
-        """Return the frame as recorded; its `frame_id` is that of the source."""
+        """Returns the frame as recorded; its `frame_id` is that of the source."""
         return self._source[self._frames[index]]

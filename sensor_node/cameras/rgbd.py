@@ -62,7 +62,7 @@ def has_backend(kind: Kind) -> bool:
 
 
 def backend_hint(kind: Kind) -> str:
-    """Return what to do if it does not."""
+    """Returns what to do if it does not."""
     return f"for such a camera, {BACKENDS[kind].advice}"
 
 
@@ -97,7 +97,7 @@ class RgbdCamera(LiveCamera):
         self._frames = 0
 
     def open(self) -> None:
-        """Open the device and request depth registered to colour.
+        """Opens the device and requests depth registered to colour.
 
         Raises:
             CameraFailure: it is absent, or another program uses it.
@@ -109,11 +109,11 @@ class RgbdCamera(LiveCamera):
             self._capture.set(cv2.CAP_PROP_OPENNI_REGISTRATION, 1)
 
     def close(self) -> None:
-        """Release the device."""
+        """Releases the device."""
         self._capture.release()
 
     def capture(self) -> SensorFrame:
-        """Wait for the next pair of pictures."""
+        """Waits for the next pair of pictures."""
         if not self._capture.grab():
             raise CameraFailure(f"{self.source} no longer sends pictures; check that it is plugged in.")
         self.note_capture(time.monotonic_ns())

@@ -32,7 +32,7 @@ class SyntheticNoise:
 
 
 def default_board() -> BoardSpec:
-    """Return the board of the synthetic scene: a grid of 3x4 ArUco markers of 5 cm."""
+    """Returns the board of the synthetic scene: a grid of 3x4 ArUco markers of 5 cm."""
     return BoardSpec.model_validate(
         {
             "type": "aruco_grid",
@@ -47,7 +47,7 @@ def default_board() -> BoardSpec:
 
 
 def default_camera() -> CameraModel:
-    """Return the camera of the synthetic scene: 640x480, 65 degrees wide, without distortion."""
+    """Returns the camera of the synthetic scene: 640x480, 65 degrees wide, without distortion."""
     return CameraModel(640, 480, np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]))
 
 
@@ -79,7 +79,7 @@ class SyntheticCamera(PacedCamera):
         self._noise, self._period_ns = noise, period_ns
 
     def pose_at(self, index: int) -> Float64[np.ndarray, "4 4"]:
-        """Return the true world_from_camera of a frame, swaying in front of the board's middle."""
+        """Returns the true world_from_camera of a frame, swaying in front of the board's middle."""
         phase = 2 * np.pi * (index % FRAMES_PER_ROUND) / FRAMES_PER_ROUND
         sway, tilt = SWAY_RAD * np.sin(phase), TILT_RAD + 0.1 * np.cos(phase)
         # The board fills about half the picture's width.
@@ -93,7 +93,7 @@ class SyntheticCamera(PacedCamera):
         return pose
 
     def frame_at(self, index: int) -> SensorFrame:
-        """Return the frame of the path's first round."""
+        """Returns the frame of the path's first round."""
         pose = self.pose_at(index)
         linear = self.scene.picture(self._fine, pose)
         depth_m = self.scene.trace(self.camera, pose).depth_m
@@ -126,6 +126,6 @@ _SRGB_OF_LINEAR = _srgb_table(1 << 14)
 
 
 def srgb_codes(linear: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the 8-bit sRGB codes of linear light (IEC 61966-2-1)."""
+    """Returns the 8-bit sRGB codes of linear light (IEC 61966-2-1)."""
     steps = np.clip(linear * (len(_SRGB_OF_LINEAR) - 1) + 0.5, 0, len(_SRGB_OF_LINEAR) - 1)
     return np.asarray(_SRGB_OF_LINEAR[steps.astype(np.int32)])

@@ -42,7 +42,7 @@ class Hits(NamedTuple):
 
 
 def irradiance(normal: Float64[np.ndarray, "3"]) -> float:
-    """Return the irradiance of a surface with this normal, in camera units."""
+    """Returns the irradiance of a surface with this normal, in camera units."""
     return float(AMBIENT_IRRADIANCE + LAMP_IRRADIANCE * max(normal @ TO_LAMP, 0))
 
 
@@ -81,7 +81,7 @@ class SyntheticScene:
         return SHEET_MARGIN * self.board.marker_length_m
 
     def trace(self, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]) -> Hits:
-        """Intersect the ray through every pixel centre with the table and the box."""
+        """Intersects the ray through every pixel centre with the table and the box."""
         turn, eye = world_from_camera[:3, :3].astype(np.float32), world_from_camera[:3, 3]
         rays = camera.rays()
         direction = [rays[..., 0] * row[0] + rays[..., 1] * row[1] + row[2] for row in turn]
@@ -98,7 +98,7 @@ class SyntheticScene:
     def picture(
         self, fine: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Return linear radiance, averaged over SAMPLES_PER_EDGE x SAMPLES_PER_EDGE pixels of `fine`."""
+        """Returns linear radiance, averaged over SAMPLES_PER_EDGE x SAMPLES_PER_EDGE pixels of `fine`."""
         hits = self.trace(fine, world_from_camera)
         on_table = ((hits.depth_m > 0) & (hits.box_irradiance == 0)).astype(np.float32)
         paper = _look_up(self._sheet, hits.x, hits.y) * on_table
@@ -113,7 +113,7 @@ class SyntheticScene:
         return np.asarray(reflected / np.pi, np.float32)
 
     def _box_hit(self, eye: Float64[np.ndarray, "3"], direction: list[Field]) -> tuple[Field, Field]:
-        """Return the distance at which each ray enters the box (infinity: never), and the irradiance of that face."""
+        """Returns the distance at which each ray enters the box (infinity: never), and that face's irradiance."""
         enter, leave = np.full_like(direction[0], -np.inf), np.full_like(direction[0], np.inf)
         light = np.zeros_like(enter)
         for axis, (low, high) in enumerate(self.box_bounds.T - eye[:, None]):
@@ -136,7 +136,7 @@ class SyntheticScene:
 
     @cached_property
     def _sheet(self) -> "_Texture":
-        """Return the albedo of the printed sheet, exact on average over each texel."""
+        """Returns the albedo of the printed sheet, exact on average over each texel."""
         board, outline = self.board, self.board.sheet_outline()
         cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
         texel = board.marker_length_m / cells / TEXELS_PER_CELL
@@ -162,7 +162,7 @@ class SyntheticScene:
     def _print_squares(
         self, albedo: Field, right: Float64[np.ndarray, " w"], down: Float64[np.ndarray, " h"]
     ) -> None:
-        """Print the black squares of a ChArUco board; (row + column) even."""
+        """Prints the black squares of a ChArUco board; (row + column) even."""
         square = self.board.marker_length_m + self.board.separation_m
         column, row = np.floor(right / square), np.floor(down / square)
         black = (column[None] + row[:, None]) % 2 == 0
@@ -202,7 +202,7 @@ def _print(
     down: Float64[np.ndarray, " h"],
     length_m: float,
 ) -> None:
-    """Print a marker; `right` and `down` are the positions of the columns and rows from its top-left corner."""
+    """Prints a marker; `right` and `down` are the positions of the columns and rows from its top-left corner."""
     columns, rows = (np.flatnonzero((place >= 0) & (place < length_m)) for place in (right, down))
     column, row = (
         (right[columns] / length_m * len(cells)).astype(int),
@@ -213,7 +213,7 @@ def _print(
 
 
 def _marker_cells(board: BoardSpec, name: int) -> Bool[np.ndarray, "n n"]:
-    """Return the cells of a marker with its black border, True = white."""
+    """Returns the cells of a marker with its black border, True = white."""
     dictionary = board.opencv_dictionary()
     cells = dictionary.markerSize + 2 * board.border_bits
     return np.asarray(dictionary.generateImageMarker(name, cells, borderBits=board.border_bits) > 127)

@@ -66,7 +66,7 @@ class UvcCamera(LiveCamera):
         self._frames = 0
 
     def open(self) -> None:
-        """Open the device, lock exposure and white balance as set.
+        """Opens the device, locks exposure and white balance as set.
 
         Raises:
             CameraFailure: it is absent, or another program uses it.
@@ -85,17 +85,17 @@ class UvcCamera(LiveCamera):
             raise
 
     def close(self) -> None:
-        """Release the device."""
+        """Releases the device."""
         if self._capture is not None:
             self._capture.release()
         self._capture = None
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure to the nearest step of 0.1 ms; it takes effect a few frames later."""
+        """Locks the exposure to the nearest step of 0.1 ms; it takes effect a few frames later."""
         self._controls.set_exposure(seconds)
 
     def capture(self) -> SensorFrame:
-        """Wait for the next picture."""
+        """Waits for the next picture."""
         exposure_s = self._controls.exposure_s
         color, jpeg = self._take()
         self._frames += 1
@@ -164,7 +164,7 @@ class UvcCamera(LiveCamera):
             )
 
     def _grab(self) -> np.ndarray:
-        """Wait for the next picture as the backend gives it, and note its capture time."""
+        """Waits for the next picture as the backend gives it, and notes its capture time."""
         capture = self._capture
         if capture is None or not capture.grab():
             raise CameraFailure(f"{self.source} no longer sends pictures; check that it is plugged in.")
@@ -176,7 +176,7 @@ class UvcCamera(LiveCamera):
         return np.asarray(raw if given else np.empty(0, np.uint8))
 
     def _take(self) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
-        """Return the next complete picture, RGB, and its JPEG if that came."""
+        """Returns the next complete picture, RGB, and its JPEG if that came."""
         for _ in range(BROKEN_IN_A_ROW):
             picture = decode(self._grab(), self.source)
             if picture is not None:
@@ -185,7 +185,7 @@ class UvcCamera(LiveCamera):
 
 
 def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None] | None:
-    """Return (RGB, JPEG or None) of OpenCV's output: a BGR picture or a JPEG's bytes; None if it is broken."""
+    """Returns (RGB, JPEG or None) of OpenCV's output: a BGR picture or a JPEG's bytes; None if it is broken."""
     if raw.ndim == 3 and raw.shape[2] == 3:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)), None
     data = raw.tobytes()

@@ -18,10 +18,10 @@ class Properties(Protocol):
     """The part of `cv2.VideoCapture` used here."""
 
     def get(self, prop: int, /) -> float:
-        """Return the value of a property; -1 or 0 if unknown."""
+        """Returns the value of a property; -1 or 0 if unknown."""
 
     def set(self, prop: int, value: float, /) -> bool:
-        """Set a property; return False if that fails."""
+        """Sets a property; returns False if that fails."""
 
 
 class UvcControls:
@@ -37,7 +37,7 @@ class UvcControls:
         return self._locked_s if self._locked_s is not None else self._read_exposure()
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure to the nearest of the camera's steps.
+        """Locks the exposure to the nearest of the camera's steps.
 
         Raises:
             DeltalightError: the camera has no such control, or refuses this value.
@@ -52,7 +52,7 @@ class UvcControls:
         self._locked_s = self._read_exposure()
 
     def set_white_balance(self, kelvin: int) -> None:
-        """Lock the colour temperature.
+        """Locks the colour temperature.
 
         Raises:
             DeltalightError: the camera has no such control.
@@ -64,13 +64,13 @@ class UvcControls:
             )
 
     def release(self) -> None:
-        """Let the camera choose both, so that it can settle; controls persist from earlier programs."""
+        """Lets the camera choose both, so that it can settle; controls persist from earlier programs."""
         self._locked_s = None
         self._choose(cv2.CAP_PROP_AUTO_EXPOSURE, AUTOMATIC)
         self._choose(cv2.CAP_PROP_AUTO_WB, 1.0)
 
     def keep(self, *, exposure: bool, white_balance: bool) -> str:
-        """Lock what the camera has chosen; return what could not be locked, for the user."""
+        """Locks what the camera has chosen; returns what could not be locked, for the user."""
         seconds, kelvin = self._read_exposure(), self._capture.get(cv2.CAP_PROP_WB_TEMPERATURE)
         refused = []
         # A value that the camera does not report must not be guessed: the picture could become black.

@@ -31,12 +31,12 @@ class LinearPicture(NamedTuple):
 
 
 def reference_exposure(exposures_s: Iterable[float | None]) -> float | None:
-    """Return the exposure in which 1.0 is white: the longest of a bracket, None if none is reported."""
+    """Returns the exposure in which 1.0 is white: the longest of a bracket, None if none is reported."""
     return max((each for each in exposures_s if each is not None), default=None)
 
 
 def merge_bracket(bracket: FisheyePictures, reference_s: float | None) -> LinearPicture:
-    """Merge exposures, each weighted by the inverse variance of the light that it indicates.
+    """Merges exposures, each weighted by the inverse variance of the light that it indicates.
 
     An exposure of t (in reference exposures) that shows the linear value c indicates c/t with a variance of v(c)/t^2,
     v being Poisson noise, read noise and the rounding of the code. Clipped values have no weight, nor do values
@@ -110,7 +110,7 @@ def _single(bracket: FisheyePictures, scale: float) -> LinearPicture:
 
 
 def _scale(exposure_s: float | None, reference_s: float | None) -> float:
-    """Return the exposure in units of the reference."""
+    """Returns the exposure in units of the reference."""
     return 1.0 if exposure_s is None or reference_s is None else exposure_s / reference_s
 
 
@@ -142,7 +142,7 @@ def _check_picture(picture: Picture, width: int, height: int) -> None:
 def display_picture(
     pictures: Sequence[Picture], merged: LinearPicture, inside: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a coded picture for display: the exposure nearest to middle grey, or linear pictures coded.
+    """Returns a coded picture for display: the exposure nearest to middle grey, or linear pictures coded.
 
     `inside` is where the lens sees; pixels outside say nothing about the exposure.
     """

@@ -33,7 +33,7 @@ class FisheyeLight:
         self._map: RadianceMap | None = None
 
     def at(self, frame: SensorFrame, pose: BoardPose | None) -> RadianceMap | None:
-        """Return the map for a frame whose pose is `pose`: the same object while its pictures are current.
+        """Returns the map for a frame whose pose is `pose`: the same object while its pictures are current.
 
         None without pictures, and until the pose of the fish-eye camera is known; `notes` says what is missing.
 
@@ -73,7 +73,7 @@ class FisheyeLight:
         return None if taken is None else taken.world_from_camera @ extrinsics.rgb_from_fisheye
 
     def _pose_when_taken(self, frame: SensorFrame, pictures: FisheyePictures) -> BoardPose | None:
-        """Return the pose of the source's frame nearest in time; a live camera has just taken its pictures."""
+        """Returns the pose of the source's frame nearest in time; a live camera has just taken its pictures."""
         if isinstance(self._rig, Camera):
             return None
         times = np.asarray(self._rig.timestamps_ns)

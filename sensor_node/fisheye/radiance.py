@@ -21,7 +21,7 @@ def radiance_map(
     size: int = SIZE,
     reference_s: float | None = None,
 ) -> RadianceMap:
-    """Merge a bracket and resample it to the hemisphere about the lens's axis.
+    """Merges a bracket and resamples it to the hemisphere about the lens's axis.
 
     Args:
         pictures: the camera's pictures of one moment.
@@ -49,7 +49,7 @@ def radiance_map(
 
 
 def light_warnings(radiance: RadianceMap) -> list[str]:
-    """Return a sentence for each thing that makes the light of a map wrong, and what to do."""
+    """Returns a sentence for each thing that makes the light of a map wrong, and what to do."""
     sentences = []
     if radiance.clipped_share >= LEAST_CLIPPED_FRACTION:
         sentences.append(

@@ -34,7 +34,7 @@ class HemisphereSampler:
     scale: Float32[np.ndarray, "size size 1"]
 
     def resample(self, picture: LinearPicture) -> tuple[Float32[np.ndarray, "size size 3"], float]:
-        """Return the radiance map, 0 where nothing is seen, and the clipped fraction of the seen solid angle."""
+        """Returns the radiance map, 0 where nothing is seen, and the clipped fraction of the seen solid angle."""
         cells = _shrunk(cv2.copyTo(picture.linear, self.inside), self.shrink)
         samples = cv2.remap(
             cells * self.gain[..., None], self.places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
@@ -48,7 +48,7 @@ class HemisphereSampler:
 
 @lru_cache(maxsize=4)
 def hemisphere_sampler(calibration: FisheyeCalibration, size: int) -> HemisphereSampler:
-    """Create the tables for a calibration (compared by value) and a map's size."""
+    """Creates the tables for a calibration (compared by value) and a map's size."""
     lens = calibration.lens
     pixel = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
     inside = lens.has_ray(pixel.reshape(-1, 2).astype(np.float64)).reshape(lens.height, lens.width)
@@ -78,14 +78,14 @@ def hemisphere_sampler(calibration: FisheyeCalibration, size: int) -> Hemisphere
 
 
 def _pixel_angle(lens: FisheyeLens) -> float:
-    """Return the angle that a pixel spans on the axis, radians."""
+    """Returns the angle that a pixel spans on the axis, radians."""
     centre = np.clip(lens.centre, 1, [lens.width - 2, lens.height - 2])
     rays = lens.directions(centre + np.array([[-0.5, 0.0], [0.5, 0.0]]))
     return float(np.linalg.norm(rays[1] - rays[0]))
 
 
 def _shrunk(picture: Float32[np.ndarray, "h w *c"], factor: int) -> Float32[np.ndarray, "cells_y cells_x *c"]:
-    """Return the mean over squares of pixels; the picture is padded with zeros to whole squares."""
+    """Returns the mean over squares of pixels; the picture is padded with zeros to whole squares."""
     if factor == 1:
         return picture
     height, width = picture.shape[:2]
@@ -97,7 +97,7 @@ def _shrunk(picture: Float32[np.ndarray, "h w *c"], factor: int) -> Float32[np.n
 
 
 def _places(lens: FisheyeLens, edge: int, shrink: int) -> Float32[np.ndarray, "edge edge 2"]:
-    """Return the position of each sample of the map in the shrunk picture.
+    """Returns the position of each sample of the map in the shrunk picture.
 
     Far outside if the lens does not see it.
     """
@@ -111,7 +111,7 @@ def _places(lens: FisheyeLens, edge: int, shrink: int) -> Float32[np.ndarray, "e
 def _cells(
     lens: FisheyeLens, shape: tuple[int, ...], shrink: int
 ) -> tuple[Float64[np.ndarray, "y x"], Float64[np.ndarray, "y x"], Bool[np.ndarray, "y x"]]:
-    """Return for every cell its angle from the axis (at most 90 degrees), solid angle (0 at the rim), and membership.
+    """Returns every cell's angle from the axis (at most 90 degrees), solid angle (0 at the rim), and membership.
 
     A cell is a member if it is in the map.
     """
@@ -135,7 +135,7 @@ def _flux_gain(
     inside: Float32[np.ndarray, "y x"],
     solid: Float64[np.ndarray, "y x"],
 ) -> Float64[np.ndarray, "y x"]:
-    """Return each cell's solid angle over the one that the map's samples give it.
+    """Returns each cell's solid angle over the one that the map's samples give it.
 
     1 near the horizon and the rim of the image circle, where samples end and texels are divided by their coverage.
     """
@@ -154,7 +154,7 @@ def _spread(
     values: Float64[np.ndarray, "edge edge"],
     shape: tuple[int, ...],
 ) -> Float64[np.ndarray, "y x"]:
-    """Add every sample's value to the four cells that it reads, with the same weights."""
+    """Adds every sample's value to the four cells that it reads, with the same weights."""
     result = np.zeros(shape[0] * shape[1])
     low = np.floor(places).astype(np.intp)
     part = places - low

@@ -23,7 +23,7 @@ BLACK_CODE = 5
 def estimate_response(
     pictures: Sequence[UInt8[np.ndarray, "h w 3"]], exposures_s: Sequence[float]
 ) -> Float32[np.ndarray, "256 3"]:
-    """Return linear R G B of each code, 1.0 = white in each channel, from pictures of one still scene.
+    """Returns linear R G B of each code, 1.0 = white in each channel, from pictures of one still scene.
 
     Only the ratios of exposures matter; three or more, one to three stops apart, that cover black to white.
 
@@ -43,7 +43,7 @@ def estimate_response(
 
 
 def _sample(pictures: Sequence[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "exposures n 3"]:
-    """Return codes of pixels in flat areas (so that blur does not mix them), spread evenly over brightness."""
+    """Returns codes of pixels in flat areas (so that blur does not mix them), spread evenly over brightness."""
     total = np.sum([picture.astype(np.float32).mean(axis=-1) for picture in pictures], axis=0)
     window = np.ones((5, 5), np.uint8)
     roughness = (cv2.dilate(total, window) - cv2.erode(total, window)).ravel()
@@ -58,7 +58,7 @@ def _sample(pictures: Sequence[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray,
 def _solve(
     codes: UInt8[np.ndarray, "exposures n"], log_exposures: Float64[np.ndarray, " exposures"]
 ) -> Float64[np.ndarray, "256"]:
-    """Solve g(code) = ln radiance + ln exposure by least squares, with a hat weight and a smooth g."""
+    """Solves g(code) = ln radiance + ln exposure by least squares, with a hat weight and a smooth g."""
     count, pixels = codes.shape
     code = np.arange(256)
     hat = np.minimum(code - BLACK_CODE, CLIPPED_CODE - code) / ((CLIPPED_CODE - BLACK_CODE) / 2)

@@ -18,7 +18,7 @@ class CborError(DeltalightError):
 
 
 def decode_cbor(data: bytes) -> Any:  # noqa: ANN401 - as json.loads
-    """Decode one item that fills the bytes.
+    """Decodes one item that fills the bytes.
 
     Raises:
         CborError: it does not, or is malformed.
@@ -38,7 +38,7 @@ class _Reader:
         self.data, self.offset = data, 0
 
     def item(self, depth: int) -> Any:  # noqa: ANN401
-        """Decode the item at the offset (RFC 8949, section 3): major type, argument, contents."""
+        """Decodes the item at the offset (RFC 8949, section 3): major type, argument, contents."""
         if depth > MAX_DEPTH:
             raise CborError
         (head,) = self._unpack(">B")
@@ -86,6 +86,6 @@ class _Reader:
         return self.data[start : self.offset]
 
     def _require(self, count: int) -> None:
-        """Refuse before anything is allocated: each item takes a byte at least."""
+        """Refuses before anything is allocated: each item takes a byte at least."""
         if count > len(self.data) - self.offset:
             raise CborError

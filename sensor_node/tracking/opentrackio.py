@@ -145,7 +145,7 @@ def _matrix(transform: Transform) -> Float64[np.ndarray, "4 4"]:
 
 
 def tracked_lens(sample: Sample, camera: CameraModel) -> CameraModel | None:
-    """Return a camera of the same size with the sample's lens; None where the sample does not tell it whole.
+    """Returns a camera of the same size with the sample's lens; None where the sample does not tell it whole.
 
     With F in millimetres, f = F w_px / w_mm and OpenCV's k1 = l1 F^2, k4 = l2 F^2, k2 = l3 F^4, k5 = l4 F^4, ...,
     p = q F^2 ("Conversion of OpenCV to OpenTrackIO", SMPTE RIS OSVP, 2025-09-02).
@@ -196,7 +196,7 @@ class PacketReader:
     _payload: bytes = b""
 
     def add(self, packet: bytes) -> Sample | None:
-        """Take a packet; return the sample that it completes."""
+        """Takes a packet; returns the sample that it completes."""
         try:
             sample = self._add(packet)
         except DeltalightError as error:
@@ -249,7 +249,7 @@ def _sample(payload: bytes, encoding: int) -> Sample:
 
 
 def fletcher16(data: bytes) -> int:
-    """Return the checksum of a packet: Fletcher's, modulus 256, the second sum in the high byte."""
+    """Returns the checksum of a packet: Fletcher's, modulus 256, the second sum in the high byte."""
     values = np.frombuffer(data, np.uint8).astype(np.uint64)
     first = values.sum() & np.uint64(0xFF)
     second = (values * np.arange(len(values), 0, -1, dtype=np.uint64)).sum() & np.uint64(0xFF)

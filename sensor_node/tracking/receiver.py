@@ -87,7 +87,7 @@ class TrackingReceiver:
         self._socket: socket.socket | None = None
 
     def __enter__(self) -> Self:
-        """Start receiving.
+        """Starts receiving.
 
         Raises:
             DeltalightError: the address or port cannot be used.
@@ -105,7 +105,7 @@ class TrackingReceiver:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop."""
+        """Stops."""
         self._closing.set()
         self._thread.join()
         if self._socket is not None:
@@ -118,7 +118,7 @@ class TrackingReceiver:
         return int(self._socket.getsockname()[1])
 
     def at(self, capture_ns: int) -> Float64[np.ndarray, "4 4"] | None:
-        """Return world_from_camera at a time by this host's clock; None if nothing is known of that time.
+        """Returns world_from_camera at a time by this host's clock; None if nothing is known of that time.
 
         It is interpolated between two poses, else the nearest one.
         """
@@ -136,13 +136,13 @@ class TrackingReceiver:
         return nearest[1]
 
     def with_lens(self, timeout_s: float) -> Sample | None:
-        """Wait for a sample that tells the sensor's size, and return it; None if none comes in time."""
+        """Waits for a sample that tells the sensor's size, and returns it; None if none comes in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._static is not None, timeout_s)
             return self._static
 
     def remark(self, now_ns: int) -> str:
-        """Say what is wrong with the newest packets; nothing if they are well."""
+        """Says what is wrong with the newest packets; nothing if they are well."""
         with self._changed:
             newest_ns, fault = self._poses[-1][0] if self._poses else None, self._reader.fault
         if newest_ns is not None and now_ns - newest_ns <= LONGEST_GAP_NS:

@@ -12,7 +12,7 @@ ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # raised by the middleware, by a
 
 
 def api_router(path: str = "", *, tags: Sequence[str] = (), dependencies: Sequence[Any] = ()) -> APIRouter:
-    """Return a router of routes below `path` whose tags and dependencies are these.
+    """Returns a router of routes below `path` whose tags and dependencies are these.
 
     Its routes are whole: an application takes them as they are, and `include_router` would describe each anew, twice.
     """

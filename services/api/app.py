@@ -95,7 +95,7 @@ class _App(FastAPI):
     """FastAPI with additions to its OpenAPI document: problems, tokens, and the live header."""
 
     def openapi(self) -> dict[str, Any]:
-        """Return the OpenAPI document."""
+        """Returns the OpenAPI document."""
         if self.openapi_schema is None:
             schema = super().openapi()
             schemas = schema["components"]["schemas"] | problem_schema()
@@ -107,7 +107,7 @@ class _App(FastAPI):
 
 
 def _live_header_schemas() -> dict[str, Any]:
-    """Return the schemas of a live picture's header, which no HTTP route returns."""
+    """Returns the schemas of a live picture's header, which no HTTP route returns."""
     template = "#/components/schemas/{model}"
     _, schema = models_json_schema([(LiveHeader, "serialization")], ref_template=template)
     definitions: dict[str, Any] = schema["$defs"]
@@ -115,7 +115,7 @@ def _live_header_schemas() -> dict[str, Any]:
 
 
 def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) -> FastAPI:
-    """Create the application, which talks to the render server while it runs. The caller closes the store."""
+    """Creates the application, which talks to the render server while it runs. The caller closes the store."""
     all_rooms = Rooms(settings, store, keys)
     contexts = all_rooms.contexts
     context = next(iter(contexts.values()))
@@ -148,7 +148,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
 
 
 def _middleware(settings: ApiSettings, store: Store, context: Context) -> list[Middleware]:
-    """Return what every request passes through, outermost first."""
+    """Returns what every request passes through, outermost first."""
     rules = AuthRules(
         needs_token=settings.leaves_host,
         host_names=HostNames(on_loopback=not settings.leaves_host, allowed=settings.allowed_hosts),
@@ -170,7 +170,7 @@ def _middleware(settings: ApiSettings, store: Store, context: Context) -> list[M
 
 
 def _secret_tokens(settings: ApiSettings) -> list[SecretToken]:
-    """Read the tokens of files; one that may change things first."""
+    """Reads the tokens of files; one that may change things first."""
     files: tuple[tuple[Path | None, Role], ...] = (
         (settings.token_file, "control"),
         (settings.view_token_file, "view"),

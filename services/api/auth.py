@@ -76,7 +76,7 @@ class AuthMiddleware:
         self._streams = streams
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or answer it here."""
+        """Passes a request on, or answers it here."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -108,7 +108,7 @@ class AuthMiddleware:
         set_principal(scope, principal)
 
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on a long-lived connection; it counts as a stream, and ends when its token is revoked."""
+        """Passes on a long-lived connection; it counts as a stream, and ends when its token is revoked."""
         token_id = principal_of(scope).token_id
 
         async def is_allowed() -> bool:
@@ -131,7 +131,7 @@ class AuthMiddleware:
             )
 
     async def _authenticate(self, scope: Scope, headers: Headers) -> Principal:
-        """Authenticate a request; a token or ticket must be valid if sent, even where none is required."""
+        """Authenticates a request; a token or ticket must be valid if sent, even where none is required."""
         scheme, _, token = headers.get("authorization", "").partition(" ")
         ticket = QueryParams(scope["query_string"]).get("ticket")
         if not scheme and (ticket is None or not _takes_tickets(scope)):
@@ -250,7 +250,7 @@ def _unauthorized(sentence: str) -> ProblemError:
 
 
 def _count(limit: RateLimit, sender: str) -> None:
-    """Count a request of a sender.
+    """Counts a request of a sender.
 
     Raises:
         ProblemError: it has sent too many.

@@ -48,7 +48,7 @@ class CameraFinder:
         self._lock = threading.Lock()
 
     def find(self) -> CamerasAnswer:
-        """Return the cameras that are attached now.
+        """Returns the cameras that are attached now.
 
         Raises:
             ProblemError: the search takes too long, or fails.

@@ -63,12 +63,12 @@ class ChildProcess:
         return line.removeprefix("deltalight: ")
 
     def interrupt(self) -> None:
-        """Interrupt it, as Ctrl-C does."""
+        """Interrupts it, as Ctrl-C does."""
         if self._process is not None and self.is_running:
             self._process.send_signal(signal.SIGINT)
 
     def end(self, timeout_s: float) -> None:
-        """Terminate it and wait for its end and for `on_end`; kill it if that takes longer."""
+        """Terminates it and waits for its end and for `on_end`; kills it if that takes longer."""
         if self._process is None:
             return
         self._process.terminate()
@@ -77,7 +77,7 @@ class ChildProcess:
             self.wait(timeout_s)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for its end and for `on_end`; return whether it ended in time."""
+        """Waits for its end and for `on_end`; returns whether it ended in time."""
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()

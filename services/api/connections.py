@@ -28,7 +28,7 @@ class LimitedProtocol(H11Protocol):
     _received_bytes = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin a connection."""
+        """Begins a connection."""
         super().connection_made(transport)
         self._await_request()
         self._await_body()
@@ -36,33 +36,33 @@ class LimitedProtocol(H11Protocol):
             transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End a connection."""
+        """Ends a connection."""
         super().connection_lost(exc)
         self._end_timers()
 
     def data_received(self, data: bytes) -> None:
-        """Take what came."""
+        """Takes what came."""
         self._received_bytes += len(data)
         super().data_received(data)
 
     def pause_writing(self) -> None:
-        """Wait until the client takes what was sent."""
+        """Waits until the client takes what was sent."""
         super().pause_writing()
         self._stall = self.loop.call_later(STALL_TIMEOUT_S, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Go on to send."""
+        """Goes on to send."""
         super().resume_writing()
         if self._stall is not None:
             self._stall.cancel()
 
     def on_response_complete(self) -> None:
-        """Wait for the next request."""
+        """Waits for the next request."""
         super().on_response_complete()
         self._await_request()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """Hand the connection to a WebSocket's protocol; a timer would keep this one, 7 kB, for half a minute."""
+        """Hands the connection to a WebSocket's protocol; a timer would keep this one, 7 kB, for half a minute."""
         self._end_timers()
         super().handle_websocket_upgrade(event)
 
@@ -112,7 +112,7 @@ class RateLimitedLog(logging.Filter):
         self._due_s: dict[str, float] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a record is to be written."""
+        """Returns whether a record is to be written."""
         now_s = time.monotonic()
         if record.msg == REFUSED_SOCKET or now_s < self._due_s.get(str(record.msg), now_s):
             return False

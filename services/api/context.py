@@ -83,12 +83,12 @@ class Context:
     def change(
         self, scene_id: str, edit: Edit, what: str, precondition: Precondition, response: Response
     ) -> SceneAnswer:
-        """Change a scene, show it if it is the active one, and describe it."""
+        """Changes a scene, shows it if it is the active one, and describes it."""
         scene = self.store.scenes.change(scene_id, edit, what, precondition.expected, precondition.gesture)
         return self.answer(scene, response, changed=True)
 
     def answer(self, scene: StoredScene, response: Response, *, changed: bool = False) -> SceneAnswer:
-        """Describe a scene, with its revision as entity tag; announce a change to all listeners first."""
+        """Describes a scene, with its revision as entity tag; announces a change to all listeners first."""
         if changed:
             self._announce(scene)
         delivery = self.link.show(scene) if changed and scene.head.is_active else self.link.delivery(scene)
@@ -174,7 +174,7 @@ IfUnchanged = Annotated[Precondition, Depends(_precondition)]
 def in_pool(
     name: PoolName,
 ) -> Callable[[Callable[Given, Answer]], Callable[Given, Coroutine[Any, Any, Answer]]]:
-    """Run a route, which has a parameter `shared`, in a pool of its own."""
+    """Runs a route, which has a parameter `shared`, in a pool of its own."""
 
     def pooled(route: Callable[Given, Answer]) -> Callable[Given, Coroutine[Any, Any, Answer]]:
         @wraps(route)
@@ -189,7 +189,7 @@ def in_pool(
 
 
 def with_revision_of(document: object, precondition: Precondition) -> Precondition:
-    """Return the precondition of a change; without If-Match it expects the `revision` in the document itself."""
+    """Returns the precondition of a change; without If-Match it expects the `revision` in the document itself."""
     revision = document.get("revision") if isinstance(document, Mapping) else None
     if precondition.expected is not None or not isinstance(revision, int) or isinstance(revision, bool):
         return precondition

@@ -36,12 +36,12 @@ class Principal:
 
 
 def set_principal(scope: Scope, principal: Principal) -> None:
-    """Attach the authenticated principal to a request."""
+    """Attaches the authenticated principal to a request."""
     scope[_KEY] = principal
 
 
 def principal_of(scope: Scope) -> Principal:
-    """Return the principal that the middleware attached to a request."""
+    """Returns the principal that the middleware attached to a request."""
     principal = scope[_KEY]
     assert isinstance(principal, Principal)
     return principal
@@ -69,7 +69,7 @@ class SecretToken:
         self._hash = _hash(token)
 
     def verify(self, given: str) -> Principal | None:
-        """Return the principal of this token, or None if it is not the file's."""
+        """Returns the principal of this token, or None if it is not the file's."""
         is_equal = hmac.compare_digest(self._hash, _hash(given))
         return Principal(self._role, name=SECRET_NAME) if is_equal else None
 
@@ -94,7 +94,7 @@ class Tickets:
         self._lock = threading.Lock()
 
     def issue(self, principal: Principal) -> str:
-        """Create a ticket for this principal."""
+        """Creates a ticket for this principal."""
         ticket = secrets.token_urlsafe(_TICKET_BYTES)
         if self._store is not None:
             with suppress(StorageFaultError):
@@ -108,7 +108,7 @@ class Tickets:
         return ticket
 
     def redeem(self, ticket: str) -> Principal | None:
-        """Consume a ticket and return its principal, or None if it is unknown or has expired.
+        """Consumes a ticket and returns its principal, or None if it is unknown or has expired.
 
         Raises:
             StorageFaultError: the store does not answer.

@@ -64,7 +64,7 @@ class Deliveries:
             return tuple(self._awaited)
 
     def expect(self, change: Change) -> Future[DeliveryStatus]:
-        """Return the future status of a stored change; older changes of its scene are superseded."""
+        """Returns the future status of a stored change; older changes of its scene are superseded."""
         with self._lock:
             of_scene = [each for each in self._awaited if each.scene_id == change.scene_id]
             newer = max((each.revision for each in of_scene), default=0)
@@ -78,7 +78,7 @@ class Deliveries:
             return self._awaited.setdefault(change, Future())
 
     def wait(self, change: Change, outcome: Future[DeliveryStatus]) -> DeliveryStatus:
-        """Return the status of a change; `pending` if it takes long, or too many requests wait already."""
+        """Returns the status of a change; `pending` if it takes long, or too many requests wait already."""
         if outcome.done():
             return outcome.result()
         if not self._waiters.acquire(blocking=False):
@@ -91,7 +91,7 @@ class Deliveries:
             self._waiters.release()
 
     def note(self, status: DeliveryStatus, awaited: Collection[Change]) -> None:
-        """Resolve the change that was sent; supersede those `awaited` that were stored before the newest was read."""
+        """Resolves the change that was sent; supersedes the `awaited` ones stored before the newest was read."""
         with self._lock:
             self._newest = status
             self._resolve(status.change, status)
@@ -99,7 +99,7 @@ class Deliveries:
                 self._resolve(change, _superseded(change))
 
     def forget(self) -> None:
-        """Record that the server lost its scene, which must be sent again."""
+        """Records that the server lost its scene, which must be sent again."""
         with self._lock:
             if self._newest is not None:
                 self._newest = pending(self._newest.change, BUSY)
@@ -111,7 +111,7 @@ class Deliveries:
 
 
 def pending(change: Change, detail: str) -> DeliveryStatus:
-    """Return the status of a change that the server has not taken."""
+    """Returns the status of a change that the server has not taken."""
     return DeliveryStatus("pending", change.scene_id, change.revision, detail)
 
 

@@ -23,11 +23,11 @@ class EventRelay:
             context.events.pass_on = partial(self._pass_on, name)
 
     def start(self) -> None:
-        """Begin to hear."""
+        """Begins to hear."""
         self._feed.start(self._hear, self._missed)
 
     def close(self) -> None:
-        """Stop."""
+        """Stops."""
         self._feed.close()
 
     def _pass_on(self, room: str, event: str) -> None:
@@ -48,7 +48,7 @@ class EventRelay:
         context.events.deliver(kind, body)
 
     def _missed(self) -> None:
-        """Make listeners and render servers look at everything again."""
+        """Makes listeners and render servers look at everything again."""
         for context in self._rooms.values():
             context.link.look_again()
             context.events.deliver("lost", {"count": 0})

@@ -42,7 +42,7 @@ class EventQueue:
     _arrived: asyncio.Event = field(default_factory=asyncio.Event)
 
     def put(self, text: str) -> None:
-        """Add an event (any thread)."""
+        """Adds an event (any thread)."""
         with self._lock:
             if len(self._waiting) == QUEUE_EVENTS:
                 self._waiting.popleft()
@@ -52,7 +52,7 @@ class EventQueue:
             self.loop.call_soon_threadsafe(self._arrived.set)
 
     async def next(self) -> str:
-        """Wait for the oldest event; if any were dropped before it, their number comes first."""
+        """Waits for the oldest event; if any were dropped before it, their number comes first."""
         while True:
             with self._lock:
                 if self.lost:
@@ -78,13 +78,13 @@ class EventHub:
         self._lock = threading.Lock()
 
     def publish(self, type: EventType, body: Mapping[str, object]) -> None:
-        """Publish an event (any thread); `body` is anything that pydantic serialises, models and times included."""
+        """Publishes an event (any thread); `body` is anything that pydantic serialises, models and times included."""
         if type in PASSED_ON:
             self.pass_on(packed(type, body))
         self.deliver(type, body)
 
     def deliver(self, type: EventType, body: Mapping[str, object]) -> None:
-        """Publish an event to the listeners of this process alone (any thread)."""
+        """Publishes an event to the listeners of this process alone (any thread)."""
         hubs = (self, *self.others) if type in IN_ALL_ROOMS else (self,)
         queues = [queue for hub in hubs for queue in hub.queues()]
         if queues:
@@ -93,7 +93,7 @@ class EventHub:
                 queue.put(text)
 
     def queues(self) -> tuple[EventQueue, ...]:
-        """Return the queues of its own listeners."""
+        """Returns the queues of its own listeners."""
         with self._lock:
             return tuple(self._queues)
 
@@ -104,7 +104,7 @@ class EventHub:
 
     @contextmanager
     def listening(self) -> Iterator[EventQueue]:
-        """Subscribe to all events for the duration of the block (in the event loop that takes them)."""
+        """Subscribes to all events for the duration of the block (in the event loop that takes them)."""
         queue = EventQueue(asyncio.get_running_loop())
         with self._lock:
             self._queues.add(queue)
@@ -116,5 +116,5 @@ class EventHub:
 
 
 def packed(type: EventType, body: Mapping[str, object]) -> str:
-    """Return an event as it is sent: a JSON object with its type."""
+    """Returns an event as it is sent: a JSON object with its type."""
     return to_json({"type": type, **body}, inf_nan_mode="null").decode()

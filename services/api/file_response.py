@@ -12,7 +12,7 @@ class StoredFileResponse(FileResponse):
     """A file, or the requested range of it; errors become problem details."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file.
+        """Sends the file.
 
         Raises:
             NotFoundError: it was deleted meanwhile.
@@ -21,7 +21,7 @@ class StoredFileResponse(FileResponse):
         head: Message | None = None
 
         async def after_reading(message: Message) -> None:
-            """Delay the head until the file was read, because the file is opened only after the head is sent."""
+            """Delays the head until the file was read, because the file is opened only after the head is sent."""
             nonlocal head
             if message["type"] == "http.response.start":
                 if message["status"] >= 400:
@@ -40,7 +40,7 @@ class StoredFileResponse(FileResponse):
 
 
 def _without_foreign_range(scope: Scope) -> Scope:
-    """Drop a range that does not count bytes, which is to be ignored (RFC 9110, 14.2)."""
+    """Drops a range that does not count bytes, which is to be ignored (RFC 9110, 14.2)."""
     headers = [
         (name, value)
         for name, value in scope["headers"]

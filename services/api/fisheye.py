@@ -27,7 +27,7 @@ class FisheyeView:
     newest: tuple[RadianceMessage, bytes] | None = None
 
     def note(self, message: Message, parts: Sequence[memoryview]) -> None:
-        """Store the picture of a message that has just arrived."""
+        """Stores the picture of a message that has just arrived."""
         assert isinstance(message, RadianceMessage)
         self.newest = message, bytes(parts[PICTURE_PART])
 
@@ -49,7 +49,7 @@ class FisheyeLight(BaseModel):
 
 
 def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str, Any]]) -> list[FisheyeLight]:
-    """Return the lights that the picture of `message` shows; `described` are those of a composite.
+    """Returns the lights that the picture of `message` shows; `described` are those of a composite.
 
     What no render server describes so is left out: other processes can send composites too.
 
@@ -64,7 +64,7 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
 
 
 def _shown(message: RadianceMessage, described: Mapping[str, Any]) -> list[FisheyeLight]:
-    """Return a light, or nothing where the picture does not show it."""
+    """Returns a light, or nothing where the picture does not show it."""
     from deltalight.render_server.lights.light_models import LIGHT_TYPES, incident_light
 
     if described.get("type") == ENVIRONMENT:
@@ -78,7 +78,7 @@ def _shown(message: RadianceMessage, described: Mapping[str, Any]) -> list[Fishe
 def _marked(
     described: Mapping[str, Any], seen: "IncidentLight", pixels: Float64[np.ndarray, "n 2"]
 ) -> FisheyeLight:
-    """Describe a light; `pixels` begin with its middle, and are NaN where the picture does not show its outline."""
+    """Describes a light; `pixels` begin with its middle, and are NaN where the picture does not show its outline."""
     distances = np.linalg.norm(pixels - pixels[0], axis=1)
     red, green, blue = (float(value) for value in seen.irradiance)
     peak = max(red, green, blue, 1e-12)
@@ -94,7 +94,7 @@ def _marked(
 
 
 def _pixels(message: RadianceMessage, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-    """Project directions in the world to pixels of the (scaled-down) picture; NaN outside it."""
+    """Projects directions in the world to pixels of the (scaled-down) picture; NaN outside it."""
     lens = calibration_of(message.camera, None).lens
     height, width = message.picture_shape[:2]
     stretch = np.array([width / lens.width, height / lens.height])
@@ -103,7 +103,7 @@ def _pixels(message: RadianceMessage, directions: Float64[np.ndarray, "n 3"]) ->
 
 
 def _outline(seen: "IncidentLight") -> Float64[np.ndarray, "n 3"]:
-    """Return directions around a light, at its angular radius."""
+    """Returns directions around a light, at its angular radius."""
     direction = seen.to_light
     side = np.cross(direction, (0.0, 0.0, 1.0) if abs(direction[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)

@@ -18,7 +18,7 @@ class HeadRequests:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on."""
+        """Passes a request on."""
         if scope["type"] != "http" or scope["method"] != "HEAD" or not scope["path"].startswith(API):
             await self._app(scope, receive, send)
             return

@@ -18,7 +18,7 @@ class HeardJobs:
         self._lock = threading.Lock()
 
     def hear(self, type: str, body: Mapping[str, Any]) -> None:
-        """Note an event of another web process (any thread)."""
+        """Notes an event of another web process (any thread)."""
         now_s = self._clock_s()
         with self._lock:
             if type == "replay":
@@ -31,7 +31,7 @@ class HeardJobs:
                 self._recordings.pop(body["id"], None)
 
     def growing(self) -> list[Mapping[str, Any]]:
-        """Return the recordings in progress, as events describe them."""
+        """Returns the recordings in progress, as events describe them."""
         since_s = self._clock_s() - LIFE_S
         with self._lock:
             self._recordings = {
@@ -40,6 +40,6 @@ class HeardJobs:
             return [body for _, body in self._recordings.values()]
 
     def replay(self) -> Mapping[str, Any] | None:
-        """Return what is replayed and where, as events describe it; None = nobody says anything."""
+        """Returns what is replayed and where, as events describe it; None = nobody says anything."""
         heard = self._replay
         return None if heard is None or heard[0] < self._clock_s() - LIFE_S else heard[1]

@@ -27,7 +27,7 @@ class HostNames:
         self._names = LOOPBACK_NAMES if on_loopback else LOOPBACK_NAMES | own_names() | set(allowed)
 
     def require(self, host: str) -> None:
-        """Check the value of a Host header.
+        """Checks the value of a Host header.
 
         Raises:
             ProblemError: it names something else.
@@ -46,13 +46,13 @@ class HostNames:
 
 
 def own_names() -> frozenset[str]:
-    """Return this host's names: its own, that with its domain, and that in the local network (mDNS)."""
+    """Returns this host's names: its own, that with its domain, and that in the local network (mDNS)."""
     name = socket.gethostname().lower()
     return frozenset({name, socket.getfqdn().lower(), f"{name.partition('.')[0]}.local"} - {""})
 
 
 def _name(host: str) -> str:
-    """Return the name in a Host header, without its port; empty if there is none."""
+    """Returns the name in a Host header, without its port; empty if there is none."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
     except ValueError:

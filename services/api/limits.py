@@ -26,12 +26,12 @@ class RateLimit:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def wait_s(self, client: str) -> float:
-        """Return the seconds until this client may send its next request, 0 if it may now."""
+        """Returns the seconds until this client may send its next request, 0 if it may now."""
         left, _ = self._level(client)
         return 0.0 if left >= 1 else (1 - left) / self._per_s
 
     def take(self, client: str) -> None:
-        """Count a request of this client."""
+        """Counts a request of this client."""
         left, now_s = self._level(client)
         self._buckets[client] = left - 1, now_s
         self._buckets.move_to_end(client)
@@ -53,7 +53,7 @@ class StreamLimits:
 
     @contextmanager
     def slot(self, client: str) -> Iterator[None]:
-        """Occupy one of the client's streams for the duration of the block.
+        """Occupies one of the client's streams for the duration of the block.
 
         Raises:
             ProblemError: this client has too many streams, or all clients together have.
@@ -73,7 +73,7 @@ class StreamLimits:
 
 
 async def run_while(stream: Awaitable[None], is_allowed: Callable[[], Awaitable[bool]]) -> bool:
-    """Run a stream and return whether it ended by itself; cancel it soon after it is no longer allowed."""
+    """Runs a stream and returns whether it ended by itself; cancels it soon after it is no longer allowed."""
     running = asyncio.ensure_future(stream)
     try:
         while not (await asyncio.wait({running}, timeout=CHECK_INTERVAL_S))[0]:

@@ -23,7 +23,7 @@ class CameraFeed:
     def publish(
         self, message: CompositeMessage, jpegs: Sequence[bytes], renderer: str, node: str | None
     ) -> LiveFrame:
-        """Return a composite as the newest frame; `node`: the name of its camera, where there are several.
+        """Returns a composite as the newest frame; `node`: the name of its camera, where there are several.
 
         `jpegs` are its own picture, then those of its `others`.
 
@@ -45,14 +45,14 @@ class CameraFeed:
         return self.newest
 
     def state(self) -> tuple[Literal["waiting", "ok", "stale"], float | None]:
-        """Return whether frames arrive, and the seconds since the newest did."""
+        """Returns whether frames arrive, and the seconds since the newest did."""
         if self.newest is None:
             return "waiting", None
         since_s = time.monotonic() - self.newest.arrived_s
         return ("ok" if since_s < STALE_AFTER_S else "stale"), since_s
 
     def rate(self) -> float | None:
-        """Return the rate of arrival over the last seconds, 1/s; None before the second frame."""
+        """Returns the rate of arrival over the last seconds, 1/s; None before the second frame."""
         now_s = time.monotonic()
         oldest_s = now_s - RATE_WINDOW_S
         while len(self._arrivals_s) > 2 and self._arrivals_s[0] < oldest_s:

@@ -31,18 +31,18 @@ class LiveFrame:
     pictures: Mapping[ShownView, LivePicture]
 
     def shown(self, view: ShownView | None) -> ShownView:
-        """Return what who asked for `view` sees: the scene's own view for None and where it is not there (yet)."""
+        """Returns what who asked for `view` sees: the scene's own view for None and where it is not there (yet)."""
         return self.message.view if view is None or view not in self.pictures else view
 
     def picture(self, view: ShownView | None) -> LivePicture:
-        """Return the picture that who asked for `view` sees."""
+        """Returns the picture that who asked for `view` sees."""
         return self.pictures[self.shown(view)]
 
     def packed(self, view: ShownView | None, skipped: int) -> bytes:
-        """Return the message for a viewer of `view` that was not sent `skipped` frames."""
+        """Returns the message for a viewer of `view` that was not sent `skipped` frames."""
         picture = self.picture(view)
         return pack(picture.header, self.viewer_header(skipped), picture.jpeg)
 
     def viewer_header(self, skipped: int) -> ViewerHeader:
-        """Return what is said at this moment to a viewer that was not sent `skipped` frames."""
+        """Returns what is said at this moment to a viewer that was not sent `skipped` frames."""
         return ViewerHeader(age_ms=age_ms(self.message), skipped=skipped)

@@ -41,18 +41,18 @@ class Viewer:
         return VIDEO_WINDOW if self.codec == "h264" else WINDOW
 
     def look_at(self, view: ShownView | None) -> None:
-        """Look at another view, as soon as a frame shows it."""
+        """Looks at another view, as soon as a frame shows it."""
         self.view = view
         self.hub.note_views()
 
     def prefer(self, codec: LiveCodec) -> None:
-        """Take pictures coded so from now on, where they are there."""
+        """Takes pictures coded so from now on, where they are there."""
         if codec != self.codec:
             self.codec = codec
             self.hub.wake()
 
     def turn_to(self, camera: str | None) -> None:
-        """See the pictures of another camera from now on.
+        """Sees the pictures of another camera from now on.
 
         Raises:
             NotFoundError: there is no such camera.
@@ -62,13 +62,13 @@ class Viewer:
         self.hub.wake()
 
     def leave(self) -> None:
-        """Leave the encoded pictures that it followed."""
+        """Leaves the encoded pictures that it followed."""
         if self._track is not None:
             self.hub.video.leave(self._track)
         self._track = self._coded = None
 
     async def next(self) -> LiveFrame | None:
-        """Wait for a frame newer than this viewer's last; None = the stream has ended."""
+        """Waits for a frame newer than this viewer's last; None = the stream has ended."""
         while not self.hub.has_ended:
             arrived = self.hub.arrival(self.camera)
             newest = self._newer()
@@ -79,7 +79,7 @@ class Viewer:
         return None
 
     async def next_message(self) -> bytes | None:
-        """Wait for the next message, in H.264 where that is wanted and there; None = the stream has ended."""
+        """Waits for the next message, in H.264 where that is wanted and there; None = the stream has ended."""
         while not self.hub.has_ended:
             arrived = self.hub.arrival(self.camera)
             picture = self._next_coded()
@@ -94,7 +94,7 @@ class Viewer:
         return None
 
     async def next_video(self) -> VideoPicture | None:
-        """Wait for the next picture in H.264; None = the stream has ended, or there is no H.264 (any more)."""
+        """Waits for the next picture in H.264; None = the stream has ended, or there is no H.264 (any more)."""
         while not self.hub.has_ended and self.hub.video.why_not is None:
             arrived = self.hub.arrival(self.camera)
             picture = self._next_coded()
@@ -107,7 +107,7 @@ class Viewer:
         return None
 
     def want_key(self) -> None:
-        """Go on with a key: what came before was lost."""
+        """Goes on with a key: what came before was lost."""
         self._coded = None
         self.hub.wake()
 
@@ -116,7 +116,7 @@ class Viewer:
         return self._track is not None and not self._track.has_failed
 
     def _newer(self) -> LiveFrame | None:
-        """Return its camera's newest frame, unless that was its last."""
+        """Returns its camera's newest frame, unless that was its last."""
         newest = self.hub.newest_of(self.camera)
         return None if newest is None or newest is self._last else newest
 
@@ -131,7 +131,7 @@ class Viewer:
         return picture
 
     def _followed(self, newest: LiveFrame) -> VideoTrack | None:
-        """Follow the track of what this viewer sees, if it wants one; one that failed is not followed."""
+        """Follows the track of what this viewer sees, if it wants one; one that failed is not followed."""
         view = newest.shown(self.view) if self.codec == "h264" and self.hub.video.why_not is None else None
         if self._track is not None and not (self._track.is_of(newest) and self._track.view == view):
             self.leave()
@@ -177,11 +177,11 @@ class LiveHub:
         self.video = LiveVideo(self._publish_coded, on_failure)
 
     def attach(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Wake viewers in this event loop from now on."""
+        """Wakes viewers in this event loop from now on."""
         self._loop = loop
 
     def publish(self, message: CompositeMessage, jpegs: Sequence[bytes], renderer: str) -> None:
-        """Publish a composite as the newest, and wake all waiting viewers (any thread).
+        """Publishes a composite as the newest, and wakes all waiting viewers (any thread).
 
         `jpegs` are its own picture, then those of its `others`.
 
@@ -199,7 +199,7 @@ class LiveHub:
         self._wake_soon(feed)
 
     def note_cameras(self, message: CamerasMessage) -> bool:
-        """Take which cameras there are (any thread); return whether that, or which of them live, is another."""
+        """Takes which cameras there are (any thread); returns whether that, or which of them live, is another."""
         before = [(each.node, each.status) for each in self.cameras]
         with self._lock:
             self._cameras = message
@@ -209,7 +209,7 @@ class LiveHub:
         return before != [(each.node, each.status) for each in message.cameras]
 
     def close(self) -> None:
-        """End the stream of every viewer (any thread)."""
+        """Ends the stream of every viewer (any thread)."""
         self.has_ended = True
         self.video.close()
         self._wake_soon()
@@ -223,7 +223,7 @@ class LiveHub:
     def viewer(
         self, view: ShownView | None = None, codec: LiveCodec = "jpeg", camera: str | None = None
     ) -> Iterator[Viewer]:
-        """Join the stream for the duration of the block (in the event loop)."""
+        """Joins the stream for the duration of the block (in the event loop)."""
         viewer = Viewer(self, view, codec, camera)
         self._viewers.add(viewer)
         self.note_views()
@@ -235,7 +235,7 @@ class LiveHub:
             self.note_views()
 
     def note_views(self) -> None:
-        """Tell which views are looked at, if that changed."""
+        """Tells which views are looked at, if that changed."""
         watched = sorted({each.view for each in self._viewers if each.view is not None})
         if watched != self._watched:
             self._watched = watched
@@ -247,7 +247,7 @@ class LiveHub:
         return () if self._cameras is None else self._cameras.cameras
 
     def require(self, camera: str | None) -> None:
-        """Refuse a camera that is not there.
+        """Refuses a camera that is not there.
 
         Raises:
             NotFoundError: the render server named no such camera.
@@ -259,12 +259,12 @@ class LiveHub:
         raise NotFoundError(f"there is no camera {camera!r:.80}; {there}.")
 
     def server_of(self, message: CompositeMessage) -> str:
-        """Return the name of the render server that a composite is from."""
+        """Returns the name of the render server that a composite is from."""
         server = self._cameras
         return server.node if server is not None and self._names(message.node) else message.node
 
     def feed(self, camera: str | None) -> CameraFeed:
-        """Return a camera's pictures; for None and one that is gone, those of the first camera that lives."""
+        """Returns a camera's pictures; for None and one that is gone, those of the first camera that lives."""
         cameras, feeds = self.cameras, self._feeds
         if len(cameras) <= 1:
             return self._last
@@ -274,7 +274,7 @@ class LiveHub:
         return next(live, self._last)
 
     def newest_of(self, camera: str | None) -> LiveFrame | None:
-        """Return the newest frame of what `feed` returns, if any arrived."""
+        """Returns the newest frame of what `feed` returns, if any arrived."""
         return self.feed(camera).newest
 
     @property
@@ -283,16 +283,16 @@ class LiveHub:
         return self.newest_of(None)
 
     def note_sent(self, missed: int) -> None:
-        """Count a frame that a viewer takes, and those that it missed since its last one."""
+        """Counts a frame that a viewer takes, and those that it missed since its last one."""
         self.sent += 1
         self.skipped += missed
 
     def state(self, camera: str | None = None) -> tuple[Literal["waiting", "ok", "stale"], float | None]:
-        """Return whether frames arrive, and the seconds since the newest did."""
+        """Returns whether frames arrive, and the seconds since the newest did."""
         return self.feed(camera).state()
 
     def frames_per_s(self, camera: str | None = None) -> float | None:
-        """Return the rate of arrival over the last seconds; None before the second frame."""
+        """Returns the rate of arrival over the last seconds; None before the second frame."""
         with self._lock:
             return self.feed(camera).rate()
 
@@ -310,10 +310,10 @@ class LiveHub:
         self._wake_soon()
 
     def arrival(self, camera: str | None) -> asyncio.Event:
-        """Return what is set as soon as viewers of a camera may have something new to take (in the event loop)."""
+        """Returns what is set as soon as viewers of a camera may have something new to take (in the event loop)."""
         return self._arrivals.setdefault(camera, asyncio.Event())
 
     def wake(self, feed: CameraFeed | None = None) -> None:
-        """Have viewers look what they can take: those whom `feed` shows to, None = all (in the event loop)."""
+        """Has viewers look what they can take: those whom `feed` shows to, None = all (in the event loop)."""
         for camera in [each for each in self._arrivals if feed is None or self.feed(each) is feed]:
             self._arrivals.pop(camera).set()

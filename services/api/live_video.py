@@ -41,7 +41,7 @@ class VideoPicture:
     is_key: bool
 
     def packed(self, skipped: int) -> bytes:
-        """Return the message for a viewer that was not sent `skipped` frames."""
+        """Returns the message for a viewer that was not sent `skipped` frames."""
         return pack(self.header, self.frame.viewer_header(skipped), self.data)
 
 
@@ -80,18 +80,18 @@ class VideoTrack:
         return self.node == frame.message.node
 
     def start(self, frame: LiveFrame) -> None:
-        """Begin with a frame that has arrived."""
+        """Begins with a frame that has arrived."""
         self._fresh = frame
         self._thread.start()
 
     def offer(self, frame: LiveFrame) -> None:
-        """Encode a frame next, unless a newer one comes before (any thread)."""
+        """Encodes a frame next, unless a newer one comes before (any thread)."""
         with self._changed:
             self._fresh = frame
             self._changed.notify()
 
     def after(self, number: int | None) -> VideoPicture | None:
-        """Return the picture after `number`, or the newest key if that is gone or for None; None = wait for it."""
+        """Returns the picture after `number`, or the newest key if that is gone or for None; None = wait for it."""
         newest = self._pictures[-1].number if self._pictures else None
         if number is not None and number == newest:
             return None
@@ -103,7 +103,7 @@ class VideoTrack:
         return found[0]
 
     def close(self) -> None:
-        """End the thread soon."""
+        """Ends the thread soon."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()
@@ -127,7 +127,7 @@ class VideoTrack:
             self._publish(partial(self._note, picture))
 
     def _next_job(self) -> tuple[LiveFrame, bool] | None:
-        """Wait for a frame, or for a key of the last one being due; None = the track is closed."""
+        """Waits for a frame, or for a key of the last one being due; None = the track is closed."""
         with self._changed:
             while not self._is_closed:
                 wait_s = self._key_due_s - time.monotonic()
@@ -162,7 +162,7 @@ class _Coder:
         self._jpeg, self._repeats, self._number = b"", 0, 0
 
     def encode(self, frame: LiveFrame, is_key_wanted: bool) -> VideoPicture:
-        """Encode the picture of the track's view.
+        """Encodes the picture of the track's view.
 
         Raises:
             DeltalightError: no encoder takes it.
@@ -213,13 +213,13 @@ class LiveVideo:
         return len(self._tracks)
 
     def offer(self, frame: LiveFrame) -> None:
-        """Encode a new frame's pictures that somebody looks at (any thread)."""
+        """Encodes a new frame's pictures that somebody looks at (any thread)."""
         for track in self._tracks.copy().values():
             if track.is_of(frame) and track.view in frame.pictures:
                 track.offer(frame)
 
     def join(self, view: ShownView, frame: LiveFrame) -> VideoTrack:
-        """Return the track of a frame's camera in a view, which begins with it if nobody looked there before."""
+        """Returns the track of a frame's camera in a view, which begins with it if nobody looked there before."""
         key = frame.message.node, view
         track = self._tracks.get(key)
         if track is None:
@@ -229,14 +229,14 @@ class LiveVideo:
         return track
 
     def leave(self, track: VideoTrack) -> None:
-        """Leave a track, which ends where nobody else looks at it."""
+        """Leaves a track, which ends where nobody else looks at it."""
         track.members -= 1
         if track.members == 0:
             track.close()
             del self._tracks[track.node, track.view]
 
     def close(self) -> None:
-        """End all threads soon (any thread)."""
+        """Ends all threads soon (any thread)."""
         for track in self._tracks.copy().values():
             track.close()
 

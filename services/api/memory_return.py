@@ -17,7 +17,7 @@ class MemoryReturn:
         self._due: asyncio.TimerHandle | None = None
 
     def note_ended(self) -> None:
-        """Count a stream that has ended."""
+        """Counts a stream that has ended."""
         self._ended += 1
         if self._ended >= MANY_STREAMS and self._due is None:
             self._due = asyncio.get_running_loop().call_later(DELAY_S, self._start)

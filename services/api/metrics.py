@@ -50,14 +50,14 @@ class Metrics:
         self._registry.register(_Streams(live, events))
 
     def note(self, scope: Scope, status: int, seconds: float) -> None:
-        """Count a completed request."""
+        """Counts a completed request."""
         # Not by address, because that would make the labels unbounded.
         operation = getattr(scope.get("route"), "name", NO_OPERATION)
         self._requests.labels(operation, status).inc()
         self._seconds.labels(operation).observe(seconds)
 
     def text(self) -> bytes:
-        """Return all measurements in the text format of Prometheus."""
+        """Returns all measurements in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
@@ -69,7 +69,7 @@ class MetricsMiddleware:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on and record how it ended."""
+        """Passes a request on and records how it ended."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -96,7 +96,7 @@ class _Reported(Collector):
         self._link = link
 
     def collect(self) -> Iterable[Metric]:
-        """Return all metric families."""
+        """Returns all metric families."""
         refused = CounterMetricFamily(
             "deltalight_api_refused", "Refused requests, by kind of problem.", labels=["kind"]
         )
@@ -138,7 +138,7 @@ class _Streams(Collector):
         self._events = events
 
     def collect(self) -> Iterable[Metric]:
-        """Return all metric families."""
+        """Returns all metric families."""
         live = self._live
         yield _gauge("deltalight_live_viewers", "Viewers of the live video.", live.viewers)
         yield _gauge("deltalight_live_encoders", "Views being encoded as H.264.", live.video.encoders)

@@ -25,7 +25,7 @@ class SceneSummary(BaseModel):
 
     @classmethod
     def of(cls, head: SceneHead) -> Self:
-        """Describe a scene."""
+        """Describes a scene."""
         return cls(
             id=head.id,
             name=head.name,
@@ -50,7 +50,7 @@ class PictureState(BaseModel):
 
     @classmethod
     def of(cls, status: DeliveryStatus) -> Self:
-        """Describe the delivery of a revision."""
+        """Describes the delivery of a revision."""
         return cls(state=status.state, revision=status.revision, detail=status.detail)
 
 
@@ -70,7 +70,7 @@ class SceneAnswer(BaseModel):
 
     @classmethod
     def of(cls, scene: StoredScene, delivery: DeliveryStatus | None) -> Self:
-        """Describe a scene at a revision."""
+        """Describes a scene at a revision."""
         return cls(
             id=scene.head.id,
             revision=scene.document.revision,
@@ -96,7 +96,7 @@ class RevisionEntry(BaseModel):
 
     @classmethod
     def of(cls, revision: Revision) -> Self:
-        """Describe a revision."""
+        """Describes a revision."""
         return cls(
             revision=revision.number,
             at=_time(revision.at_ns),
@@ -129,7 +129,7 @@ class AssetAnswer(BaseModel):
 
     @classmethod
     def of(cls, asset: Asset) -> Self:
-        """Describe an asset."""
+        """Describes an asset."""
         return cls(
             asset=asset.reference,
             names=list(asset.names),
@@ -156,7 +156,7 @@ class ProcessAnswer(BaseModel):
 
     @classmethod
     def of(cls, report: Report) -> Self:
-        """Describe a report."""
+        """Describes a report."""
         message = report.message
         bound_ns = message.clock_bound_ns
         return cls(

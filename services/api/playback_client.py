@@ -37,7 +37,7 @@ class PlaybackClient:
     def ask(
         self, op: str, payload: Mapping[str, object] | None = None, timeout_s: float = ASK_TIMEOUT_S
     ) -> Position:
-        """Execute a command and return the position after it.
+        """Executes a command and returns the position after it.
 
         Raises:
             UnansweredError: it does not answer.
@@ -56,6 +56,6 @@ class PlaybackClient:
         return self.last
 
     def close(self) -> None:
-        """Close the connection, without waiting for an answer."""
+        """Closes the connection, without waiting for an answer."""
         self._client.abandon()
         self._client.close()

@@ -36,7 +36,7 @@ class Pool:
         self._places = asyncio.Semaphore(threads)
 
     async def run(self, call: Callable[[], Answer]) -> Answer:
-        """Return the result of `call`, which runs in a thread.
+        """Returns the result of `call`, which runs in a thread.
 
         Raises:
             ProblemError: earlier calls took too long.
@@ -54,7 +54,7 @@ class Pool:
 
 
 def make_pools() -> Mapping[PoolName, Pool]:
-    """Return the pools of one service."""
+    """Returns the pools of one service."""
     pools = (
         Pool("render server", 8, patience_s=10.0),
         Pool("replay", 4, patience_s=10.0),

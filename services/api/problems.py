@@ -78,7 +78,7 @@ class ProblemError(HTTPException):
 
 
 def unreadable_json(cause: BaseException | None) -> ProblemError:
-    """Return the refusal of a body that `json.loads` ended with `cause`."""
+    """Returns the refusal of a body that `json.loads` ended with `cause`."""
     limit = beyond_limits(cause) if isinstance(cause, ValueError | RecursionError) else None
     sentence = "The body is not valid JSON; correct it." if limit is None else f"The body {limit}."
     return ProblemError(400, "not-json", sentence)
@@ -99,7 +99,7 @@ class Problems:
         headers: Mapping[str, str] | None = None,
         revision: int | None = None,
     ) -> JSONResponse:
-        """Return a problem as a response; what a client sent may be part of `sentence`."""
+        """Returns a problem as a response; what a client sent may be part of `sentence`."""
         self.counts[kind] += 1
         problem = Problem(
             type=TYPE_PREFIX + kind,
@@ -113,7 +113,7 @@ class Problems:
         )
 
     def of_http(self, fault: HTTPException) -> JSONResponse:
-        """Return the response to a refusal by the framework or the middleware."""
+        """Returns the response to a refusal by the framework or the middleware."""
         if fault.status_code == 400 and not isinstance(fault, ProblemError):  # the body's text cannot be read
             return self._not_json(fault.__cause__)
         status = fault.status_code
@@ -123,14 +123,14 @@ class Problems:
         )
 
     def of_fault(self, fault: DeltalightError) -> JSONResponse:
-        """Return the response to a refusal by the storage or a document."""
+        """Returns the response to a refusal by the storage or a document."""
         status, kind = next((status, kind) for each, status, kind in _KINDS if isinstance(fault, each))
         revision = fault.current if isinstance(fault, StaleRevisionError) else None
         headers = {"Retry-After": LOOKED_AGAIN_S} if isinstance(fault, UnansweredError) else None
         return self.response(status, kind, str(fault), headers=headers, revision=revision)
 
     def install(self, app: FastAPI) -> None:
-        """Register the handlers of all errors of the application."""
+        """Registers the handlers of all errors of the application."""
 
         @app.exception_handler(HTTPException)
         async def _http(request: Request, fault: HTTPException) -> JSONResponse:
@@ -185,29 +185,29 @@ class Problems:
 
 
 def problem_schema() -> dict[str, Any]:
-    """Return the schema of a problem for an OpenAPI document's components, where descriptions refer to it."""
+    """Returns the schema of a problem for an OpenAPI document's components, where descriptions refer to it."""
     schema = Problem.model_json_schema(mode="serialization")
     return {Problem.__name__: jsonable_encoder(schema, exclude_none=True)}
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return the errors of a route for its OpenAPI description."""
+    """Returns the errors of a route for its OpenAPI description."""
     return {status: _described(HTTPStatus(status).phrase) for status in statuses}
 
 
 def unavailable(when: str) -> dict[int | str, dict[str, Any]]:
-    """Return the 503 of a route for its OpenAPI description; `when` is a sentence."""
+    """Returns the 503 of a route for its OpenAPI description; `when` is a sentence."""
     return {503: _described(when)}
 
 
 def _described(what: str) -> dict[str, Any]:
-    """Describe an error by a reference: FastAPI would make a validator of each `model` that is named here."""
+    """Describes an error by a reference: FastAPI would make a validator of each `model` that is named here."""
     schema = {"$ref": f"#/components/schemas/{Problem.__name__}"}
     return {"description": what, "content": {MEDIA_TYPE: {"schema": schema}}}
 
 
 def _allowed(request: Request) -> str:
-    """Return the methods of all routes at an address; the framework names those of the first."""
+    """Returns the methods of all routes at an address; the framework names those of the first."""
     routes = (
         route for route in request.app.router.routes if route.matches(request.scope)[0] is Match.PARTIAL
     )

@@ -63,11 +63,11 @@ class RecordingSessions:
         self._lock = Lock()
 
     def use_endpoints(self, endpoints: Sequence[str]) -> None:
-        """Record from these endpoints, in recordings that start from now on."""
+        """Records from these endpoints, in recordings that start from now on."""
         self._endpoints = tuple(endpoints)
 
     def running(self) -> list[RecordingSession]:
-        """Return the recordings in progress."""
+        """Returns the recordings in progress."""
         with self._lock:
             return list(self._running.values())
 
@@ -80,7 +80,7 @@ class RecordingSessions:
         *,
         composites: bool = False,
     ) -> RecordingSession:
-        """Start a recording with this scene attached, and the relit pictures beside the frames if `composites`.
+        """Starts a recording with this scene attached, and the relit pictures beside the frames if `composites`.
 
         Raises:
             ConflictError: the name is taken, or this node is being recorded.
@@ -104,7 +104,7 @@ class RecordingSessions:
         return session
 
     def stop(self, name: str) -> RecordingSession:
-        """Stop a recording, wait until its file is complete and return what it was.
+        """Stops a recording, waits until its file is complete and returns what it was.
 
         Raises:
             NotFoundError: no recording of this name is in progress.
@@ -124,7 +124,7 @@ class RecordingSessions:
         return session
 
     def close(self) -> None:
-        """Stop all recordings and complete their files."""
+        """Stops all recordings and completes their files."""
         sessions = self.running()
         for session in sessions:
             if session.child is not None:
@@ -167,7 +167,7 @@ class RecordingSessions:
         return ["--rooms", directory, "--room", name]
 
     def _note(self, session: RecordingSession, child: ChildProcess, line: str) -> None:
-        """Parse the recorder's output, one line a second; its standard error explains why no frame arrives."""
+        """Parses the recorder's output, one line a second; its standard error explains why no frame arrives."""
         with suppress(ValueError):
             figures, before = json.loads(line), session.figures or {}
             session.figures = figures if figures["frames"] else None
@@ -184,7 +184,7 @@ class RecordingSessions:
         self._publish(session, False)
 
     def _named(self, sentence: str) -> str:
-        """Return a sentence with the recordings' names in place of their paths."""
+        """Returns a sentence with the recordings' names in place of their paths."""
         return sentence.replace(f"{self._store.folder}{os.sep}", "")
 
     def _forget(self, session: RecordingSession) -> None:

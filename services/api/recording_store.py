@@ -74,7 +74,7 @@ class RecordingStore:
                 path.unlink(missing_ok=True)
 
     def all(self, growing: Collection[str] = ()) -> list[StoredRecording]:
-        """Return all recordings, the newest first, except growing ones, which would be reread each time."""
+        """Returns all recordings, the newest first, except growing ones, which would be reread each time."""
         found = []
         for name in {path.name.split(".")[0] for path in self._paths()}.difference(growing):
             with suppress(NotFoundError):  # deleted meanwhile
@@ -82,7 +82,7 @@ class RecordingStore:
         return sorted(found, key=lambda each: (-each.changed_ns, each.id))
 
     def get(self, name: str) -> StoredRecording:
-        """Return one recording.
+        """Returns one recording.
 
         Raises:
             NotFoundError: there is none of this name.
@@ -90,7 +90,7 @@ class RecordingStore:
         return self._described(self._path(name))
 
     def new_path(self, name: str) -> Path:
-        """Return the path for a new recording of this name.
+        """Returns the path for a new recording of this name.
 
         Raises:
             DeltalightError: it is not a valid name.
@@ -107,7 +107,7 @@ class RecordingStore:
 
     @contextmanager
     def receiving(self, limit_bytes: int, quota_bytes: int) -> Iterator[Incoming]:
-        """Yield a place for an upload; it is removed at the end unless `keep` took it.
+        """Yields a place for an upload; it is removed at the end unless `keep` took it.
 
         `quota_bytes` is what all recordings, and what is received, may take together.
 
@@ -134,7 +134,7 @@ class RecordingStore:
             shutil.rmtree(folder, ignore_errors=True)
 
     def keep(self, incoming: Incoming, name: str) -> StoredRecording:
-        """Check a received file in a limited process, and store it under the name of the file, or one like it.
+        """Checks a received file in a limited process, and stores it under the name of the file, or one like it.
 
         A .zip of a dataset folder is stored as the recording made of it.
 
@@ -160,7 +160,7 @@ class RecordingStore:
         return self._described(path)
 
     def _used_bytes(self) -> int:
-        """Return what all files take, those being received included."""
+        """Returns what all files take, those being received included."""
         used = 0
         for path in self.folder.rglob("*"):
             with suppress(FileNotFoundError):  # deleted meanwhile
@@ -168,7 +168,7 @@ class RecordingStore:
         return used
 
     def _free_path(self, stem: str) -> Path:
-        """Return the path of a new recording, its name as like `stem` as may be."""
+        """Returns the path of a new recording, its name as like `stem` as may be."""
         plain = re.sub(r"[^A-Za-z0-9_-]+", "-", stem).strip("-_")[:56] or "upload"
         for number in count(1):
             with suppress(ConflictError):
@@ -176,7 +176,7 @@ class RecordingStore:
         raise AssertionError  # count never ends
 
     def poster(self, name: str) -> Path:
-        """Return the JPEG file of a recording's first colour picture, created on first request.
+        """Returns the JPEG file of a recording's first colour picture, created on first request.
 
         Raises:
             NotFoundError: there is no such recording.
@@ -191,7 +191,7 @@ class RecordingStore:
         return cached
 
     def made_video(self, name: str) -> Path | None:
-        """Return the video of a recording's relit pictures; None if none was made since it changed.
+        """Returns the video of a recording's relit pictures; None if none was made since it changed.
 
         Raises:
             NotFoundError: there is no such recording.
@@ -213,7 +213,7 @@ class RecordingStore:
         return path if is_made else None
 
     def make_video(self, name: str, track: "Track") -> Path:
-        """Make the video of a recording's relit pictures, one at a time; what `track` raises leaves nothing.
+        """Makes the video of a recording's relit pictures, one at a time; what `track` raises leaves nothing.
 
         Raises:
             NotFoundError: there is no such recording.
@@ -233,14 +233,14 @@ class RecordingStore:
         return path
 
     def remove_video(self, name: str) -> None:
-        """Delete a video, if there is one."""
+        """Deletes a video, if there is one."""
         self._video_path(name).unlink(missing_ok=True)
 
     def _video_path(self, name: str) -> Path:
         return self._cache / f"{name}.mp4"
 
     def recover(self, name: str) -> StoredRecording:
-        """Recover an interrupted recording; the result replaces its remains.
+        """Recovers an interrupted recording; the result replaces its remains.
 
         Raises:
             NotFoundError: there is no such recording.
@@ -259,7 +259,7 @@ class RecordingStore:
         return self._described(out)
 
     def remove(self, name: str) -> None:
-        """Delete a recording.
+        """Deletes a recording.
 
         Raises:
             NotFoundError: there is none of this name.
@@ -271,7 +271,7 @@ class RecordingStore:
             each.unlink(missing_ok=True)
 
     def _paths(self) -> Iterator[Path]:
-        """Yield the paths of all recordings, unfinished ones too."""
+        """Yields the paths of all recordings, unfinished ones too."""
         for suffix in (SUFFIX + ACTIVE_SUFFIX, SUFFIX):
             for path in self.folder.glob(f"*{suffix}"):
                 if NAME.fullmatch(path.name.removesuffix(suffix)):
@@ -291,7 +291,7 @@ class RecordingStore:
         return StoredRecording(name, path, state, status.st_size, status.st_mtime_ns, facts, detail)
 
     def _facts(self, path: Path, key: list[int]) -> tuple[Facts | None, str]:
-        """Return the facts of a recording, or why it cannot be read; cached, because the whole file is read."""
+        """Returns the facts of a recording, or why it cannot be read; cached, because the whole file is read."""
         cached = self._cache / f"{path.name.split('.')[0]}.json"
         known = _cached_facts(cached, key)
         if known is not None:
@@ -308,7 +308,7 @@ def _absent(name: str) -> NotFoundError:
 
 
 def _status(path: Path) -> os.stat_result:
-    """Return size and time of a recording, which may be deleted or finished after it was found."""
+    """Returns size and time of a recording, which may be deleted or finished after it was found."""
     try:
         return path.stat()
     except FileNotFoundError as fault:
@@ -337,7 +337,7 @@ def _read_facts(path: Path) -> tuple[Facts | None, str]:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Name recordings instead of paths in errors, because clients know no paths."""
+    """Names recordings instead of paths in errors, because clients know no paths."""
     try:
         yield
     except (NotFoundError, ConflictError):

@@ -37,7 +37,7 @@ class _Job:
     future: "Future[Path]" = field(default_factory=Future)
 
     def tracked(self, numbers: range) -> Iterator[int]:
-        """Yield the numbers of frames, and note how far it is."""
+        """Yields the numbers of frames, and notes how far it is."""
         for number in numbers:
             if self.stopped.is_set():
                 raise was_stopped(self.name)
@@ -55,7 +55,7 @@ class RecordingVideos:
         self._executor = ThreadPoolExecutor(1, "videos", initializer=_give_way)
 
     def begin(self, name: str) -> "Future[Path]":
-        """Have a video made unless it is there or being made; the path comes once it is (cancelled: `was_stopped`).
+        """Has a video made unless it is there or being made; the path comes once it is (cancelled: `was_stopped`).
 
         Raises:
             NotFoundError: there is no such recording.
@@ -77,7 +77,7 @@ class RecordingVideos:
             return job.future
 
     def state(self, name: str) -> VideoAnswer:
-        """Return how far a video is.
+        """Returns how far a video is.
 
         Raises:
             DeltalightError: as `begin`.
@@ -94,7 +94,7 @@ class RecordingVideos:
         return VideoAnswer(state="failed", progress=0.0, detail=detail)
 
     def stop(self, name: str) -> None:
-        """Stop the making of a video, and wait until nothing is left of it."""
+        """Stops the making of a video, and waits until nothing is left of it."""
         with self._lock:
             job = self._jobs.pop(name, None)
         if job is not None:
@@ -103,18 +103,18 @@ class RecordingVideos:
                 job.future.exception()
 
     def close(self) -> None:
-        """Stop all."""
+        """Stops all."""
         for name in list(self._jobs):
             self.stop(name)
         self._executor.shutdown()
 
 
 def was_stopped(name: str) -> ConflictError:
-    """Return the refusal of a video whose making was stopped."""
+    """Returns the refusal of a video whose making was stopped."""
     return ConflictError(f"The video of {name} was stopped; ask for it again.")
 
 
 def _give_way() -> None:
-    """Lower the priority of the calling thread, and of the encoder's threads that it starts."""
+    """Lowers the priority of the calling thread, and of the encoder's threads that it starts."""
     if sys.platform == "linux":  # elsewhere this would be the whole process
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)

@@ -40,7 +40,7 @@ class FifoLock:
         self._waiting: deque[threading.Lock] = deque()
 
     def __enter__(self) -> None:
-        """Wait until all earlier threads have released the lock."""
+        """Waits until all earlier threads have released the lock."""
         with self._lock:
             if not self._is_held:
                 self._is_held = True
@@ -51,7 +51,7 @@ class FifoLock:
         turn.acquire()
 
     def __exit__(self, *_fault: object) -> None:
-        """Hand the lock over to the thread that has waited longest."""
+        """Hands the lock over to the thread that has waited longest."""
         with self._lock:
             if self._waiting:
                 self._waiting.popleft().release()
@@ -99,11 +99,11 @@ class RenderLink:
         self._thread = threading.Thread(target=self._run, name="render-link", daemon=True)
 
     def start(self) -> None:
-        """Start watching the server."""
+        """Starts watching the server."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stops watching."""
         self._stop.set()
         self._changed.set()
         if self._thread.is_alive():
@@ -113,7 +113,7 @@ class RenderLink:
             self._client.close()
 
     def follow(self, control: str | None, epoch: int | None) -> None:
-        """Talk to another render server from now on, of this epoch; one of another is taken for silent.
+        """Talks to another render server from now on, of this epoch; one of another is taken for silent.
 
         Requests to the one before end without an answer. The new one gets source, views and scene.
         """
@@ -140,7 +140,7 @@ class RenderLink:
         return self._deliveries.newest
 
     def delivery(self, scene: StoredScene) -> DeliveryStatus | None:
-        """Return the status of the last change of a scene that was sent; None for a scene that is not shown."""
+        """Returns the status of the last change of a scene that was sent; None for a scene that is not shown."""
         newest = self._deliveries.newest
         if newest is not None and newest.scene_id == scene.head.id:
             return newest
@@ -149,7 +149,7 @@ class RenderLink:
         return pending(_change(scene), SILENT if self._answers is False else BUSY)
 
     def show(self, scene: StoredScene) -> DeliveryStatus:
-        """Send a stored revision of the active scene; return its status, or `pending` if that takes long.
+        """Sends a stored revision of the active scene; returns its status, or `pending` if that takes long.
 
         Does not wait for a server that did not answer the last request.
         """
@@ -163,7 +163,7 @@ class RenderLink:
     def command(
         self, op: str, payload: dict[str, object] | None = None, timeout_s: float = COMMAND_TIMEOUT_S
     ) -> dict[str, object]:
-        """Execute a command at the render server, after those that wait, and return the payload of its reply.
+        """Executes a command at the render server, after those that wait, and returns the payload of its reply.
 
         Raises:
             UnansweredError: the server does not answer.
@@ -173,16 +173,16 @@ class RenderLink:
         return self._execute(op, payload, timeout_s)
 
     def watch(self, views: Sequence[ShownView]) -> None:
-        """Have frames rendered in these views beside the scene's own, as soon as the server takes it."""
+        """Has frames rendered in these views beside the scene's own, as soon as the server takes it."""
         self._watched = tuple(views)
         self._changed.set()
 
     def look_again(self) -> None:
-        """Send the active scene if it is not what the server has: somebody else changed it."""
+        """Sends the active scene if it is not what the server has: somebody else changed it."""
         self._changed.set()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
-        """Make the server read frames from these endpoints, also after its restart; None = from its own nodes.
+        """Makes the server read frames from these endpoints, also after its restart; None = from its own nodes.
 
         Calls `on_source` with the endpoints.
 
@@ -211,7 +211,7 @@ class RenderLink:
             )
 
     def _require_alive(self) -> None:
-        """Detect a dead server within a second; only the renderer knows how long its commands take."""
+        """Detects a dead server within a second; only the renderer knows how long its commands take."""
         try:
             self._request(CLOCK_OP, ALIVE_TIMEOUT_S)
         except UnansweredError:
@@ -219,7 +219,7 @@ class RenderLink:
             self._refuse_where_silent()
 
     def _send_newest(self) -> None:
-        """Send the newest revision of the active scene unless the server has it (while holding the lock)."""
+        """Sends the newest revision of the active scene unless the server has it (while holding the lock)."""
         self._changed.clear()
         awaited = self._deliveries.awaited
         active = self._store.scenes.active()
@@ -237,7 +237,7 @@ class RenderLink:
             self._on_delivery(status)
 
     def _send_watched(self) -> None:
-        """Tell the server which views are looked at, unless it knows (while holding the lock)."""
+        """Tells the server which views are looked at, unless it knows (while holding the lock)."""
         watched = self._watched
         is_due = bool(watched) and time.monotonic() >= self._watch_due_s
         if not self._answers or (watched == self._sent_watched and not is_due):
@@ -265,7 +265,7 @@ class RenderLink:
         return DeliveryStatus("shown", active.head.id, revision)
 
     def _refused(self, active: StoredScene, refusal: DeltalightError) -> DeliveryStatus:
-        """Return the status of a refused scene; another web process may have sent a newer revision meanwhile."""
+        """Returns the status of a refused scene; another web process may have sent a newer revision meanwhile."""
         revision = active.document.revision
         with suppress(DeltalightError):
             server = self._request("ping", ALIVE_TIMEOUT_S)
@@ -276,7 +276,7 @@ class RenderLink:
         return DeliveryStatus("refused", active.head.id, revision, detail)
 
     def _set_scene(self, active: StoredScene) -> None:
-        """Send the scene.
+        """Sends the scene.
 
         The first one without a revision, so that the server does not compare it with older ones.
         """
@@ -297,7 +297,7 @@ class RenderLink:
         return str(server["instance"])
 
     def _run(self) -> None:
-        """Send changes; check the server at first, and after each second of silence."""
+        """Sends changes; checks the server at first, and after each second of silence."""
         while not self._stop.is_set():
             try:
                 with self._asking:
@@ -317,7 +317,7 @@ class RenderLink:
             self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
     def _check_server(self) -> None:
-        """Check whether the server answers; send source and scene to one that (re)started."""
+        """Checks whether the server answers; sends source and scene to one that (re)started."""
         answered_before = self._answers
         try:
             self._request(CLOCK_OP, ALIVE_TIMEOUT_S)
@@ -336,7 +336,7 @@ class RenderLink:
             self._instance, self._has_scene = instance, False
 
     def _restore_source(self) -> None:
-        """Tell a (re)started server where to read from; its source may be left from a killed service."""
+        """Tells a (re)started server where to read from; its source may be left from a killed service."""
         if not self._chooses_source:
             return
         try:

@@ -55,7 +55,7 @@ class ReplayEndpoints:
 
     @classmethod
     def beside(cls, server: str) -> Self:
-        """Choose endpoints that the render server reaches: sockets beside its own, else loopback ports.
+        """Chooses endpoints that the render server reaches: sockets beside its own, else loopback ports.
 
         Its sockets may be in a folder shared with another container. The names are constant, so that a replay takes
         over what a killed service left.
@@ -77,7 +77,7 @@ class ReplayEndpoints:
         return cls(ports.endpoint(streams), ports.endpoint(control))
 
     def clear(self) -> None:
-        """Remove the files that closed sockets leave behind."""
+        """Removes the files that closed sockets leave behind."""
         for endpoint in (self.streams, self.control):
             if endpoint.startswith(IPC):
                 Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
@@ -117,7 +117,7 @@ class ReplayControl:
         return None if replay is None else replay.order.recording
 
     def position(self) -> Position | None:
-        """Return the position of what is shown; None = a camera is."""
+        """Returns the position of what is shown; None = a camera is."""
         shown = self._shown
         if shown is None:
             return None
@@ -131,7 +131,7 @@ class ReplayControl:
         return self._source if replay is None else replay.playback
 
     def start(self, order: ReplayOrder) -> Position:
-        """Replay a recording.
+        """Replays a recording.
 
         Raises:
             ConflictError: the render server is on another host.
@@ -163,7 +163,7 @@ class ReplayControl:
         playing: bool | None = None,
         rate: float | None = None,
     ) -> Position:
-        """Seek, then step, pause, resume, or change the rate.
+        """Seeks, then step, pauses, resumes, or changes the rate.
 
         Raises:
             ConflictError: no recording is shown.
@@ -186,14 +186,14 @@ class ReplayControl:
         return position
 
     def stop(self) -> None:
-        """Show the live nodes again."""
+        """Shows the live nodes again."""
         with self._changing:
             was_replayed = self._end()
         if was_replayed:
             self._publish(self.position())
 
     def close(self) -> None:
-        """Stop the replay at the end of the service, without publishing."""
+        """Stops the replay at the end of the service, without publishing."""
         with self._changing:
             self._end()
             source, self._source = self._source, None
@@ -217,7 +217,7 @@ class ReplayControl:
             log.info("the render server reads from elsewhere as soon as it answers")
 
     def _ended(self, replay: "_Replay", sentence: str) -> None:
-        """Return to live after a child that ended by itself (called by its thread)."""
+        """Returns to live after a child that ended by itself (called by its thread)."""
         with self._changing:
             if self._replay is not replay:
                 return
@@ -229,7 +229,7 @@ class ReplayControl:
         threading.Thread(target=self._watch, args=(playback,), name="replay-control", daemon=True).start()
 
     def _watch(self, playback: PlaybackClient) -> None:
-        """Publish how a position changes while it is shown, until that is over for good."""
+        """Publishes how a position changes while it is shown, until that is over for good."""
         last, due_s = None, 0.0
         while playback in (self._shown, self._source):
             position = self._moved(playback) if playback is self._shown else None
@@ -273,7 +273,7 @@ class _Replay:
         self._child = ChildProcess(*words, on_end=end)
 
     def first_position(self) -> Position:
-        """Wait until the child runs, and return its position.
+        """Waits until the child runs, and returns its position.
 
         Raises:
             DeltalightError: the child ended, or does not answer.
@@ -290,7 +290,7 @@ class _Replay:
         raise DeltalightError(sentence or f"The replay of {self.order.recording} does not start; try again.")
 
     def close(self) -> None:
-        """End the child process."""
+        """Ends the child process."""
         self._is_closing = True
         self._child.end(END_TIMEOUT_S)
         self.playback.close()

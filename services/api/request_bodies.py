@@ -29,14 +29,14 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def _as_sent(value: object, _validate: ValidatorFunctionWrapHandler) -> object:
-    """Leave the body unvalidated; its model only describes it."""
+    """Leaves the body unvalidated; its model only describes it."""
     if isinstance(value, bytes):  # of another media type
         raise ValueError("must be JSON")
     return value
 
 
 def checked(model: type[Model], sent: object, name: str) -> Model:
-    """Validate a body called `name` that came `AS_SENT`.
+    """Validates a body called `name` that came `AS_SENT`.
 
     Raises:
         DeltalightError: the first fault, with its place and the nearest key.
@@ -133,7 +133,7 @@ SentDocument = Annotated[Any, Depends(_sent)]
 
 
 def document_file(document: SceneDocument, name: str, *, as_yaml: bool) -> Response:
-    """Return a document as a download, NAME.json or NAME.yaml."""
+    """Returns a document as a download, NAME.json or NAME.yaml."""
     if as_yaml:
         content = yaml_text(document.model_dump(mode="json"))
         media_type, suffix = YAML_TYPE, "yaml"
@@ -144,7 +144,7 @@ def document_file(document: SceneDocument, name: str, *, as_yaml: bool) -> Respo
 
 
 def require_upload_type(request: Request) -> None:
-    """Refuse a body that is no file as it is.
+    """Refuses a body that is no file as it is.
 
     Raises:
         ProblemError: it is of another media type.

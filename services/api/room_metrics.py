@@ -41,13 +41,13 @@ class RoomMetrics:
         self._lock = threading.Lock()
 
     def note_replaced(self, room: str) -> None:
-        """Note that a room's render server is another from now on, or is gone."""
+        """Notes that a room's render server is another from now on, or is gone."""
         with self._lock:
             if room in self._newest_s:
                 self._replaced.add(room)
 
     def note_frame(self, room: str, rendering_s: float) -> None:
-        """Note a picture, and how long it took the render server."""
+        """Notes a picture, and how long it took the render server."""
         now_s = time.monotonic()
         with self._lock:
             before_s, self._newest_s[room] = self._newest_s.get(room, now_s), now_s
@@ -61,7 +61,7 @@ class RoomMetrics:
             gaps.observe(now_s - before_s)
 
     def text(self) -> bytes:
-        """Return all measurements in the text format of Prometheus."""
+        """Returns all measurements in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
@@ -72,7 +72,7 @@ class _Placed(Collector):
         self._rooms, self._refused = rooms, refused
 
     def collect(self) -> Iterable[Metric]:
-        """Return all metric families."""
+        """Returns all metric families."""
         found = self._rooms()
         yield from _rooms(found.rooms)
         yield _slots(found.slots)

@@ -20,7 +20,7 @@ class RoomPaths:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, with its room noted and left out of its path."""
+        """Passes a request on, with its room noted and left out of its path."""
         match = _PATH.fullmatch(scope["path"]) if scope["type"] in ("http", "websocket") else None
         if match is not None and match["rest"] not in OWN:
             path = match["api"] + match["rest"]

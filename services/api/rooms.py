@@ -51,7 +51,7 @@ class Room:
     nodes: tuple[str, ...] = ()  # endpoints
 
     def follow(self, endpoints: RoomEndpoints | None) -> None:
-        """Use another render server from now on, None = there is none."""
+        """Uses another render server from now on, None = there is none."""
         self.metrics.note_replaced(self.context.room)
         published = () if endpoints is None else (endpoints.publish,)
         self.streams.follow((*published, *self.nodes))
@@ -62,7 +62,7 @@ class Room:
             self.context.link.follow(endpoints.control, endpoints.epoch)
 
     def close(self) -> None:
-        """End its children and connections."""
+        """Ends its children and connections."""
         self.context.replay.close()
         self.context.recording_sessions.close()
         self.streams.close()
@@ -103,7 +103,7 @@ class Rooms:
         return {name: room.context for name, room in self._rooms.items()}
 
     def start(self) -> None:
-        """Start to talk to nodes, render servers and other web processes."""
+        """Starts to talk to nodes, render servers and other web processes."""
         self._relay.start()
         for room in self._rooms.values():
             room.context.link.start()
@@ -112,7 +112,7 @@ class Rooms:
             self.follower.start()
 
     def close(self) -> None:
-        """End all children and connections."""
+        """Ends all children and connections."""
         if self.follower is not None:
             self.follower.close()
         self._relay.close()
@@ -156,11 +156,11 @@ class _Builder:
         self._whep = WhepSessions(settings, store.tokens, self._streams)
 
     def close(self) -> None:
-        """End what the rooms share."""
+        """Ends what the rooms share."""
         self._videos.close()
 
     def single(self) -> Room:
-        """Return the room of an installation that has one."""
+        """Returns the room of an installation that has one."""
         settings = self._settings
         context = self._context(
             ONLY_ROOM,
@@ -173,7 +173,7 @@ class _Builder:
         return self._room(context, settings.subscribe)
 
     def of_directory(self, status: RoomStatus, rooms: Sequence[str]) -> Room:
-        """Return a room of a directory, which is followed later; one without a scene gets an empty one."""
+        """Returns a room of a directory, which is followed later; one without a scene gets an empty one."""
         assert self._settings.rooms is not None
         store = self._store.of_room(status.name, rooms)
         if store.scenes.active_id() is None:
@@ -197,7 +197,7 @@ class _Builder:
         *,
         playback: str | None = None,
     ) -> Context:
-        """Build the context of a room; `server` and `playback` are as for `ReplayControl`."""
+        """Builds the context of a room; `server` and `playback` are as for `ReplayControl`."""
         events, watch = EventHub(), ProcessWatch()
         link = RenderLink(
             store,
@@ -256,7 +256,7 @@ class _Builder:
 
 
 def _sinks(context: Context, metrics: RoomMetrics) -> dict[str, Sink]:
-    """Route composites to viewers, radiance to the fish-eye view, and reports to the watch and to event listeners."""
+    """Routes composites to viewers, radiance to the fish-eye view, reports to the watch and to event listeners."""
     return {
         "composite": lambda message, parts: _publish_composite(context, metrics, message, parts),
         "cameras": lambda message, _parts: _publish_cameras(context, message),

@@ -42,10 +42,10 @@ log = structlog.get_logger()
 
 
 def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None = None) -> None:
-    """Serve until SIGINT or SIGTERM; import and activate `scene` first.
+    """Serves until SIGINT or SIGTERM; imports and activate `scene` first.
 
-    Without any scene, take over that of the render server, or create an empty one. If the address leaves the host and
-    there is no token yet, create one and show it: at a terminal there, else in a file of the data folder.
+    Without any scene, takes over the render server's, or creates an empty one. If the address leaves the host and
+    there is no token yet, creates one and shows it: at a terminal there, else in a file of the data folder.
 
     Raises:
         DeltalightError: the port is in use, the data folder cannot be used, or the scene is wrong.
@@ -74,7 +74,7 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
 
 
 def open_patiently(settings: ApiSettings) -> Store:
-    """Open the service's store; wait for a database that does not answer yet, as when a host starts.
+    """Opens the service's store; waits for a database that does not answer yet, as when a host starts.
 
     Raises:
         DeltalightError: it cannot be used.
@@ -96,7 +96,7 @@ class _Server(uvicorn.Server):
     """Ends the live streams, which would not end by themselves, before it waits for connections to close."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop serving."""
+        """Stops serving."""
         assert isinstance(self.config.app, FastAPI)
         for context in self.config.app.state.contexts.values():
             context.live.close()
@@ -104,7 +104,7 @@ class _Server(uvicorn.Server):
 
 
 def http_server(app: FastAPI) -> uvicorn.Server:
-    """Return the web server that runs the application."""
+    """Returns the web server that runs the application."""
     config = uvicorn.Config(
         app,
         http=LimitedProtocol,
@@ -125,7 +125,7 @@ def http_server(app: FastAPI) -> uvicorn.Server:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that listens at an address.
+    """Returns a socket that listens at an address.
 
     Raises:
         DeltalightError: it cannot.
@@ -156,7 +156,7 @@ def _announce_access(settings: ApiSettings, store: Store) -> None:
 
 
 def _hand_out(token: str, path: Path) -> None:
-    """Show the first token to who sits at a terminal; else keep it in a file: what is printed ends in a log."""
+    """Shows the first token to who sits at a terminal; else keep it in a file: what is printed ends in a log."""
     if sys.stdout.isatty():
         print(f"Token `{FIRST_TOKEN}` (role control), shown this once: {token}", flush=True)
         return

@@ -62,13 +62,13 @@ class SnapshotStore:
                 shutil.rmtree(path, ignore_errors=True)
 
     def all(self) -> list[SnapshotFacts]:
-        """Return all snapshots, the newest first."""
+        """Returns all snapshots, the newest first."""
         names = sorted((path.name for path in self._folder.iterdir()), reverse=True)
         read = (_facts(self._folder / name) for name in names if ID.fullmatch(name))
         return [facts for facts in read if facts is not None]
 
     def get(self, name: str) -> SnapshotFacts:
-        """Return one snapshot.
+        """Returns one snapshot.
 
         Raises:
             NotFoundError: there is none of this name.
@@ -79,7 +79,7 @@ class SnapshotStore:
         return facts
 
     def file(self, name: str, file: str) -> Path:
-        """Return the path of a snapshot's file.
+        """Returns the path of a snapshot's file.
 
         Raises:
             NotFoundError: there is no such snapshot, or no such file in it.
@@ -89,7 +89,7 @@ class SnapshotStore:
         return self._folder / name / file
 
     def remove(self, name: str) -> None:
-        """Delete a snapshot.
+        """Deletes a snapshot.
 
         Raises:
             NotFoundError: there is none of this name.
@@ -103,7 +103,7 @@ class SnapshotStore:
         shutil.rmtree(hidden, ignore_errors=True)
 
     def add(self, take: Callable[[str, Path], SnapshotFacts]) -> SnapshotFacts:
-        """Add a snapshot: `take(name, folder)` writes the pictures; it is listed once it is synced to the disk.
+        """Adds a snapshot: `take(name, folder)` writes the pictures; it is listed once it is synced to the disk.
 
         Raises:
             StorageFaultError: the disk refuses.
@@ -129,7 +129,7 @@ class SnapshotStore:
 
 
 def files_of(answer: dict[str, Any], folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Return the files that a render server reports and that exist, and its errors by picture."""
+    """Returns the files that a render server reports and that exist, and its errors by picture."""
     written = [str(each) for each in answer.get("files", []) if FILE.fullmatch(str(each))]
     faults = {str(name): str(fault) for name, fault in answer.get("errors", {}).items()}
     return [each for each in written if (folder / each).is_file()], faults
@@ -140,7 +140,7 @@ def _absent(name: str) -> NotFoundError:
 
 
 def now() -> datetime:
-    """Return the timestamp of a snapshot taken now."""
+    """Returns the timestamp of a snapshot taken now."""
     return datetime.now(UTC)
 
 

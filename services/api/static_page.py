@@ -57,7 +57,7 @@ class StaticPage:
         self._files = StaticFiles(directory=folder, html=True, check_dir=False)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
+        """Answers a request."""
         path = scope["path"]
         if scope["type"] != "http" or path.startswith(API):
             await self._otherwise(scope, receive, send)

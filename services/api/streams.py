@@ -70,7 +70,7 @@ class ProcessWatch:
         self._lock = threading.Lock()
 
     def note(self, message: StatsMessage) -> Report:
-        """Store a report that has just arrived."""
+        """Stores a report that has just arrived."""
         sent_ns = message.capture_ns + message.clock_offset_ns
         delay_ms = (time.time_ns() - sent_ns) / 1e6
         with self._lock:
@@ -86,19 +86,19 @@ class ProcessWatch:
         return newest.lost if newest.message.state == "stopping" else newest.before
 
     def reports(self) -> list[Report]:
-        """Return the newest report of each process, ordered by name."""
+        """Returns the newest report of each process, ordered by name."""
         with self._lock:
             self._reports = {k: v for k, v in self._reports.items() if v.age_s < FORGOTTEN_AFTER_S}
             return [self._reports[name] for name in sorted(self._reports)]
 
     def detail(self, name: str) -> str:
-        """Return the detail of a process's newest report; empty if there is none."""
+        """Returns the detail of a process's newest report; empty if there is none."""
         report = self._reports.get(name)
         return "" if report is None else report.message.detail
 
 
 def _judged(report: Report, earlier: Report | None) -> Report:
-    """Count and log that a process has become degraded, or is no longer."""
+    """Counts and logs that a process has become degraded, or is no longer."""
     if earlier is not None:
         report = replace(report, degraded=earlier.degraded, logged_s=earlier.logged_s)
         if earlier.is_degraded and report.is_degraded:
@@ -131,11 +131,11 @@ class Streams:
         self._thread = threading.Thread(target=self._run, name="streams", daemon=True)
 
     def start(self) -> None:
-        """Start listening."""
+        """Starts listening."""
         self._thread.start()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
-        """Subscribe also to the source that the render server reads from now on; None = its own nodes.
+        """Subscribes also to the source that the render server reads from now on; None = its own nodes.
 
         With such a source, radiance comes from there only.
         """
@@ -146,13 +146,13 @@ class Streams:
             before.close()
 
     def follow(self, endpoints: Sequence[str]) -> None:
-        """Listen to these endpoints in place of the earlier ones."""
+        """Listens to these endpoints in place of the earlier ones."""
         with self._changing:
             before, self._receiver = self._receiver, Receiver(endpoints, list(self._sinks), keys=self._keys)
         before.close()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stops listening."""
         self._stop.set()
         self.use_source(None)
         self._receiver.close()

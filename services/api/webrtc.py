@@ -57,7 +57,7 @@ def _capability(profile: str) -> RTCRtpCodecCapability:
 
 
 def _add_profiles() -> None:
-    """Have aiortc negotiate the profiles of our encoders: it lists those of its own alone."""
+    """Has aiortc negotiate the profiles of our encoders: it lists those of its own alone."""
     feedback = next(codec.rtcpFeedback for codec in CODECS["video"] if codec.name == "H264")
     for number, profile in enumerate(OUR_PROFILES):
         ours = _capability(profile)
@@ -99,7 +99,7 @@ class Peer:
         on_key_wanted(self._transceiver.sender, viewer)
 
     async def answer(self, offer: str) -> str:
-        """Return the answer to an offer, with all candidates of this host.
+        """Returns the answer to an offer, with all candidates of this host.
 
         Raises:
             DeltalightError: it is no offer, or wants what is not there.
@@ -119,11 +119,11 @@ class Peer:
         return self._connection.localDescription.sdp
 
     async def until_ended(self) -> None:
-        """Wait until the peer has gone or did not come, or until there are no more pictures."""
+        """Waits until the peer has gone or did not come, or until there are no more pictures."""
         await self._has_ended.wait()
 
     async def close(self) -> None:
-        """End the connection; tell the peer."""
+        """Ends the connection; tells the peer."""
         await self._connection.close()
 
     async def _take(self, offer: str) -> None:
@@ -171,7 +171,7 @@ class _LiveTrack(MediaStreamTrack):
 
 
 def on_key_wanted(sender: RTCRtpSender, viewer: Viewer) -> None:
-    """Give the viewer a key when the peer lost pictures (RFC 4585, 6.3.1; RFC 5104, 4.3.1).
+    """Gives the viewer a key when the peer lost pictures (RFC 4585, 6.3.1; RFC 5104, 4.3.1).
 
     aiortc tells its own encoder alone, which coded pictures do not pass.
     """
@@ -179,7 +179,7 @@ def on_key_wanted(sender: RTCRtpSender, viewer: Viewer) -> None:
 
 
 def listen_at(transceiver: RTCRtpTransceiver, addresses: Sequence[str]) -> None:
-    """Open ports at these addresses alone; aiortc would at all of the host but loopback."""
+    """Opens ports at these addresses alone; aiortc would at all of the host but loopback."""
     connection = transceiver.sender.transport.transport.iceGatherer._connection
     gather = connection.get_component_candidates
 
@@ -193,7 +193,7 @@ def listen_at(transceiver: RTCRtpTransceiver, addresses: Sequence[str]) -> None:
 
 
 def _restrict(offer: SessionDescription) -> None:
-    """Check an offer, and leave out of it what is not used.
+    """Checks an offer, and leaves out of it what is not used.
 
     Raises:
         DeltalightError: it is for something else, or incomplete.

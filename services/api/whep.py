@@ -70,7 +70,7 @@ class WhepSessions:
         return why_unavailable() or (NO_AIORTC if find_spec("aiortc") is None else None)
 
     async def open(self, hub: LiveHub, watched: WatchedView, offer: str, watcher: Watcher) -> tuple[str, str]:
-        """Begin a session; return its id and the answer to the offer.
+        """Begins a session; returns its id and the answer to the offer.
 
         Raises:
             ProblemError: there is no WHEP here, no port opens, or there are too many sessions.
@@ -97,7 +97,7 @@ class WhepSessions:
         return session_id, answer
 
     async def end(self, session_id: str) -> None:
-        """End a session.
+        """Ends a session.
 
         Raises:
             NotFoundError: there is none of this id.
@@ -109,7 +109,7 @@ class WhepSessions:
         await asyncio.wait([task])
 
     async def close(self) -> None:
-        """End all sessions."""
+        """Ends all sessions."""
         for task in (tasks := list(self._running.values())):
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -145,14 +145,14 @@ class WhepSessions:
 
 
 def _peer_class() -> "type[Peer]":
-    """Import aiortc, which takes a third of a second."""
+    """Imports aiortc, which takes a third of a second."""
     from deltalight.services.api.webrtc import Peer
 
     return Peer
 
 
 def _addresses_of_host(version: int) -> Sequence[str]:
-    """Return this host's addresses, without loopback and those of one link alone.
+    """Returns this host's addresses, without loopback and those of one link alone.
 
     Raises:
         ProblemError: it has none.

@@ -160,7 +160,7 @@ def revoke(
 
 
 def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:
-    """Return the given endpoints, or the one of the node to be found beside the render server."""
+    """Returns the given endpoints, or the one of the node to be found beside the render server."""
     if node is None:
         return subscribe or None
     from deltalight.services.discovery import node_endpoint

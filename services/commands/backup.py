@@ -52,7 +52,7 @@ def restore(
 
 
 def _whole_folder(data: Path | None, config_file: Path | None) -> Path:
-    """Return the data folder.
+    """Returns the data folder.
 
     Raises:
         DeltalightError: a part of what it usually holds is elsewhere.

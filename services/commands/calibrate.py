@@ -193,7 +193,7 @@ def photometric(
 
 
 def _print_figures(figures: dict[str, Any], *, as_json: bool) -> None:
-    """Print figures as JSON, or one per line."""
+    """Prints figures as JSON, or one per line."""
     if as_json:
         typer.echo(json.dumps(figures, indent=2))
         return

@@ -36,7 +36,7 @@ def config(
 
 
 def _models() -> "dict[str, type[BaseModel]]":
-    """Return the sections whose programs are installed here."""
+    """Returns the sections whose programs are installed here."""
     from deltalight.protocol.keys import KeySettings
     from deltalight.sensor_node.node import NodeConfig
 
@@ -61,7 +61,7 @@ def _print_table(name: str, values: Mapping[str, Any], origins: Mapping[str, str
 
 
 def _toml(value: object) -> str:
-    """Format a value as TOML: JSON's strings, numbers and lists are valid TOML."""
+    """Formats a value as TOML: JSON's strings, numbers and lists are valid TOML."""
     if isinstance(value, dict):
         return (
             "{" + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items() if each is not None) + "}"

@@ -35,5 +35,5 @@ EXAMPLES = {
 
 
 def examples_of(command: str) -> str:
-    """Return the examples of a command as the end of its help; blank lines keep them apart."""
+    """Returns the examples of a command as the end of its help; blank lines keep them apart."""
     return "\n\n".join(["[bold]Examples[/bold]", *(f"  {line}" for line in EXAMPLES[command])])

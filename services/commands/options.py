@@ -85,7 +85,7 @@ LARGEST_EDGE = 8192
 
 
 def writable(path: Path | None) -> Path | None:
-    """Check the file that an option names, if any, before the command begins its work.
+    """Checks the file that an option names, if any, before the command begins its work.
 
     Raises:
         DeltalightError: it cannot be written.
@@ -98,7 +98,7 @@ def writable(path: Path | None) -> Path | None:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Parse `WxH` into width and height in pixels.
+    """Parses `WxH` into width and height in pixels.
 
     Raises:
         DeltalightError: not two whole numbers within the range of the scene document.
@@ -114,7 +114,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_frames(text: str | None, count: int) -> range:
-    """Parse the half-open `A:B` (either may be omitted) into frame numbers of a source of `count` frames.
+    """Parses the half-open `A:B` (either may be omitted) into frame numbers of a source of `count` frames.
 
     Raises:
         DeltalightError: not such a range, or it reaches outside the source or is empty.
@@ -136,7 +136,7 @@ def parse_frames(text: str | None, count: int) -> range:
 
 
 def node_endpoints(subscribe: list[str] | None, node: str | None, settings: "KeySettings") -> list[str]:
-    """Return the given endpoints, or the one of the node to be found, or the default.
+    """Returns the given endpoints, or the one of the node to be found, or the default.
 
     Raises:
         DeltalightError: both were given, or no such node announces itself.
@@ -151,7 +151,7 @@ def node_endpoints(subscribe: list[str] | None, node: str | None, settings: "Key
 
 
 def data_folder(data: Path | None, config_file: Path | None = None) -> Path:
-    """Return the web process's data folder: of the command line, the configuration, or the default."""
+    """Returns the web process's data folder: of the command line, the configuration, or the default."""
     from deltalight.services.api.settings import ApiSettings
     from deltalight.services.settings import load_configuration
     from deltalight.services.storage.store import default_folder

@@ -120,7 +120,7 @@ def _progress_lines() -> "Iterator[Show]":
 
 
 def _run(recorder: "Recorder", progress: "AbstractContextManager[Show]", summarize: "Show") -> None:
-    """Record in a thread, which no signal interrupts in the middle of a frame, and show progress."""
+    """Records in a thread, which no signal interrupts in the middle of a frame, and shows progress."""
     from concurrent.futures import ThreadPoolExecutor, wait
     from threading import Event
 

@@ -35,7 +35,7 @@ Composites = Annotated[
 def following_room(
     rooms: str | None, room: str | None, keys: "Keys | None", use: Callable[[str | None], None]
 ) -> Iterator[None]:
-    """Call `use` with the endpoints of a room (`follower.following`), if one is named.
+    """Calls `use` with the endpoints of a room (`follower.following`), if one is named.
 
     Raises:
         DeltalightError: one option is without the other, the directory does not answer, or has no such room.
@@ -57,7 +57,7 @@ def following_room(
 def relit_pictures(
     composites: str | None, rooms: str | None, room: str | None, camera: str | None, keys: "KeySettings"
 ) -> "Iterator[tuple[PictureSource, str]]":
-    """Yield the pictures of a render server or a room, and what to call where they come from.
+    """Yields the pictures of a render server or a room, and what to call where they come from.
 
     Raises:
         DeltalightError: the options contradict each other, or as `following_room` and `PictureSource.follow`.

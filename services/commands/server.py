@@ -77,7 +77,7 @@ def server(
 
 
 def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:
-    """Return the given endpoints, or the one of the node to be found."""
+    """Returns the given endpoints, or the one of the node to be found."""
     if node is None:
         return subscribe or None
     from deltalight.services.discovery import node_endpoint

@@ -67,7 +67,7 @@ def stream(
 
 
 def _send_all(source: "PictureSource", out: "StreamOut", show: "Callable[[StreamStatus], None]") -> None:
-    """Send each picture, and the last one again while none comes."""
+    """Sends each picture, and the last one again while none comes."""
     from deltalight.services.stream_out import REPEAT_AFTER_S
 
     picture: np.ndarray | None = None

@@ -115,7 +115,7 @@ def up(
 
 
 def _run_plan(plan: "HostPlan", scene: "SceneDocument", early: Mapping[str, Process]) -> None:
-    """Run the processes of a plan until Ctrl-C; `early` ones are those of their names."""
+    """Runs the processes of a plan until Ctrl-C; `early` ones are those of their names."""
     from deltalight.services.session_file import session_file
     from deltalight.services.supervisor import Supervisor
 
@@ -131,7 +131,7 @@ def _run_plan(plan: "HostPlan", scene: "SceneDocument", early: Mapping[str, Proc
 def _require_fitting(
     rooms: Path | None, ray_address: str | None, rooms_host: str, *, on_cluster: bool
 ) -> None:
-    """Check that options of a cluster come with `--placer ray`, and that with rooms.
+    """Checks that options of a cluster come with `--placer ray`, and that with rooms.
 
     Raises:
         DeltalightError: they do not.
@@ -148,7 +148,7 @@ def _require_fitting(
 
 
 def _require_none(*options: object) -> None:
-    """Check that options of a single room are not given with `--rooms`.
+    """Checks that options of a single room are not given with `--rooms`.
 
     Raises:
         DeltalightError: one is.
@@ -161,7 +161,7 @@ def _require_none(*options: object) -> None:
 
 
 def _source_of_node(source: str | None, node: str | None, config_file: Path | None) -> str | None:
-    """Return the source of the node to start: given, or of the configuration; None where `node` is used.
+    """Returns the source of the node to start: given, or of the configuration; None where `node` is used.
 
     Raises:
         DeltalightError: both are given, or there is no source.
@@ -207,7 +207,7 @@ def _run_rooms(
 
 
 def _configured_source(config_file: Path | None) -> str:
-    """Return the node's source of the configuration.
+    """Returns the node's source of the configuration.
 
     Raises:
         DeltalightError: it names none.

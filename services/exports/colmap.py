@@ -14,7 +14,7 @@ CAMERA_ID = 1
 
 
 def write_colmap(folder: Path, views: Iterable[PosedView]) -> int:
-    """Write `images/` and `sparse/0/` into a folder; return the number of frames.
+    """Writes `images/` and `sparse/0/` into a folder; returns the number of frames.
 
     Raises:
         DeltalightError: COLMAP has no model of the camera's lens.
@@ -42,7 +42,7 @@ def write_colmap(folder: Path, views: Iterable[PosedView]) -> int:
 
 
 def camera_line(camera: CameraModel) -> str:
-    """Return a camera's line; COLMAP's pixels begin at their corner.
+    """Returns a camera's line; COLMAP's pixels begin at their corner.
 
     Raises:
         DeltalightError: COLMAP has no model of its lens.
@@ -59,7 +59,7 @@ def camera_line(camera: CameraModel) -> str:
 
 
 def _image_line(number: int, world_from_camera: Float64[np.ndarray, "4 4"], name: str) -> str:
-    """Return an image's line: rotation and translation from the world to the camera."""
+    """Returns an image's line: rotation and translation from the world to the camera."""
     pose = np.linalg.inv(world_from_camera)
     return f"{number} {_words([*wxyz_from_rotation(pose[:3, :3]), *pose[:3, 3]])} {CAMERA_ID} {name}"
 

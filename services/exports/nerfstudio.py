@@ -18,7 +18,7 @@ OPTICAL_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_nerfstudio(folder: Path, views: Iterable[PosedView]) -> int:
-    """Write `transforms.json`, `images/`, `depth/` and the points into a folder; return the number of frames.
+    """Writes `transforms.json`, `images/`, `depth/` and the points into a folder; returns the number of frames.
 
     Raises:
         DeltalightError: Nerfstudio has no model of the camera's lens.
@@ -39,7 +39,7 @@ def write_nerfstudio(folder: Path, views: Iterable[PosedView]) -> int:
 
 
 def camera_values(camera: CameraModel) -> dict[str, Any]:
-    """Return the camera's keys; Nerfstudio's pixels begin at their corner.
+    """Returns the camera's keys; Nerfstudio's pixels begin at their corner.
 
     Raises:
         DeltalightError: Nerfstudio has no model of its lens.
@@ -74,7 +74,7 @@ def _frame(folder: Path, view: PosedView) -> dict[str, Any]:
 
 
 def _write_points(path: Path, cloud: PointCloud) -> None:
-    """Write points with colours as binary PLY."""
+    """Writes points with colours as binary PLY."""
     positions, colors = cloud.arrays()
     names = [
         *((f"float {axis}", "<f4") for axis in "xyz"),

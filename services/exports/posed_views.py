@@ -35,7 +35,7 @@ class PosedView:
         return self.frame.pose.world_from_camera
 
     def write(self, folder: Path) -> str:
-        """Write the picture into a folder and return its name."""
+        """Writes the picture into a folder and returns its name."""
         name = f"{self.frame.frame_id:06d}.{self.suffix}"
         (folder / name).write_bytes(self.picture)
         return name
@@ -48,7 +48,7 @@ class PointCloud:
     _cells: dict[tuple[int, int, int], tuple[float, ...]] = field(default_factory=dict)
 
     def add(self, view: PosedView) -> None:
-        """Add what the depth of a frame shows."""
+        """Adds what the depth of a frame shows."""
         depth, color = view.frame.depth, view.frame.color
         if depth is None or not depth.valid.any():
             return
@@ -66,13 +66,13 @@ class PointCloud:
             self._cells.setdefault(tuple(cell), (*point, *code))
 
     def arrays(self) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-        """Return positions and colours."""
+        """Returns positions and colours."""
         rows = np.array(list(self._cells.values())).reshape(-1, 6)
         return rows[:, :3], rows[:, 3:].astype(np.uint8)
 
 
 def posed_views(source: Source, track: Track) -> Iterator[PosedView]:
-    """Yield the frames whose pose is given, or found by the marker board, with clean depth.
+    """Yields the frames whose pose is given, or found by the marker board, with clean depth.
 
     Raises:
         DeltalightError: no frame has a pose, or one is damaged.
@@ -93,7 +93,7 @@ def posed_views(source: Source, track: Track) -> Iterator[PosedView]:
 
 
 def lens_terms(camera: CameraModel, most: int, program: str) -> list[float]:
-    """Return the first `most` coefficients of the lens in OpenCV's order, zeros where it has fewer.
+    """Returns the first `most` coefficients of the lens in OpenCV's order, zeros where it has fewer.
 
     Raises:
         DeltalightError: it has others, which `program` cannot express.

@@ -22,7 +22,7 @@ GLB = ".glb"
 
 
 def export_as(wanted: ExportFormat, path: Path, out: Path, scene: Path | None, track: Track) -> Copied:
-    """Write a recording in a format; `scene` replaces the attached scene document (glb alone has it).
+    """Writes a recording in a format; `scene` replaces the attached scene document (glb alone has it).
 
     Raises:
         DeltalightError: the format needs other poses or another lens, `out` is taken, or the disk refuses.
@@ -66,7 +66,7 @@ def _export_glb(source: Source, out: Path, scene: Path | None, track: Track) -> 
 
 
 def _with_poses(copied: Copied, source: Source) -> Copied:
-    """Say how many frames have no pose."""
+    """Says how many frames have no pose."""
     missing = len(source) - copied.frames
     note = [f"Left out: {counted(missing, 'frame')} without a pose."] if missing else []
     return replace(copied, notes=[*copied.notes, *note])

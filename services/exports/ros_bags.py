@@ -73,24 +73,24 @@ class _Bag:
     fisheye_ns: int | None = None  # time of the fish-eye pictures that were written last
 
     def make(self, kind: str, *values: object, **named: object) -> Any:  # noqa: ANN401 - classes made at run time
-        """Return a message such as `sensor_msgs/msg/Image`."""
+        """Returns a message such as `sensor_msgs/msg/Image`."""
         return self.store.types[kind](*values, **named)
 
     def header(self, time_ns: int, frame: str) -> Any:  # noqa: ANN401
-        """Return a header; ROS 1 counts messages in it."""
+        """Returns a header; ROS 1 counts messages in it."""
         stamp = self.make("builtin_interfaces/msg/Time", time_ns // 10**9, time_ns % 10**9)
         numbers = (0,) if self.version == "ros1" else ()
         return self.make("std_msgs/msg/Header", *numbers, stamp, frame)
 
     def image(self, header: object, encoding: str, picture: np.ndarray) -> Any:  # noqa: ANN401
-        """Return an uncompressed picture."""
+        """Returns an uncompressed picture."""
         height, width = picture.shape[:2]
         data = np.ascontiguousarray(picture).view(np.uint8).ravel()
         step = data.size // height
         return self.make("sensor_msgs/msg/Image", header, height, width, encoding, 0, step, data)
 
     def write(self, topic: str, time_ns: int, message: Any) -> None:  # noqa: ANN401
-        """Append a message."""
+        """Appends a message."""
         kind = message.__msgtype__
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
@@ -99,7 +99,7 @@ class _Bag:
 
 
 def export_bag(source: Source, out: Path, version: Version, track: Track) -> Copied:
-    """Write frames as a bag: a file `.bag` for ROS 1, a folder for ROS 2.
+    """Writes frames as a bag: a file `.bag` for ROS 1, a folder for ROS 2.
 
     Raises:
         DeltalightError: rosbags is missing, a frame is damaged, `out` is taken, or the disk refuses.
@@ -230,7 +230,7 @@ def is_bag(path: Path) -> bool:
 
 
 def import_bag(path: Path, out: Path, track: Track) -> Copied:
-    """Write a bag as a recording: its colour camera, the depth of the same moments, and poses in `/tf`.
+    """Writes a bag as a recording: its colour camera, the depth of the same moments, and poses in `/tf`.
 
     Poses are transforms that lead straight from `world` or `map` to the colour camera's frame.
 
@@ -301,11 +301,11 @@ class _BagReader:
         self._fisheye = FisheyeReader(f"of {path}", _rows)
 
     def close(self) -> None:
-        """Close the bag."""
+        """Closes the bag."""
         self._bag.close()
 
     def depth_from_rgb(self) -> Float64[np.ndarray, "4 4"] | None:
-        """Return the transform between the cameras' frames, if `/tf_static` has it directly."""
+        """Returns the transform between the cameras' frames, if `/tf_static` has it directly."""
         for _, message in self._messages("/tf_static"):
             for each in message.transforms:
                 if "depth" in each.child_frame_id and "depth" not in each.header.frame_id:
@@ -313,7 +313,7 @@ class _BagReader:
         return None
 
     def frames(self) -> Iterator[SensorFrame]:
-        """Yield every colour picture whose camera is known, with depth, pose and exposure of its moment."""
+        """Yields every colour picture whose camera is known, with depth, pose and exposure of its moment."""
         waiting: deque[_Waiting] = deque()
         own = (EXPOSURE, COMPOSITE, *FISHEYE_TOPICS)
         wanted = [self._color, self._depth, "/tf", *own, *self._info_topics()]
@@ -333,7 +333,7 @@ class _BagReader:
         return [f"{_namespace(name)}/camera_info" for name in (self._color, self._depth) if name is not None]
 
     def _note(self, topic: str, message: Any) -> int:  # noqa: ANN401
-        """Keep what a message says for the frames of its moment; return its time."""
+        """Keeps what a message says for the frames of its moment; returns its time."""
         if topic == "/tf":
             return self._note_poses(message.transforms)
         if topic == EXPOSURE:
@@ -358,7 +358,7 @@ class _BagReader:
         return _stamp_ns(transforms[0].header) if transforms else 0
 
     def _frame(self, color: _Waiting, number: int) -> Iterator[SensorFrame]:
-        """Yield the frame of a colour message; none while its camera is unknown."""
+        """Yields the frame of a colour message; none while its camera is unknown."""
         time_ns = color.time_ns
         info = self._infos.get(f"{_namespace(self._color)}/camera_info")
         if info is None:
@@ -413,7 +413,7 @@ class _BagReader:
         return Description()
 
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
-        """Yield (topic, message) in order of time."""
+        """Yields (topic, message) in order of time."""
         connections = [each for each in self._bag.connections if each.topic in topics]
         if not connections:
             return
@@ -442,7 +442,7 @@ def _opened(path: Path) -> "AnyReader":
 
 @contextmanager
 def _named_for_rosbags(path: Path) -> Iterator[Path]:
-    """Yield a path by which rosbags knows a ROS 1 bag while it opens it: it asks for `.bag` in small letters."""
+    """Yields a path by which rosbags knows a ROS 1 bag while it opens it: it asks for `.bag` in small letters."""
     if path.suffix == BAG_SUFFIX or path.suffix.lower() != BAG_SUFFIX:
         yield path
         return
@@ -453,7 +453,7 @@ def _named_for_rosbags(path: Path) -> Iterator[Path]:
 
 
 def _namespace(topic: str) -> str:
-    """Return a camera's namespace: /camera/color of /camera/color/image_raw/compressed."""
+    """Returns a camera's namespace: /camera/color of /camera/color/image_raw/compressed."""
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
@@ -462,7 +462,7 @@ def _stamp_ns(header: Any) -> int:  # noqa: ANN401
 
 
 def _nearest(of: deque[tuple[int, Any]], time_ns: int) -> tuple[int, Any] | None:
-    """Return what is nearest in time, if it is of the same frame."""
+    """Returns what is nearest in time, if it is of the same frame."""
     found = min(of, key=lambda each: abs(each[0] - time_ns), default=None)
     return found if found is not None and abs(found[0] - time_ns) <= TOGETHER_NS else None
 
@@ -474,7 +474,7 @@ def _matrix(transform: Any) -> Float64[np.ndarray, "4 4"]:  # noqa: ANN401
 
 
 def _camera(info: Any) -> CameraModel:  # noqa: ANN401
-    """Return the camera of a camera_info; ROS 1 writes its matrices in capitals."""
+    """Returns the camera of a camera_info; ROS 1 writes its matrices in capitals."""
     matrix, terms = (info.K, info.D) if hasattr(info, "K") else (info.k, info.d)
     name = "equidistant" if info.distortion_model == "equidistant" else "plumb_bob"
     values = {"width": info.width, "height": info.height, "distortion_model": name}
@@ -482,7 +482,7 @@ def _camera(info: Any) -> CameraModel:  # noqa: ANN401
 
 
 def _rows(message: Any, kind: "np.dtype[Any]", channels: int, name: str) -> np.ndarray:  # noqa: ANN401
-    """Return the pixels of an image message; its rows may be padded."""
+    """Returns the pixels of an image message; its rows may be padded."""
     width_bytes = message.width * channels * kind.itemsize
     data = np.asarray(message.data, np.uint8)
     if message.step < width_bytes or data.size < message.step * message.height:

@@ -40,20 +40,20 @@ class MessageSink(Protocol):
     """A bag that is being written."""
 
     def make(self, kind: str, *values: object) -> Any:  # noqa: ANN401 - classes made at run time
-        """Return a message."""
+        """Returns a message."""
 
     def header(self, time_ns: int, frame: str) -> Any:  # noqa: ANN401
-        """Return a header."""
+        """Returns a header."""
 
     def write(self, topic: str, time_ns: int, message: Any) -> None:  # noqa: ANN401
-        """Append a message."""
+        """Appends a message."""
 
     def image(self, header: object, encoding: str, picture: np.ndarray) -> Any:  # noqa: ANN401
-        """Return an uncompressed picture."""
+        """Returns an uncompressed picture."""
 
 
 def write_fisheye(bag: MessageSink, pictures: FisheyePictures, now_ns: int) -> None:
-    """Append a bracket at the time of the frame with which it is new."""
+    """Appends a bracket at the time of the frame with which it is new."""
     header = bag.header(pictures.timestamp_ns, FISHEYE_FRAME)
     for picture in pictures.pictures:
         if picture.dtype == np.uint8:
@@ -80,7 +80,7 @@ class FisheyeReader:
         self._complete: list[tuple[int, FisheyePictures]] = []
 
     def add(self, topic: str, message: Any, now_ns: int) -> None:  # noqa: ANN401
-        """Take a message of one of FISHEYE_TOPICS.
+        """Takes a message of one of FISHEYE_TOPICS.
 
         Raises:
             DeltalightError: it was not written by `write_fisheye`.
@@ -95,7 +95,7 @@ class FisheyeReader:
             self._group.append(self._rows(message, np.dtype("<f4"), 3, self._name))
 
     def at(self, time_ns: int) -> FisheyePictures | None:
-        """Return the newest pictures that came up to a time; before the first, the first."""
+        """Returns the newest pictures that came up to a time; before the first, the first."""
         index = bisect_right(self._complete, time_ns, key=lambda each: each[0])
         return self._complete[max(index, 1) - 1][1] if self._complete else None
 

@@ -42,7 +42,7 @@ class Exported:
 
 
 def write_scene_glb(path: Path, document: SceneDocument, views: Iterable[PosedView] = ()) -> Exported:
-    """Write a scene and what `views` show of the room; glTF's y is up, 1 unit is 1 m.
+    """Writes a scene and what `views` show of the room; glTF's y is up, 1 unit is 1 m.
 
     Strengths of lights are numbers in camera units: a viewer that shows radiance 1 as white shows them alike. The
     camera is that of the first view.
@@ -92,7 +92,7 @@ def _notes(document: SceneDocument, objects: int, lights: int) -> list[str]:
 def _add(
     scene: "trimesh.Scene", name: str, asset: str, matrix: Float64[np.ndarray, "4 4"], material: object
 ) -> None:
-    """Add a mesh file's nodes; `matrix` leads from its axes to the world."""
+    """Adds a mesh file's nodes; `matrix` leads from its axes to the world."""
     import trimesh
 
     if not Path(asset).is_file():
@@ -128,7 +128,7 @@ def _visual(material: Material) -> Any:  # noqa: ANN401 - trimesh has no types
 
 
 def light_node(light: ManualLight) -> dict[str, Any] | None:
-    """Return a light's node, its definition under `light`; None for ambient light, which glTF does not have.
+    """Returns a light's node, its definition under `light`; None for ambient light, which glTF does not have.
 
     A rectangle becomes a spot with the opening of its hemisphere and the intensity that it has along its axis.
     """
@@ -161,7 +161,7 @@ def light_node(light: ManualLight) -> dict[str, Any] | None:
 
 
 def _aimed(position: Iterable[float], direction: Iterable[float]) -> Float64[np.ndarray, "4 4"]:
-    """Return world_from_node of what shines along its own -z."""
+    """Returns world_from_node of what shines along its own -z."""
     back = -np.asarray(tuple(direction), float)
     side = np.cross((0.0, 0.0, 1.0) if abs(back[2]) < 0.9 else (1.0, 0.0, 0.0), back)
     side /= np.linalg.norm(side)
@@ -172,7 +172,7 @@ def _aimed(position: Iterable[float], direction: Iterable[float]) -> Float64[np.
 
 
 def camera_node(camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """Return a camera's node, its definition under `camera`: a pinhole with its axis in the picture's middle."""
+    """Returns a camera's node, its definition under `camera`: a pinhole with its axis in the picture's middle."""
     matrix = camera.matrix
     perspective = {
         "yfov": float(2 * np.arctan(camera.height / (2 * matrix[1, 1]))),
@@ -188,12 +188,12 @@ def camera_node(camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4
 
 
 def _columns(world_from_node: Float64[np.ndarray, "4 4"]) -> list[float]:
-    """Return the matrix in glTF's axes, column by column."""
+    """Returns the matrix in glTF's axes, column by column."""
     return [float(value) for value in (Y_UP_FROM_Z_UP @ world_from_node).T.ravel()]
 
 
 def _add_nodes(tree: dict[str, Any], lights: list[dict[str, Any]], camera: dict[str, Any] | None) -> None:
-    """Add lights and camera to the JSON of a glTF file."""
+    """Adds lights and camera to the JSON of a glTF file."""
     nodes, roots = tree.setdefault("nodes", []), tree["scenes"][tree.get("scene", 0)].setdefault("nodes", [])
     if lights:
         tree.setdefault("extensions", {})[LIGHTS_EXTENSION] = {"lights": [light["light"] for light in lights]}

@@ -11,7 +11,7 @@ from deltalight.services.video_file import VIDEO_SUFFIX, video_file
 
 
 def export_video(source: Source, out: Path, track: Track) -> Copied:
-    """Write the relit pictures that were recorded along.
+    """Writes the relit pictures that were recorded along.
 
     Raises:
         DeltalightError: PyAV is missing, there are no such pictures, `out` is taken, or the disk refuses.

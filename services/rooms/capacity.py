@@ -55,7 +55,7 @@ class RoomFigures:
 
 
 def load_figures(path: Path) -> RoomFigures:
-    """Read the figures of a room from `report.json` of `deltalight gpu-check`.
+    """Reads the figures of a room from `report.json` of `deltalight gpu-check`.
 
     Raises:
         DeltalightError: it is not there, or lacks the steps `memory` or `speed`.
@@ -76,7 +76,7 @@ def load_figures(path: Path) -> RoomFigures:
 
 
 def find_device_apart(device: int | None) -> "FoundDevice":
-    """Ask an EGL device in a process of its own, because a process has one context.
+    """Asks an EGL device in a process of its own, because a process has one context.
 
     Raises:
         DeltalightError: the device cannot be used.
@@ -96,7 +96,7 @@ def find_device_apart(device: int | None) -> "FoundDevice":
 
 
 def slots_of(figures: RoomFigures, found: "FoundDevice", frames_per_s: float) -> int:
-    """Return how many rooms a device holds: by memory, and by the time that frames take (at least one).
+    """Returns how many rooms a device holds: by memory, and by the time that frames take (at least one).
 
     Raises:
         DeltalightError: the figures are another device's, or not even one room fits.
@@ -125,7 +125,7 @@ def with_slots(
     devices: Sequence[int],
     find: "Callable[[int | None], FoundDevice]" = find_device_apart,
 ) -> RoomsFile:
-    """Return the rooms file with a number for `slots: auto`: what these EGL devices hold, without any the first one.
+    """Returns the rooms file with a number for `slots: auto`: what these EGL devices hold, without any the first one.
 
     Raises:
         DeltalightError: the figures are not there or another device's, or no room fits.
@@ -140,7 +140,7 @@ def with_slots(
 
 
 def labels_of(found: "FoundDevice") -> dict[str, str]:
-    """Return the labels by which a host of a cluster claims its device."""
+    """Returns the labels by which a host of a cluster claims its device."""
     labels = {GPU_LABEL: label_text(found.name)}
     if found.memory_bytes is not None:
         labels[MEMORY_LABEL] = str(found.memory_bytes >> 20)
@@ -148,7 +148,7 @@ def labels_of(found: "FoundDevice") -> dict[str, str]:
 
 
 def label_text(name: str) -> str:
-    """Return the name of a device as a label's value: letters, digits, `-`, `_` and `.`, at most 63 of them."""
+    """Returns the name of a device as a label's value: letters, digits, `-`, `_` and `.`, at most 63 of them."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-_.")[:63].strip("-_.")
 
 
@@ -160,7 +160,7 @@ def is_claim(labels: Mapping[str, str]) -> bool:
 def check_claim(
     host: str, labels: Mapping[str, str], slots: int, found: "FoundDevice", figures: RoomFigures | None
 ) -> None:
-    """Check what a host of a cluster says of its device, and with `figures` whether `slots` rooms fit on that.
+    """Checks what a host of a cluster says of its device, and with `figures` whether `slots` rooms fit on that.
 
     Raises:
         FalseClaimError: it does not have what it claims.

@@ -40,7 +40,7 @@ class DirectoryServer:
         self._replies = ReplyServer(endpoint, self._execute, node="rooms", keys=keys)
 
     def close(self) -> None:
-        """Stop answering."""
+        """Stops answering."""
         self._replies.close()
 
     def _execute(self, request: ControlRequest) -> dict[str, object]:
@@ -74,11 +74,11 @@ class DirectoryClient:
         self._client = RequestClient(endpoint, keys=keys)
 
     def close(self) -> None:
-        """Close the connection."""
+        """Closes the connection."""
         self._client.close()
 
     def rooms(self) -> RoomList:
-        """Return all rooms and slots.
+        """Returns all rooms and slots.
 
         Raises:
             SilentDirectoryError: the directory does not answer.
@@ -86,7 +86,7 @@ class DirectoryClient:
         return self._ask(LIST)
 
     def command(self, op: str, room: str, slot: str | None = None) -> RoomList:
-        """Drain, start or move a room, and return all rooms after it.
+        """Drains, starts or moves a room, and returns all rooms after it.
 
         Raises:
             SilentDirectoryError: the directory does not answer.
@@ -96,7 +96,7 @@ class DirectoryClient:
         return self._ask(op, {"room": room, **({} if slot is None else {"slot": slot})})
 
     def host_command(self, op: str, host: str) -> RoomList:
-        """Drain a host or end that, and return all rooms after it.
+        """Drains a host or ends that, and returns all rooms after it.
 
         Raises:
             SilentDirectoryError: the directory does not answer.

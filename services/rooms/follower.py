@@ -23,7 +23,7 @@ class Directory(Protocol):
     """Knows all rooms (`directory.DirectoryClient`)."""
 
     def rooms(self) -> RoomList:
-        """Return all rooms and slots; raises DeltalightError where it does not answer."""
+        """Returns all rooms and slots; raises DeltalightError where it does not answer."""
 
 
 class RoomFollower:
@@ -53,17 +53,17 @@ class RoomFollower:
         self._thread = threading.Thread(target=self._run, name="room-follower", daemon=True)
 
     def start(self) -> None:
-        """Start to follow."""
+        """Starts to follow."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop following."""
+        """Stops following."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
 
     def look(self) -> None:
-        """Ask once.
+        """Asks once.
 
         Raises:
             DeltalightError: the directory does not answer.
@@ -71,7 +71,7 @@ class RoomFollower:
         self.take(self._directory.rooms())
 
     def take(self, found: RoomList) -> None:
-        """Follow what a directory says."""
+        """Follows what a directory says."""
         for room in found.rooms:
             self._follow(room.name, room.endpoints)
         before, self.newest = self.newest, found
@@ -113,7 +113,7 @@ class RoomFollower:
 def following(
     directory: str, room: str, keys: Keys | None, use: Callable[[str | None], None]
 ) -> Iterator[None]:
-    """Call `use` with the endpoint at which a room's render server publishes, now and whenever it is another.
+    """Calls `use` with the endpoint at which a room's render server publishes, now and whenever it is another.
 
     None = it has none; so it is told at the end.
 

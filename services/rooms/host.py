@@ -53,7 +53,7 @@ class RoomsHost:
     rooms_address: str = ports.LOOPBACK
 
     def require_free_ports(self) -> None:
-        """Check the ports that have been chosen, before a child is started.
+        """Checks the ports that have been chosen, before a child is started.
 
         Raises:
             DeltalightError: another program listens on one of them, or they are the same.
@@ -69,7 +69,7 @@ class RoomsHost:
         return dict(zip(here, ports.private_ports(len(here)), strict=True))
 
     def run(self, forward: Callable[[str], None], until: Callable[[], bool] = lambda: False) -> None:
-        """Keep everything running until `until` returns true.
+        """Keeps everything running until `until` returns true.
 
         Raises:
             DeltalightError: a source, a scene, a key or a port cannot be used, or the web process keeps dying.
@@ -143,7 +143,7 @@ class RoomsHost:
         return specs
 
     def _web(self, nodes: Iterable[str]) -> ChildSpec:
-        """Return the web process; it is told where `nodes` are, so that it loads keys if one is elsewhere."""
+        """Returns the web process; it is told where `nodes` are, so that it loads keys if one is elsewhere."""
         sources = [word for node in nodes for word in ("--subscribe", node)]
         return self.commands.web(self.data, self.page_port, "--rooms", self.directory, *sources)
 
@@ -172,7 +172,7 @@ class RoomsHost:
 
 
 def _spare(commands: HostCommands) -> ChildSpec | None:
-    """Return what waits to become a render server, None if there shall be no spares."""
+    """Returns what waits to become a render server, None if there shall be no spares."""
     return replace(commands.child("spare", "server"), warm=PREPARED["server"]) if commands.spares else None
 
 
@@ -187,7 +187,7 @@ class NodeSupervisor:
         self._again_s = 0.0
 
     def poll(self) -> bool:
-        """Look after it; return whether it does not run, for the reason `fault`."""
+        """Looks after it; returns whether it does not run, for the reason `fault`."""
         try:
             if not self.fault:
                 self._supervisor.poll()
@@ -200,12 +200,12 @@ class NodeSupervisor:
         return bool(self.fault)
 
     def stop(self) -> None:
-        """End it."""
+        """Ends it."""
         self._supervisor.stop()
 
 
 def room_scene(store: Store, name: str, room: RoomEntry, source: Source | None) -> SceneDocument:
-    """Return the document that a room shows first: its active one, else a copy of its file's or its recording's.
+    """Returns the document that a room shows first: its active one, else a copy of its file's or its recording's.
 
     Raises:
         DeltalightError: the document or one of its files is wrong.

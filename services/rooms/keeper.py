@@ -50,10 +50,10 @@ class Memory(Protocol):
     """Keeps what is drained over a restart (`storage.drained.DrainedStore`)."""
 
     def load(self) -> Drained:
-        """Return what was kept last."""
+        """Returns what was kept last."""
 
     def keep(self, drained: Drained) -> None:
-        """Store it; raises DeltalightError where it cannot be."""
+        """Stores it; raises DeltalightError where it cannot be."""
 
 
 @dataclass(eq=False)
@@ -119,7 +119,7 @@ class RoomKeeper:
         )  # held over the database's answer, so that rooms are looked after meanwhile
 
     def poll(self) -> None:
-        """Learn what happened, then place the rooms that wait."""
+        """Learns what happened, then places the rooms that wait."""
         with self._lock:
             for event in self._placer.watch():
                 self._note(event)
@@ -127,18 +127,18 @@ class RoomKeeper:
             self._place_waiting()
 
     def note_nodes(self, faults: Mapping[str, str]) -> None:
-        """Note which nodes do not run, and why."""
+        """Notes which nodes do not run, and why."""
         self._faults = faults
 
     def status(self) -> RoomList:
-        """Return all rooms, in their order, and slots."""
+        """Returns all rooms, in their order, and slots."""
         with self._lock:
             rooms = tuple(self._described(room) for room in self._rooms.values())
             slots = tuple(self._described_slot(slot) for slot in self._placer.slots())
         return RoomList(rooms=rooms, slots=slots)
 
     def drain(self, name: str) -> None:
-        """End a room's render server until `start`.
+        """Ends a room's render server until `start`.
 
         Raises:
             DeltalightError: there is no such room.
@@ -153,7 +153,7 @@ class RoomKeeper:
         self._notice(f"room {name}: drained.")
 
     def start(self, name: str) -> None:
-        """Start a room that was drained or has failed.
+        """Starts a room that was drained or has failed.
 
         Raises:
             DeltalightError: there is no such room.
@@ -170,7 +170,7 @@ class RoomKeeper:
                 room.wait("It is about to start.")
 
     def move(self, name: str, slot: str | None = None) -> None:
-        """Start a room's next render server in this slot, or a free one; once that shows frames, the old one ends.
+        """Starts a room's next render server in this slot, or a free one; once that shows frames, the old one ends.
 
         Raises:
             DeltalightError: there is no such room, it does not run or moves already, or the slot is not free.
@@ -185,7 +185,7 @@ class RoomKeeper:
             self._notice(f"room {name}: moves from {room.placement.slot} to {room.successor.slot}.")
 
     def drain_host(self, host: str) -> None:
-        """Move the rooms of a host elsewhere, one after another, and place none there until `undrain_host`.
+        """Moves the rooms of a host elsewhere, one after another, and places none there until `undrain_host`.
 
         A room for which there is no other slot ends and waits.
 
@@ -205,7 +205,7 @@ class RoomKeeper:
         self._notice(f"host {host}: drained.")
 
     def undrain_host(self, host: str) -> None:
-        """Let rooms start on a host again.
+        """Lets rooms start on a host again.
 
         Raises:
             DeltalightError: it is not drained.
@@ -235,7 +235,7 @@ class RoomKeeper:
         return self._rooms[name]
 
     def _place(self, room: _Room, slot: str | None = None) -> Placement:
-        """Start a room's next render server, with an epoch of its own."""
+        """Starts a room's next render server, with an epoch of its own."""
         sources = tuple(node.endpoint for node in room.plan.nodes)
         plan, avoid = room.plan, frozenset(self._drained_hosts)
         self._epoch += 1
@@ -273,7 +273,7 @@ class RoomKeeper:
         room.why = "" if event.shows else f"No frames come from {names}."
 
     def _lose(self, room: _Room, event: PlacementEvent) -> None:
-        """Note a loss. What a room that ran before does not take any more is its device, which may be gone."""
+        """Notes a loss. What a room that ran before does not take any more is its device, which may be gone."""
         is_of_device = event.refused and room.has_run
         if room.state == "starting" and room.placement is not None:
             self._doubt(room.placement.slot)
@@ -293,7 +293,7 @@ class RoomKeeper:
             room.queued = min(each.queued for each in self._rooms.values()) - 1
 
     def _doubt(self, name: str) -> None:
-        """Take the device of a slot last for a while."""
+        """Takes the device of a slot last for a while."""
         for slot in self._placer.slots():
             if slot.name == name:
                 self._doubted[slot.host, slot.device] = time.monotonic() + DOUBT_S
@@ -316,7 +316,7 @@ class RoomKeeper:
             self._placer.release(before)
 
     def _empty_drained_hosts(self) -> None:
-        """Move the rooms of drained hosts, a single one at a time."""
+        """Moves the rooms of drained hosts, a single one at a time."""
         if not self._drained_hosts:
             return
         of_slot = {slot.name: slot.host for slot in self._placer.slots()}
@@ -333,7 +333,7 @@ class RoomKeeper:
                 return
 
     def _leave(self, room: _Room, host: str) -> None:
-        """Start a room's next render server on another host; without a slot there, it ends and waits."""
+        """Starts a room's next render server on another host; without a slot there, it ends and waits."""
         assert room.placement is not None
         try:
             room.successor = self._place(room)

@@ -44,14 +44,14 @@ class LocalPlacer:
         self._used_ports = ports.used_ports()
 
     def slots(self) -> list[Slot]:
-        """Return all slots."""
+        """Returns all slots."""
         return [
             Slot(name, "default" if device is None else f"EGL {device}", self._room_in(name))
             for name, device in self._devices.items()
         ]
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
-        """Start the render server of a room (`Placer.place`)."""
+        """Starts the render server of a room (`Placer.place`)."""
         chosen = choose_slot(self.slots(), order, slot).name
         publish, control = self._fresh_ports()
         placement = Placement(
@@ -65,19 +65,19 @@ class LocalPlacer:
         return placement
 
     def release(self, placement: Placement) -> None:
-        """End a render server; its slot is free once it is gone."""
+        """Ends a render server; its slot is free once it is gone."""
         placed = self._placed.get(placement.slot)
         if placed is not None and placed.placement == placement:
             placed.end()
 
     def watch(self) -> list[PlacementEvent]:
-        """Return what happened since the last call; start a spare if it is time."""
+        """Returns what happened since the last call; starts a spare if it is time."""
         found = [event for slot in list(self._placed) for event in self._look_at(slot)]
         self._start_spare_if_due()
         return found
 
     def process_ids(self) -> dict[str, int]:
-        """Return the process id of the render server in each slot that has one."""
+        """Returns the process id of the render server in each slot that has one."""
         return {slot: placed.process.pid for slot, placed in self._placed.items()}
 
     @property
@@ -86,7 +86,7 @@ class LocalPlacer:
         return None if self._spare is None else self._spare.pid
 
     def close(self) -> None:
-        """End all render servers and the spare."""
+        """Ends all render servers and the spare."""
         processes = [placed.process for placed in self._placed.values()]
         end_all([*processes, *([] if self._spare is None else [self._spare])])
         for placed in self._placed.values():
@@ -98,7 +98,7 @@ class LocalPlacer:
         return None if placed is None else placed.placement.room
 
     def _fresh_ports(self) -> list[int]:
-        """Choose ports that no late placement had, so that who still talks to a lost one reaches nobody else."""
+        """Chooses ports that no late placement had, so that who still talks to a lost one reaches nobody else."""
         found = ports.private_ports(2, avoid=self._used_ports)
         self._used_ports.extend(found)
         return found
@@ -115,7 +115,7 @@ class LocalPlacer:
         return take_spare(spare, spec)
 
     def _start_spare_if_due(self) -> None:
-        """Start a spare once those that were placed have had the time to start."""
+        """Starts a spare once those that were placed have had the time to start."""
         if self._spare is not None and self._spare.poll() is not None:
             self._spare = None
             self._spare_due_s = time.monotonic() + SPARE_AFTER_S

@@ -80,10 +80,10 @@ class Placer(Protocol):
     """Places render servers; called from one thread at a time."""
 
     def slots(self) -> Sequence[Slot]:
-        """Return all slots."""
+        """Returns all slots."""
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
-        """Start the render server of a room, in this slot or in a free one, without waiting for it.
+        """Starts the render server of a room, in this slot or in a free one, without waiting for it.
 
         Raises:
             NoSlotError: there is none.
@@ -91,17 +91,17 @@ class Placer(Protocol):
         """
 
     def release(self, placement: Placement) -> None:
-        """End a render server and free its slot; one that is gone already is ignored."""
+        """Ends a render server and frees its slot; one that is gone already is ignored."""
 
     def watch(self) -> Sequence[PlacementEvent]:
-        """Return what happened since the last call; the slot of what was lost is free."""
+        """Returns what happened since the last call; the slot of what was lost is free."""
 
     def close(self) -> None:
-        """End all render servers."""
+        """Ends all render servers."""
 
 
 def choose_slot(slots: Sequence[Slot], order: RoomOrder, wanted: str | None = None) -> Slot:
-    """Return the slot that is wanted, or a free one of the host that has most of them.
+    """Returns the slot that is wanted, or a free one of the host that has most of them.
 
     Hosts none of whose devices is doubted come first.
 

@@ -74,7 +74,7 @@ class RayCluster:
         return str(self.ray.util.get_node_ip_address())
 
     def hosts(self) -> list[ClusterHost]:
-        """Return the hosts with slots that live, by name."""
+        """Returns the hosts with slots that live, by name."""
         nodes = [node for node in self.ray.nodes() if node["Alive"] and _slots(node) > 0]
         names = Counter(_name(node) for node in nodes)
         return sorted(
@@ -82,13 +82,13 @@ class RayCluster:
         )
 
     def close(self) -> None:
-        """Leave the cluster, or end it if it was started here."""
+        """Leaves the cluster, or ends it if it was started here."""
         self.ray.shutdown()
 
 
 @contextmanager
 def own_sigterm() -> Iterator[None]:
-    """Let SIGTERM end this process as before the block, in which Ray takes it over (main thread)."""
+    """Lets SIGTERM end this process as before the block, in which Ray takes it over (main thread)."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -121,7 +121,7 @@ def _alone(slots: int) -> dict[str, object]:
 
 
 def _require_answer(address: str) -> None:
-    """Check that somebody listens, because Ray would wait for minutes."""
+    """Checks that somebody listens, because Ray would wait for minutes."""
     if address == AUTO:
         return
     host, _, port = address.rpartition(":")
@@ -134,12 +134,12 @@ def _require_answer(address: str) -> None:
 
 
 def _slots(node: dict[str, Any]) -> int:
-    """Return how many slots a host offers: whole ones, and as many as there may be rooms at most."""
+    """Returns how many slots a host offers: whole ones, and as many as there may be rooms at most."""
     return int(min(MAX_ROOMS, node["Resources"].get(SLOT_RESOURCE, 0)))
 
 
 def _name(node: dict[str, Any]) -> str:
-    """Return the name that a host was given, that which it has otherwise, or Ray's id where both write anything."""
+    """Returns the name that a host was given, that which it has otherwise, or Ray's id where both write anything."""
     named, own = str(node["NodeName"]), str(node["NodeManagerHostname"])
     chosen = own if named == node["NodeManagerAddress"] else named
     return chosen if re.fullmatch(HOST_PATTERN, chosen) else f"host-{node['NodeID']}"

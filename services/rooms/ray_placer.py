@@ -81,11 +81,11 @@ class RayPlacer:
         self._used: dict[str, deque[int]] = {}  # ports, by address
 
     def slots(self) -> list[Slot]:
-        """Return the slots of all hosts that live and are not refused."""
+        """Returns the slots of all hosts that live and are not refused."""
         return [slot for host in self._hosts() for slot in self._slots_of(host)]
 
     def place(self, order: RoomOrder, slot: str | None = None) -> Placement:
-        """Start the render server of a room (`Placer.place`)."""
+        """Starts the render server of a room (`Placer.place`)."""
         hosts = self._hosts()
         try:
             chosen = choose_slot([each for host in hosts for each in self._slots_of(host)], order, slot)
@@ -112,14 +112,14 @@ class RayPlacer:
         return _Placed(task.placement, host, spare.actor, spare.actor.begin.remote(task), late_s, holder)
 
     def release(self, placement: Placement) -> None:
-        """End a render server; its slot is free once it is gone."""
+        """Ends a render server; its slot is free once it is gone."""
         placed = self._placed.get(placement.slot)
         if placed is not None and placed.placement == placement and placed.ending is None:
             placed.ending = placed.actor.end.remote()
             placed.late_s = time.monotonic() + END_TIMEOUT_S
 
     def watch(self) -> list[PlacementEvent]:
-        """Return what happened since the last call; start spares where it is time."""
+        """Returns what happened since the last call; starts spares where it is time."""
         self._keep_spares()
         ray = self._cluster.ray
         awaited = [placed.ending or placed.news for placed in self._placed.values()]
@@ -129,12 +129,12 @@ class RayPlacer:
         return [event for slot in list(self._placed) for event in self._look_at(slot, ready)]
 
     def process_ids(self) -> dict[str, int]:
-        """Return the process id, on its host, of the render server in each slot that has one."""
+        """Returns the process id, on its host, of the render server in each slot that has one."""
         ray = self._cluster.ray
         return {slot: ray.get(placed.actor.process_id.remote()) for slot, placed in self._placed.items()}
 
     def close(self) -> None:
-        """End all render servers and spares; the cluster stays."""
+        """Ends all render servers and spares; the cluster stays."""
         spares = list(self._spares.values())
         for placed in list(self._placed.values()):
             self.release(placed.placement)
@@ -152,7 +152,7 @@ class RayPlacer:
         return [host for host in self._cluster.hosts() if host.node_id not in self._refused]
 
     def _refusals(self) -> list[str]:
-        """Say why hosts that live are refused."""
+        """Says why hosts that live are refused."""
         hosts = (self._refused.get(host.node_id) for host in self._cluster.hosts())
         return [f"{why[:1].upper()}{why[1:]}" for why in hosts if why is not None]
 
@@ -160,7 +160,7 @@ class RayPlacer:
         return [self._slot_of(host, number) for number in range(1, host.slots + 1)]
 
     def _slot_of(self, host: ClusterHost, number: int) -> Slot:
-        """Describe a slot; its device, which its number chooses among those there, may be another one's, too."""
+        """Describes a slot; its device, which its number chooses among those there, may be another one's, too."""
         name = f"{host.name}/{number}"
         return Slot(name, f"chosen there for slot {number}", self._room_in(name), host.name, host.labels)
 
@@ -169,7 +169,7 @@ class RayPlacer:
         return None if placed is None else placed.placement.room
 
     def _keep_spares(self) -> None:
-        """Start the spare of each host whose rooms have had the time to start, and forget those that died.
+        """Starts the spare of each host whose rooms have had the time to start, and forgets those that died.
 
         A host that has just come may be about to get a room that waits: its spare is started at the second look.
         """
@@ -219,7 +219,7 @@ class RayPlacer:
         )
 
     def _fresh_endpoint(self, host: ClusterHost) -> str:
-        """Choose a port that no late placement on the host had; its actor sees whether it is free there."""
+        """Chooses a port that no late placement on the host had; its actor sees whether it is free there."""
         used = self._used.setdefault(host.address, ports.used_ports())
         while (port := random.choice(ports.PRIVATE_PORTS)) in used:
             pass
@@ -263,7 +263,7 @@ class RayPlacer:
         return [PlacementEvent(epoch, "lost", why)]
 
     def _forget(self, slot: str) -> None:
-        """End the actor, which takes its render server with it, and free its slot."""
+        """Ends the actor, which takes its render server with it, and frees its slot."""
         placed = self._placed.pop(slot)
         for actor in (placed.actor, placed.holder):
             if actor is not None:
@@ -271,7 +271,7 @@ class RayPlacer:
 
 
 def reachable_endpoint(commands: HostCommands, address: str, port: int) -> str:
-    """Return the endpoint of a port, with the name of the key that the fleet's hosts share where it leaves the host.
+    """Returns the endpoint of a port, with the name of the key that the fleet's hosts share where it leaves the host.
 
     Raises:
         DeltalightError: it leaves the host, and there is no key.

@@ -90,18 +90,18 @@ class RenderActor:
         threading.Thread(target=self._end_without_keeper, args=(os.getppid(),), daemon=True).start()
 
     def begin(self, task: RenderTask) -> News:
-        """Start the render server of a task by the spare; return the first news."""
+        """Starts the render server of a task by the spare; returns the first news."""
         self._start(task)
         return self.news()
 
     def waits(self) -> bool:
-        """Return after a second whether the spare still lives."""
+        """Returns after a second whether the spare still lives."""
         time.sleep(NEWS_WAIT_S)
         self._asked_s = time.monotonic()
         return self._spare is not None and self._spare.poll() is None
 
     def news(self) -> News:
-        """Return what happened since the last call; waits a second for it."""
+        """Returns what happened since the last call; waits a second for it."""
         deadline_s = time.monotonic() + NEWS_WAIT_S
         events = self._events()
         while not events and not self._is_gone and time.monotonic() < deadline_s:
@@ -112,7 +112,7 @@ class RenderActor:
         return News(tuple(events), tuple(lines))
 
     def end(self) -> None:
-        """End the render server or the spare, and return when it is gone."""
+        """Ends the render server or the spare, and returns when it is gone."""
         if self._spare is not None:
             end_all([self._spare])
         if self._render is not None:
@@ -123,7 +123,7 @@ class RenderActor:
                 time.sleep(LOOK_INTERVAL_S)
 
     def process_id(self) -> int:
-        """Return the process id of the render server; 0 = it was not started."""
+        """Returns the process id of the render server; 0 = it was not started."""
         with self._lock:
             return 0 if self._render is None else self._render.process.pid
 
@@ -176,14 +176,14 @@ def _started(task: RenderTask, forward: Callable[[str], None], spare: Process | 
 
 
 def _check_host(host: ClusterHost, device: int | None, devices: int, figures: RoomFigures | None) -> None:
-    """Compare what a host claims with what is found on one of its devices; without a claim nothing is asked."""
+    """Compares what a host claims with what is found on one of its devices; without a claim nothing is asked."""
     if figures is not None or is_claim(host.labels):
         slots = math.ceil(host.slots / devices)
         check_claim(host.name, host.labels, slots, find_device_apart(device), figures)
 
 
 def hardware_devices() -> list[int]:
-    """Return the numbers of the EGL devices of this host that are no software renderers (EGL_EXT_device_enumeration).
+    """Returns the numbers of this host's EGL devices that are no software renderers (EGL_EXT_device_enumeration).
 
     Empty where there is none, or no EGL.
     """

@@ -45,7 +45,7 @@ class RenderProcess:
         return self._child.process
 
     def news(self) -> list[PlacementEvent]:
-        """Return what happened since the last call; kill it if it hangs, or does not end although told to."""
+        """Returns what happened since the last call; kills it if it hangs, or does not end although told to."""
         if self.is_gone:
             return []
         self._child.end_if_hanging()
@@ -62,18 +62,18 @@ class RenderProcess:
         return [PlacementEvent(self.placement.epoch, "reported", newest.detail, shows)]
 
     def end(self) -> None:
-        """Tell it to end, without waiting for it; that is no loss."""
+        """Tells it to end, without waiting for it; that is no loss."""
         if self._ends_s is None:
             self._ends_s = time.monotonic() + STOP_TIMEOUT_S
             self.process.terminate()
 
     def close(self) -> None:
-        """Stop listening to a process that has ended."""
+        """Stops listening to a process that has ended."""
         self._child.end_watching()
         self._child.end_reading()
 
     def _watched(self, process_id: int) -> Watchdog:
-        """Watch a process; its reports tell how the room is doing."""
+        """Watches a process; its reports tell how the room is doing."""
         endpoints = self.placement.publish, self.placement.control
         self._watchdog = Watchdog(process_id, *endpoints, self._keys)
         return self._watchdog

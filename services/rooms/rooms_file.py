@@ -123,7 +123,7 @@ class RoomsFile(StrictModel):
 
 
 def load_rooms(path: Path) -> RoomsFile:
-    """Read a rooms file (YAML or JSON); paths in it become absolute.
+    """Reads a rooms file (YAML or JSON); paths in it become absolute.
 
     Raises:
         DeltalightError: it is missing, malformed, or names what it does not define.
@@ -137,7 +137,7 @@ def load_rooms(path: Path) -> RoomsFile:
 
 
 def require_cluster_form(rooms: RoomsFile) -> None:
-    """Check a file whose rooms run on a cluster.
+    """Checks a file whose rooms run on a cluster.
 
     Raises:
         DeltalightError: it names devices, which hosts of a cluster choose themselves.
@@ -149,7 +149,7 @@ def require_cluster_form(rooms: RoomsFile) -> None:
 
 
 def require_local_form(rooms: RoomsFile) -> None:
-    """Check a file whose rooms run on this host.
+    """Checks a file whose rooms run on this host.
 
     Raises:
         DeltalightError: a room asks for labels, which only hosts of a cluster have.

@@ -29,7 +29,7 @@ _ENCRYPTED = 1  # general purpose flag, bit 0 (APPNOTE 4.4.4)
 
 @contextmanager
 def unpacking(path: Path) -> Iterator[None]:
-    """Turn what damaged archives raise into a sentence.
+    """Turns what damaged archives raise into a sentence.
 
     Raises:
         DeltalightError: the archive is damaged.
@@ -73,13 +73,13 @@ class Archive:
             raise DeltalightError(f"{path} holds two files of the same name; pack it again.")
 
     def unpack(self, name: str, to: Path) -> None:
-        """Write a file of the archive."""
+        """Writes a file of the archive."""
         to.parent.mkdir(parents=True, exist_ok=True)
         with self._archive.open(self.entries[name]) as packed, to.open("xb") as file:
             shutil.copyfileobj(packed, file)
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file.
+        """Returns the content of a file.
 
         Raises:
             DeltalightError: there is none of this name.

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def mesh_facts(path: Path) -> Facts:
-    """Load a mesh and return its facts.
+    """Loads a mesh and returns its facts.
 
     They are `triangles`, `vertices`, `minimum` and `maximum` (in the file's own units and axes, at rest), the
     `clips` (`name`, `duration_s`) that it can play, and the `material` of most of it, as scene documents write one.
@@ -43,7 +43,7 @@ def mesh_facts(path: Path) -> Facts:
 
 
 def _material_facts(meshes: Sequence["TriangleMesh"]) -> Facts:
-    """Return the material of the mesh with the most triangles; textures and vertex colours by their mean."""
+    """Returns the material of the mesh with the most triangles; textures and vertex colours by their mean."""
     import numpy as np
 
     mesh = max(meshes, key=lambda each: len(each.triangles))
@@ -80,7 +80,7 @@ def _rounded(color: Iterable[float]) -> list[float]:
 
 
 def map_facts(path: Path) -> Facts:
-    """Load an environment map and return its `width` and `height` in pixels.
+    """Loads an environment map and returns its `width` and `height` in pixels.
 
     Raises:
         DeltalightError: the file is wrong; the sentence says how.
@@ -96,7 +96,7 @@ def map_facts(path: Path) -> Facts:
 
 
 def material_facts(path: Path) -> Facts:
-    """Load a precomputed material; return its `model`, mean `base_color` (linear) and what it is made of.
+    """Loads a precomputed material; returns its `model`, mean `base_color` (linear) and what it is made of.
 
     A `measured_brdf` has `lobes` and the `roughness` of their mean, a `polynomial_texture` or `texture_stack` (ABTF)
     `width` and `height` in texels.

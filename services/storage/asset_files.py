@@ -37,11 +37,11 @@ class FolderFiles:
             self.incoming.mkdir(parents=True, exist_ok=True)
 
     def path(self, digest: str, name: str) -> Path:
-        """Return the path of a file on this host, which may be missing."""
+        """Returns the path of a file on this host, which may be missing."""
         return (self.folder / digest / name).absolute()
 
     def fetched(self, digest: str, name: str) -> Path:
-        """Return the path of a file on this host, brought here if it is elsewhere; still missing if it is nowhere.
+        """Returns the path of a file on this host, brought here if it is elsewhere; still missing if it is nowhere.
 
         Raises:
             StorageFaultError: it cannot be brought here.
@@ -49,10 +49,10 @@ class FolderFiles:
         return self.path(digest, name)
 
     def upload(self, digest: str, name: str, file: Path) -> None:
-        """Bring a file where it takes long, before it is placed."""
+        """Brings a file where it takes long, before it is placed."""
 
     def place(self, digest: str, name: str, file: Path) -> None:
-        """Move a file to its place, durably.
+        """Moves a file to its place, durably.
 
         Raises:
             StorageFaultError: the disk or the store of objects refuses.
@@ -65,7 +65,7 @@ class FolderFiles:
             sync_folder(self.folder)
 
     def remove(self, digest: str, name: str) -> None:
-        """Remove an asset's folder."""
+        """Removes an asset's folder."""
         del name
         shutil.rmtree(self.folder / digest, ignore_errors=True)
 
@@ -85,7 +85,7 @@ class ObjectFiles(FolderFiles):
         self._objects, self._root = _file_system(address)
 
     def fetched(self, digest: str, name: str) -> Path:
-        """Return the path of a copy on this host, whose content is checked when it comes."""
+        """Returns the path of a copy on this host, whose content is checked when it comes."""
         place = self.path(digest, name)
         if place.is_file():
             mark_used(place.parent)
@@ -106,19 +106,19 @@ class ObjectFiles(FolderFiles):
         return place
 
     def upload(self, digest: str, name: str, file: Path) -> None:
-        """Send a file to the store of objects, unless it is there."""
+        """Sends a file to the store of objects, unless it is there."""
         with self._explained():
             if not self._objects.exists(self._object(digest, name)):
                 self._objects.put_file(str(file), self._object(digest, name))
 
     def place(self, digest: str, name: str, file: Path) -> None:
-        """Move a file to its place here; send it again if it was removed from the store of objects meanwhile."""
+        """Moves a file to its place here; sends it again if it was removed from the store of objects meanwhile."""
         self.upload(digest, name, file)
         super().place(digest, name, file)
         prune(self.folder, cache_limit_bytes(), self.path(digest, name).parent)
 
     def remove(self, digest: str, name: str) -> None:
-        """Remove a file here and in the store of objects; one that stays there is in nobody's way."""
+        """Removes a file here and in the store of objects; one that stays there is in nobody's way."""
         super().remove(digest, name)
         try:
             with self._explained(), suppress(FileNotFoundError):
@@ -142,7 +142,7 @@ class ObjectFiles(FolderFiles):
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Turn faults of the store of objects into sentences; each kind of store has exceptions of its own."""
+        """Turns faults of the store of objects into sentences; each kind of store has exceptions of its own."""
         try:
             yield
         except Exception as fault:
@@ -153,7 +153,7 @@ class ObjectFiles(FolderFiles):
 
 
 def asset_files(folder: Path, address: str | None) -> FolderFiles:
-    """Return the files of assets: in the folder, or in the store of objects at an address.
+    """Returns the files of assets: in the folder, or in the store of objects at an address.
 
     Raises:
         DeltalightError: the folder cannot be written, the address is wrong, or a package for it is missing.
@@ -180,7 +180,7 @@ def _file_system(address: str) -> tuple[Any, str]:
 
 @contextmanager
 def disk_faults() -> Iterator[None]:
-    """Turn what the disk refuses into a fault of the storage."""
+    """Turns what the disk refuses into a fault of the storage."""
     try:
         yield
     except OSError as fault:

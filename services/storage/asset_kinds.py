@@ -88,7 +88,7 @@ def is_archive(head: bytes) -> bool:
 
 
 def recognise(head: bytes, size_bytes: int, name: str) -> AssetFormat:
-    """Return the format of a file with this beginning.
+    """Returns the format of a file with this beginning.
 
     Raises:
         RejectedAssetError: its format is not supported, or its name claims another one.
@@ -110,7 +110,7 @@ def _advice(head: bytes, name: str) -> str:
 
 
 def clean_name(name: str) -> str:
-    """Return the last part of a file name for display, without control characters.
+    """Returns the last part of a file name for display, without control characters.
 
     Raises:
         RejectedAssetError: nothing is left of it.

@@ -42,7 +42,7 @@ def run_limited(
     output_bytes: int = 0,
     time_s: int = TIME_LIMIT_S,
 ) -> Facts:
-    """Run a task on a file in the worker and return its facts; `name` names the file in sentences.
+    """Runs a task on a file in the worker and returns its facts; `name` names the file in sentences.
 
     `output_bytes` limits the size of the file that the task writes.
 
@@ -75,7 +75,7 @@ def _said_by_process(words: Sequence[str], timeout_s: float) -> str:
 
 
 def probe(path: Path, kind: AssetKind, name: str, *, memory_bytes: int = MEMORY_LIMIT_BYTES) -> Facts:
-    """Load a file in the worker and return its facts (`asset_facts`).
+    """Loads a file in the worker and returns its facts (`asset_facts`).
 
     `name` names the file in sentences.
 

@@ -42,7 +42,7 @@ def _limit(memory_bytes: int, time_s: int, output_bytes: int) -> None:
 
 
 def _task(name: str) -> Callable[..., Facts]:
-    """Return the function of a task; imported here, because each needs other heavy packages."""
+    """Returns the function of a task; imported here, because each needs other heavy packages."""
     if name == "unzip":
         from deltalight.services.storage.gltf_zip import repack
 
@@ -73,7 +73,7 @@ def _task(name: str) -> Callable[..., Facts]:
 
 
 def _write_shelf_item(path: Path, item: str) -> Facts:
-    """Write the file of an object of the shelf to `path`, which has no suffix; return its facts."""
+    """Writes the file of an object of the shelf to `path`, which has no suffix; returns its facts."""
     from deltalight.services.storage.asset_facts import mesh_facts
     from deltalight.services.storage.shelf import shelf_item
 
@@ -102,7 +102,7 @@ def _main(task: str, path: str, memory_bytes: str, time_s: str, output_bytes: st
 
 
 def _fork_workers(requests: socket.socket) -> None:
-    """Fork a worker for each request until there has been none for a while, or nobody can send any more."""
+    """Forks a worker for each request until there has been none for a while, or nobody can send any more."""
     while True:
         if not select.select([requests], [], [], IDLE_S)[0]:
             requests.shutdown(socket.SHUT_RD)  # what was sent before is received all the same

@@ -82,7 +82,7 @@ class Incoming:
     digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
 
     def write(self, chunk: bytes) -> None:
-        """Append bytes.
+        """Appends bytes.
 
         Raises:
             TooLargeError: the file exceeds the limit.
@@ -93,7 +93,7 @@ class Incoming:
             self.file.write(chunk)
 
     def take_over(self) -> None:
-        """Take what another process wrote to the file.
+        """Takes what another process wrote to the file.
 
         Raises:
             TooLargeError: the file exceeds the limit.
@@ -125,7 +125,7 @@ class AssetStore:
 
     @contextmanager
     def receiving(self, limit_bytes: int) -> Iterator[Incoming]:
-        """Yield a place for an upload; it is removed at the end unless `keep` took it."""
+        """Yields a place for an upload; it is removed at the end unless `keep` took it."""
         path = self._incoming / uuid4().hex
         try:
             with disk_faults():
@@ -136,7 +136,7 @@ class AssetStore:
             path.unlink(missing_ok=True)
 
     def keep(self, incoming: Incoming, name: str) -> tuple[Asset, bool]:
-        """Check a received file and store it; return the asset and whether it is new.
+        """Checks a received file and stores it; returns the asset and whether it is new.
 
         A .zip with one glTF and its files is stored as the .glb made of it.
 
@@ -151,7 +151,7 @@ class AssetStore:
             return self._keep(unpacked, Path(shown).stem + ".glb")
 
     def take_from_shelf(self, name: str) -> tuple[Asset, bool]:
-        """Store an object of the shelf; return the asset and whether it is new.
+        """Stores an object of the shelf; returns the asset and whether it is new.
 
         The worker makes it: the packages for that would take 127 MB of this process for good.
 
@@ -193,7 +193,7 @@ class AssetStore:
 
     @remembered
     def get(self, digest: str) -> Asset:
-        """Return an asset.
+        """Returns an asset.
 
         Raises:
             NotFoundError: there is none of this digest.
@@ -203,13 +203,13 @@ class AssetStore:
 
     @remembered
     def all(self) -> list[Asset]:
-        """Return all assets, the newest first."""
+        """Returns all assets, the newest first."""
         with self._database.reading() as session:
             rows = session.scalars(select(AssetRow).order_by(AssetRow.uploaded_ns.desc(), AssetRow.digest))
             return [_asset(session, row) for row in rows]
 
     def path(self, asset: Asset) -> Path:
-        """Return the path of an asset's file, brought to this host if it is elsewhere.
+        """Returns the path of an asset's file, brought to this host if it is elsewhere.
 
         Raises:
             StorageFaultError: it cannot be brought here.
@@ -217,7 +217,7 @@ class AssetStore:
         return self._files.fetched(asset.digest, _file_name(asset.format.name))
 
     def thumbnail(self, digest: str) -> Path:
-        """Return the file of an asset's thumbnail, drawn on first request.
+        """Returns the file of an asset's thumbnail, drawn on first request.
 
         Raises:
             NotFoundError: there is no asset of this digest.
@@ -243,7 +243,7 @@ class AssetStore:
             drawn.unlink(missing_ok=True)
 
     def remove(self, digest: str) -> None:
-        """Delete an asset that no scene uses, now or in an earlier revision.
+        """Deletes an asset that no scene uses, now or in an earlier revision.
 
         Raises:
             NotFoundError: there is none of this digest.
@@ -262,7 +262,7 @@ class AssetStore:
                 self._files.remove(digest, _file_name(format_name))
 
     def localised(self, document: SceneDocument) -> SceneDocument:
-        """Return a stored document with the paths of its assets' files, for the render server.
+        """Returns a stored document with the paths of its assets' files, for the render server.
 
         Raises:
             StorageFaultError: a file was removed from the data folder.
@@ -270,7 +270,7 @@ class AssetStore:
         return document.with_assets(lambda _place, reference: str(self._existing(reference)))
 
     def without_paths(self, sentence: str) -> str:
-        """Return a sentence of the render server for clients: digests in place of files."""
+        """Returns a sentence of the render server for clients: digests in place of files."""
         return sentence.replace(f"{self._files.folder.absolute()}{os.sep}", DIGEST_PREFIX)
 
     def _existing(self, reference: str) -> Path:
@@ -295,7 +295,7 @@ class AssetStore:
             return self._probe(path, found.kind, name)
 
     def _placed(self, checked: Path, row: AssetRow, name: str) -> tuple[Asset, bool]:
-        """Move the file into place, then add its row: a row without a file never exists."""
+        """Moves the file into place, then adds its row: a row without a file never exists."""
         self._files.upload(row.digest, _file_name(row.format), checked)
         with self._database.writing() as session:
             known = session.get(AssetRow, row.digest)
@@ -327,7 +327,7 @@ class AssetNames:
         self._rows: dict[str, AssetRow | None] = {}
 
     def resolved(self, place: str, asset: str) -> str:
-        """Return the reference of the asset that a document names at `place`, by digest or by uploaded name.
+        """Returns the reference of the asset that a document names at `place`, by digest or by uploaded name.
 
         Raises:
             DeltalightError: there is no such asset, several have this name, or its kind does not fit `place`.

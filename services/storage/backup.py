@@ -66,7 +66,7 @@ class _GoneError(Exception):
 
 
 def write_backup(folder: Path, path: Path) -> Contents:
-    """Write a backup of a data folder to a new file, which its owner alone can read.
+    """Writes a backup of a data folder to a new file, which its owner alone can read.
 
     Services may go on writing: the backup has every revision that was stored when it began.
 
@@ -89,7 +89,7 @@ def write_backup(folder: Path, path: Path) -> Contents:
 
 
 def restore_backup(path: Path, folder: Path) -> Contents:
-    """Replace scenes, tokens and assets of a data folder by those of a backup, and move the former aside.
+    """Replaces scenes, tokens and assets of a data folder by those of a backup, and moves the former aside.
 
     All of the backup is checked first. A restore that is cut off leaves the old or the new state; the next user of
     the folder finishes it.
@@ -138,7 +138,7 @@ def _write(folder: Path, out: Path) -> Contents:
 
 @contextmanager
 def _private(path: Path) -> Iterator[BinaryIO]:
-    """Open a new file that its owner alone can read, because it holds the hashes of tokens; durable at the end."""
+    """Opens a new file that its owner alone can read, because it holds the hashes of tokens; durable at the end."""
     with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600), "w+b") as file:
         yield file
         file.flush()
@@ -146,7 +146,7 @@ def _private(path: Path) -> Iterator[BinaryIO]:
 
 
 def _copy_database(source: Path, target: Path) -> None:
-    """Copy a database as of one moment; writers go on meanwhile (https://sqlite.org/backup.html)."""
+    """Copies a database as of one moment; writers go on meanwhile (https://sqlite.org/backup.html)."""
     with (
         _explained(source),
         closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=rw", uri=True)) as live,
@@ -157,7 +157,7 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _examined(database: Path, shown: Path) -> tuple[Contents, dict[str, str]]:
-    """Check a database without a log; return what it holds and the file names of its assets by digest."""
+    """Checks a database without a log; returns what it holds and the file names of its assets by digest."""
     with _explained(shown), closing(sqlite3.connect(database)) as connection:
         (found,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
         if found != "ok":
@@ -206,7 +206,7 @@ def _add(archive: zipfile.ZipFile, name: str, path: Path) -> _Entry:
 
 
 def _unpack(path: Path, to: Path) -> Contents:
-    """Unpack a backup into a new folder, durably, and check everything in it."""
+    """Unpacks a backup into a new folder, durably, and checks everything in it."""
     try:
         with path.open("rb") as file, zipfile.ZipFile(file) as archive:
             for entry in _entries(archive, path):
@@ -228,7 +228,7 @@ def _unpack(path: Path, to: Path) -> Contents:
 
 
 def _entries(archive: zipfile.ZipFile, path: Path) -> list[_Entry]:
-    """Return the files that the manifest lists; their names can only be those that a backup has."""
+    """Returns the files that the manifest lists; their names can only be those that a backup has."""
     if archive.getinfo(MANIFEST).file_size > LARGEST_MANIFEST_BYTES:
         raise ValueError("its list of files is too long")
     about = json.loads(archive.read(MANIFEST))

@@ -20,7 +20,7 @@ _CONTENTS = (f"{DATABASE}-wal", f"{DATABASE}-shm", ASSETS, DATABASE)
 
 
 def use_folder(folder: Path) -> ExitStack:
-    """Use a data folder together with others, until what is returned is closed; finish a restore that was cut off.
+    """Uses a data folder together with others, until what is returned is closed; finishes a restore that was cut off.
 
     Raises:
         DeltalightError: its contents are being replaced now, or it cannot be written.
@@ -32,7 +32,7 @@ def use_folder(folder: Path) -> ExitStack:
 
 
 def use_folder_alone(folder: Path) -> ExitStack:
-    """Use a data folder alone, until what is returned is closed.
+    """Uses a data folder alone, until what is returned is closed.
 
     Raises:
         DeltalightError: a process uses it, or it cannot be written.
@@ -46,7 +46,7 @@ def use_folder_alone(folder: Path) -> ExitStack:
 
 @contextmanager
 def doing_jobs(folder: Path) -> Iterator[bool]:
-    """Announce during the block that this process records and replays; yield whether another one does so, too.
+    """Announces during the block that this process records and replays; yields whether another one does so, too.
 
     It does so by a lock of this process alone (lockf(3)): what it forks does not keep it.
     """
@@ -61,12 +61,12 @@ def doing_jobs(folder: Path) -> Iterator[bool]:
 
 
 def staging_folder(folder: Path) -> Path:
-    """Return the name of a folder that takes the contents' place as soon as it exists."""
+    """Returns the name of a folder that takes the contents' place as soon as it exists."""
     return folder / f"{_STAGED}{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
 
 
 def finish_replacing(folder: Path) -> Path | None:
-    """Move staged contents into place, and those of before aside; return where they are then.
+    """Moves staged contents into place, and those of before aside; returns where they are then.
 
     May be cut off at any point, and called again: what was moved stays, the rest follows.
     """
@@ -81,7 +81,7 @@ def finish_replacing(folder: Path) -> Path | None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable."""
+    """Makes the names in a folder durable."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

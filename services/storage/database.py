@@ -36,13 +36,13 @@ class Database(ABC):
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
-        """Yield a session with a consistent view of the data."""
+        """Yields a session with a consistent view of the data."""
         with self._explained(), Session(self._reading) as session:
             yield session
 
     @contextmanager
     def writing(self, *, durable: bool = True) -> Iterator[Session]:
-        """Yield the session of the only writer, of all threads and processes; an exception rolls everything back.
+        """Yields the session of the only writer, of all threads and processes; an exception rolls everything back.
 
         What is not `durable` may be lost in a power cut.
         """
@@ -51,28 +51,28 @@ class Database(ABC):
             yield session
 
     def answer(self, key: Hashable, read: Callable[[], Answer]) -> Answer:
-        """Return what `read` returns; where the database may be away, what it returned last time under this `key`."""
+        """Returns what `read` returns; where the database may be away, what it last returned under this `key`."""
         del key
         return read()
 
     def note(self, key: Hashable, answer: Answer, read: Callable[[], Answer]) -> None:
-        """Note what `read` would answer now, after a change."""
+        """Notes what `read` would answer now, after a change."""
         del key, answer, read
 
     def keep_known(self, *reads: Callable[[], object]) -> None:
-        """Have the answers of these reads at hand if the database goes."""
+        """Has the answers of these reads at hand if the database goes."""
         del reads
 
     @abstractmethod
     def feed(self) -> Feed:
-        """Return a feed to and from the other processes that use this database; the caller closes it."""
+        """Returns a feed to and from the other processes that use this database; the caller closes it."""
 
     def close(self) -> None:
-        """Close all connections."""
+        """Closes all connections."""
         self._engine.dispose()
 
     def _open(self) -> None:
-        """Lock writers' transactions from now on, and bring the layout up to date."""
+        """Locks writers' transactions from now on, and brings the layout up to date."""
         event.listen(self._engine, "begin", self._begin)
         self._writing = self._engine.execution_options(**{WRITES: True})
         with self._explained(), self._writing.begin() as connection:
@@ -90,24 +90,24 @@ class Database(ABC):
 
     @abstractmethod
     def _version(self, connection: Connection) -> int:
-        """Return the version of the layout; 0 = there are no tables."""
+        """Returns the version of the layout; 0 = there are no tables."""
 
     def _migrate(self, connection: Connection, version: int) -> None:
-        """Bring an older layout up to date."""
+        """Brings an older layout up to date."""
         del version
         migrate(connection)
 
     def _note_version(self, connection: Connection) -> None:
-        """Note where else than in Alembic's table that the layout is the newest."""
+        """Notes where else than in Alembic's table that the layout is the newest."""
         del connection
 
     @abstractmethod
     def _begin(self, connection: Connection) -> None:
-        """Lock at the start of a writer, so that what it reads stays true until it has written."""
+        """Locks at the start of a writer, so that what it reads stays true until it has written."""
 
     @abstractmethod
     def _explained(self) -> AbstractContextManager[None]:
-        """Turn faults of the database into sentences."""
+        """Turns faults of the database into sentences."""
 
 
 class Stored(Protocol):
@@ -122,7 +122,7 @@ Reader = TypeVar("Reader", bound=Stored)
 def remembered(
     read: Callable[Concatenate[Reader, Given], Answer],
 ) -> Callable[Concatenate[Reader, Given], Answer]:
-    """Let a method that reads answer as last time while the database is away (`Database.answer`)."""
+    """Lets a method that reads answer as last time while the database is away (`Database.answer`)."""
 
     @wraps(read)
     def answer(self: Reader, /, *args: Given.args, **kwargs: Given.kwargs) -> Answer:

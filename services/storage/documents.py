@@ -16,7 +16,7 @@ Item = TypeVar("Item")
 
 
 def merge_patch(target: object, patch: object) -> Any:  # noqa: ANN401 - JSON
-    """Return `target` changed by a JSON merge patch: null removes a key, so that its default holds.
+    """Returns `target` changed by a JSON merge patch: null removes a key, so that its default holds.
 
     Raises:
         DeltalightError: the patch is nested too deeply.
@@ -40,7 +40,7 @@ def _merged(target: object, patch: object) -> object:
 
 
 def patch_document(patch: object) -> Edit:
-    """Return an edit that merges a patch into the whole document.
+    """Returns an edit that merges a patch into the whole document.
 
     A patch that names another method starts from that method's defaults, because the methods' keys differ.
     """
@@ -58,22 +58,22 @@ def _prepared(document: Document, patch: object) -> Document:
 
 
 def patch_part(part: str, patch: object) -> Edit:
-    """Return an edit that merges a patch into one top-level part."""
+    """Returns an edit that merges a patch into one top-level part."""
     return patch_document({part: patch})
 
 
 def replace_part(part: str, value: object) -> Edit:
-    """Return an edit that replaces a top-level part."""
+    """Returns an edit that replaces a top-level part."""
     return lambda document: {**document, part: value}
 
 
 def replace_document(value: object) -> Edit:
-    """Return an edit that replaces the document."""
+    """Returns an edit that replaces the document."""
     return lambda _document: value
 
 
 def add_object(value: object) -> Edit:
-    """Return an edit that adds an object; one without an id gets a free one."""
+    """Returns an edit that adds an object; one without an id gets a free one."""
 
     def edit(document: Document) -> Document:
         added = {"id": _free_id(document), **value} if isinstance(value, Mapping) else value
@@ -88,12 +88,12 @@ def _free_id(document: Document) -> str:
 
 
 def replace_object(name: str, value: object) -> Edit:
-    """Return an edit that replaces an object; without an id the new one keeps the old one's."""
+    """Returns an edit that replaces an object; without an id the new one keeps the old one's."""
     return _edit_object(name, lambda _old: {"id": name, **value} if isinstance(value, Mapping) else value)
 
 
 def patch_object(name: str, patch: object) -> Edit:
-    """Return an edit that merges a patch into one object.
+    """Returns an edit that merges a patch into one object.
 
     A patch from a material in numbers to a precomputed one, or back, replaces the material: they share no key.
     """
@@ -118,7 +118,7 @@ def _edit_object(name: str, change: Callable[[Document], Any]) -> Edit:
 
 
 def remove_object(name: str) -> Edit:
-    """Return an edit that removes an object."""
+    """Returns an edit that removes an object."""
 
     def edit(document: Document) -> Document:
         index = _index(document, name)
@@ -135,17 +135,17 @@ def _index(document: Document, name: str) -> int:
 
 
 def add_light(value: object) -> Edit:
-    """Return an edit that adds a manual light after the others."""
+    """Returns an edit that adds a manual light after the others."""
     return _edit_lights(lambda lights: [*lights, value])
 
 
 def replace_light(index: int, value: object) -> Edit:
-    """Return an edit that replaces a manual light."""
+    """Returns an edit that replaces a manual light."""
     return _edit_lights(lambda lights: _with_lights(lights, index, [value]))
 
 
 def patch_light(index: int, patch: object) -> Edit:
-    """Return an edit that merges a patch into one manual light.
+    """Returns an edit that merges a patch into one manual light.
 
     A patch that names another type keeps what lights of that type have too, such as place and colour.
     """
@@ -164,12 +164,12 @@ def _for_new_type(light: Document, patch: object) -> Document:
 
 
 def remove_light(index: int) -> Edit:
-    """Return an edit that removes a manual light; those after it move up."""
+    """Returns an edit that removes a manual light; those after it move up."""
     return _edit_lights(lambda lights: _with_lights(lights, index, []))
 
 
 def light_at(lights: Sequence[Item], index: int) -> Item:
-    """Return one of the manual lights.
+    """Returns one of the manual lights.
 
     Raises:
         NotFoundError: there are fewer.
@@ -190,13 +190,13 @@ def _edit_lights(change: Callable[[list[Any]], list[Any]]) -> Edit:
 
 
 def _with_lights(lights: list[Any], index: int, values: list[Any]) -> list[Any]:
-    """Replace one light by any number of lights."""
+    """Replaces one light by any number of lights."""
     light_at(lights, index)
     return [*lights[:index], *values, *lights[index + 1 :]]
 
 
 def checked_document(document: object, revision: int) -> SceneDocument:
-    """Validate a document and give it its revision.
+    """Validates a document and gives it its revision.
 
     Raises:
         DeltalightError: the first fault, with its place.
@@ -209,7 +209,7 @@ def checked_document(document: object, revision: int) -> SceneDocument:
 
 
 def require_revision(expected: int | None, current: int) -> None:
-    """Refuse a change to an older revision; None = whichever is newest.
+    """Refuses a change to an older revision; None = whichever is newest.
 
     Raises:
         StaleRevisionError: `expected` is not the newest.

@@ -24,7 +24,7 @@ class DrainedStore:
         self._database = database
 
     def load(self) -> Drained:
-        """Return what was kept last.
+        """Returns what was kept last.
 
         Raises:
             StorageFaultError: the database does not answer.
@@ -37,7 +37,7 @@ class DrainedStore:
         return Drained(frozenset(found["rooms"]), frozenset(found["hosts"]))
 
     def keep(self, drained: Drained) -> None:
-        """Store it in place of the last.
+        """Stores it in place of the last.
 
         Raises:
             StorageFaultError: the database does not answer.

@@ -24,12 +24,12 @@ class Feed(ABC):
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
     def start(self, hear: Callable[[str], None], missed: Callable[[], None]) -> None:
-        """Begin to hear."""
+        """Begins to hear."""
         self._hear, self._missed = hear, missed
         self._thread.start()
 
     def send(self, text: str) -> None:
-        """Pass a text on soon (any thread); waits for nothing."""
+        """Passes a text on soon (any thread); waits for nothing."""
         content = text.encode()
         if len(content) > LONGEST_BYTES:
             log.warning("an event is too long to be passed to other web processes", bytes=len(content))
@@ -37,18 +37,18 @@ class Feed(ABC):
             self._send(content)
 
     def close(self) -> None:
-        """Stop."""
+        """Stops."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
 
     @abstractmethod
     def _send(self, content: bytes) -> None:
-        """Pass a text of at most `LONGEST_BYTES` on."""
+        """Passes a text of at most `LONGEST_BYTES` on."""
 
     @abstractmethod
     def _run(self) -> None:
-        """Hear until `_stop` is set."""
+        """Hears until `_stop` is set."""
 
     def _pass_on(self, text: str) -> None:
         try:

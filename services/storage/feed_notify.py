@@ -26,7 +26,7 @@ class Tick(Protocol):
     """Called a few times a second."""
 
     def __call__(self, *, is_changed: bool) -> None:
-        """Do what is due."""
+        """Does what is due."""
 
 
 class NotifyFeed(Feed):
@@ -51,19 +51,19 @@ class NotifyFeed(Feed):
         self._sending = threading.Thread(target=self._send_all, name="feed-send", daemon=True)
 
     def start(self, hear: Callable[[str], None], missed: Callable[[], None]) -> None:
-        """Begin to hear and to send."""
+        """Begins to hear and to send."""
         super().start(hear, missed)
         self._sending.start()
 
     def _send(self, content: bytes) -> None:
-        """Pass a text on soon; while the database is away it is lost."""
+        """Passes a text on soon; while the database is away it is lost."""
         try:
             self._waiting.put_nowait(self._name + content.decode())
         except queue.Full:
             log.warning("the database is too slow to pass events to other web processes; one is lost")
 
     def close(self) -> None:
-        """Stop, once what waits was sent."""
+        """Stops, once what waits was sent."""
         super().close()
         if self._sending.is_alive():
             self._sending.join()
@@ -101,7 +101,7 @@ class NotifyFeed(Feed):
                 self._stop.wait(TRY_AGAIN_S)
 
     def _listening(self, stack: ExitStack) -> Connection:
-        """Return a connection that hears, until the `stack` unwinds; that it hears nothing is no fault."""
+        """Returns a connection that hears, until the `stack` unwinds; that it hears nothing is no fault."""
         with self._explained():
             connection = stack.enter_context(self._engine.connect())
             connection.exec_driver_sql(f"LISTEN {CHANNEL}")
@@ -118,7 +118,7 @@ class NotifyFeed(Feed):
             raise
 
     def _hear_all(self, driver: psycopg.Connection[Any]) -> bool:
-        """Pass on what comes within a moment; return whether anything did, also from this process."""
+        """Passes on what comes within a moment; returns whether anything did, also from this process."""
         is_changed = False
         for found in driver.notifies(timeout=LOOK_S):
             is_changed = True

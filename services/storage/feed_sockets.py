@@ -31,7 +31,7 @@ class SocketFeed(Feed):
         self._lock = threading.Lock()
 
     def start(self, hear: Callable[[str], None], missed: Callable[[], None]) -> None:
-        """Make the socket and begin to hear."""
+        """Makes the socket and begins to hear."""
         self._socket = self._opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         self._sender = self._opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         self._socket.settimeout(LOOK_S)
@@ -66,7 +66,7 @@ class SocketFeed(Feed):
             log.debug("an event was not passed on", fault=str(fault))
 
     def close(self) -> None:
-        """Stop, and remove the socket."""
+        """Stops, and removes the socket."""
         super().close()
         with self._lock:
             self._folder = None
@@ -79,7 +79,7 @@ class SocketFeed(Feed):
 
 
 def _address(folder: int, name: str) -> str:
-    """Return an address that fits: that of a socket may have 107 bytes."""
+    """Returns an address that fits: that of a socket may have 107 bytes."""
     return f"/proc/self/fd/{folder}/{name}"
 
 

@@ -20,7 +20,7 @@ _IMAGE_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"
 
 
 def repack(path: Path, out: str, limit: str) -> Facts:
-    """Write the glTF of an archive as one .glb file (in the worker); `limit` is its greatest size unpacked, bytes.
+    """Writes the glTF of an archive as one .glb file (in the worker); `limit` is its greatest size unpacked, bytes.
 
     The same archive always gives the same bytes.
 
@@ -52,7 +52,7 @@ def _repacked(archive: Archive) -> bytes:
 
 
 def _joined(document: dict[str, Any], archive: Archive, folder: str) -> tuple[dict[str, Any], bytes]:
-    """Join all buffers, then all pictures, into one; buffer views are shifted accordingly."""
+    """Joins all buffers, then all pictures, into one; buffer views are shifted accordingly."""
     binary, starts = bytearray(), []
     for buffer in document.get("buffers", []):
         starts.append(_append(binary, _content(buffer["uri"], archive, folder)[: int(buffer["byteLength"])]))
@@ -74,7 +74,7 @@ def _joined(document: dict[str, Any], archive: Archive, folder: str) -> tuple[di
 
 
 def _append(binary: bytearray, content: bytes) -> int:
-    """Append a piece and return its offset; every accessor type is aligned to four bytes."""
+    """Appends a piece and returns its offset; every accessor type is aligned to four bytes."""
     start = len(binary)
     binary += content + bytes(-len(content) % 4)
     return start

@@ -36,7 +36,7 @@ class LastKnown:
         self._lock = Lock()
 
     def answer(self, key: Hashable, read: Callable[[], Answer]) -> Answer:
-        """Return what `read` returns; where the database is away, what it returned at most `LIFE_S` ago.
+        """Returns what `read` returns; where the database is away, what it returned at most `LIFE_S` ago.
 
         Raises:
             DatabaseGoneError: the database is away, and nothing is known.
@@ -59,7 +59,7 @@ class LastKnown:
         return answer
 
     def note(self, key: Hashable, answer: Answer, read: Callable[[], Answer]) -> None:
-        """Note what `read` would answer now."""
+        """Notes what `read` would answer now."""
         now_s = self._clock_s()
         with self._lock:
             self._known[key] = _Known(answer, read, now_s, now_s)
@@ -68,7 +68,7 @@ class LastKnown:
                 self._known.popitem(last=False)
 
     def keep(self, *reads: Callable[[], object]) -> None:
-        """Make these reads, each by way of `answer`, now and whenever others are made again."""
+        """Makes these reads, each by way of `answer`, now and whenever others are made again."""
         self._kept = reads
         self._read_kept()
 
@@ -78,7 +78,7 @@ class LastKnown:
                 read()
 
     def tick(self, *, is_changed: bool) -> None:
-        """Read again what was asked lately if something `is_changed`, and each minute what was within an hour."""
+        """Reads again what was asked lately if something `is_changed`, and each minute what was within an hour."""
         now_s = self._clock_s()
         if now_s >= self._all_due_s:
             self._all_due_s = now_s + LATELY_S

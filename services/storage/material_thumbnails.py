@@ -28,7 +28,7 @@ LIGHTS = ((KEY_LIGHT, KEY), (FILL_LIGHT, FILL))
 
 
 def draw_material(path: Path, out: str) -> Facts:
-    """Write a precomputed material as PNG on a transparent ground, under the lights of all thumbnails.
+    """Writes a precomputed material as PNG on a transparent ground, under the lights of all thumbnails.
 
     Raises:
         DeltalightError: the material cannot be read.
@@ -39,7 +39,7 @@ def draw_material(path: Path, out: str) -> Facts:
 
 
 def _ball(material: GaussianBrdf) -> Pixels:
-    """Return a ball of the material, seen from far away."""
+    """Returns a ball of the material, seen from far away."""
     edge = SIZE * SAMPLES
     right, down = np.meshgrid(*[(2 * (np.arange(edge) + 0.5) / edge - 1) * MARGIN] * 2)
     covered = right**2 + down**2 < 1
@@ -56,7 +56,7 @@ def _ball(material: GaussianBrdf) -> Pixels:
 def _reflected(
     material: GaussianBrdf, normals: Float64[np.ndarray, "n 3"], light: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Return the radiance towards the camera (z) of surfaces under a light that a white one would show as 1."""
+    """Returns the radiance towards the camera (z) of surfaces under a light that a white one would show as 1."""
     cosine = normals @ light
     found = np.zeros_like(normals)
     lit = cosine > 0
@@ -68,7 +68,7 @@ def _reflected(
 def _in_tangent_frame(
     direction: Float64[np.ndarray, "3"], normals: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Return a direction in frames whose z is each normal (Duff et al. 2017; normals have z > 0)."""
+    """Returns a direction in frames whose z is each normal (Duff et al. 2017; normals have z > 0)."""
     x, y, z = normals.T
     across = -1 / (1 + z)
     tangent = np.stack([1 + across * x * x, across * x * y, -x], axis=1)
@@ -77,7 +77,7 @@ def _in_tangent_frame(
 
 
 def _square(material: TextureByLight) -> Pixels:
-    """Return the texture, seen from in front, in the middle of the picture."""
+    """Returns the texture, seen from in front, in the middle of the picture."""
     height, width = material.albedo.shape[:2]
     scale = SIZE / max(height, width)
     size = [max(1, round(edge * scale)) for edge in (width, height)]

@@ -71,19 +71,19 @@ class PostgresDatabase(Database):
         engine.dispose()  # of the connection that may have changed the layout, which takes its time
 
     def answer(self, key: Hashable, read: Callable[[], Answer]) -> Answer:
-        """Return what `read` returns; while the database is away, what it returned last time under this `key`."""
+        """Returns what `read` returns; while the database is away, what it returned last time under this `key`."""
         return self._last.answer(key, read)
 
     def note(self, key: Hashable, answer: Answer, read: Callable[[], Answer]) -> None:
-        """Note what `read` would answer now, after a change."""
+        """Notes what `read` would answer now, after a change."""
         self._last.note(key, answer, read)
 
     def keep_known(self, *reads: Callable[[], object]) -> None:
-        """Make these reads now and after each change, so that their answers are known if the database goes."""
+        """Makes these reads now and after each change, so that their answers are known if the database goes."""
         self._last.keep(*reads)
 
     def feed(self) -> Feed:
-        """Return a feed to and from the other processes that use this database."""
+        """Returns a feed to and from the other processes that use this database."""
         return NotifyFeed(self._engine, self._explained, self._last.tick)
 
     def _version(self, connection: Connection) -> int:
@@ -146,7 +146,7 @@ class PostgresDatabase(Database):
             raise StorageFaultError("Too many requests wait for the database; try again soon.") from fault
 
     def _gone_error(self, fault: DBAPIError) -> DatabaseGoneError:
-        """Return the error for clients, who need not know where the database is; that is in the log, once."""
+        """Returns the error for clients, who need not know where the database is; that is in the log, once."""
         if not self._is_open:
             return DatabaseGoneError(
                 f"The database {self.shown} does not answer ({_first_line(fault)}); start it, or correct its address."
@@ -173,7 +173,7 @@ _WRONG_ADDRESS = "the address of a database must be that of PostgreSQL, such as 
 
 
 def _prepare(connection: psycopg.Connection[Any], _entry: ConnectionPoolEntry) -> None:
-    """Wait for other writers no longer than for those of SQLite."""
+    """Waits for other writers no longer than for those of SQLite."""
     connection.autocommit = True
     connection.execute(f"SET lock_timeout = '{BUSY_TIMEOUT_S:.0f}s'")
     connection.autocommit = False

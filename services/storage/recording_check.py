@@ -19,7 +19,7 @@ LISTS = (COLORS, "depth.txt", "composite.txt", "fisheye.txt", "groundtruth.txt")
 
 
 def check_recording(path: Path, out: str, limit: str) -> Facts:
-    """Check a recording; make `out` of a zipped dataset folder, of at most `limit` bytes unpacked.
+    """Checks a recording; makes `out` of a zipped dataset folder, of at most `limit` bytes unpacked.
 
     Raises:
         DeltalightError: it is neither, or cannot be read.
@@ -63,7 +63,7 @@ def _imported(path: Path, out: Path, limit_bytes: int) -> Path:
 
 
 def _require_inside(path: Path) -> None:
-    """Refuse a list that names files outside of its folder.
+    """Refuses a list that names files outside of its folder.
 
     Raises:
         DeltalightError: it does.

@@ -81,7 +81,7 @@ class SceneStore:
             yield session
 
     def create(self, document: object, what: str = "created") -> StoredScene:
-        """Store a new scene; its revisions begin at 1.
+        """Stores a new scene; its revisions begin at 1.
 
         Raises:
             DeltalightError: the document is wrong or names an asset that was not uploaded.
@@ -91,7 +91,7 @@ class SceneStore:
         return self._noted(added)
 
     def get(self, scene_id: str) -> StoredScene:
-        """Return the newest revision of a scene.
+        """Returns the newest revision of a scene.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -103,7 +103,7 @@ class SceneStore:
             return _stored(session, _scene(session, scene_id), _newest(session, scene_id))
 
     def _noted(self, newest: StoredScene) -> StoredScene:
-        """Note what reads would answer after a change."""
+        """Notes what reads would answer after a change."""
         scene_id = newest.head.id
         self._database.note((self, scene_id), newest, partial(self._get, scene_id))
         if newest.head.is_active:
@@ -113,7 +113,7 @@ class SceneStore:
 
     @remembered
     def revision(self, scene_id: str, number: int) -> StoredScene:
-        """Return a scene as it was at a revision.
+        """Returns a scene as it was at a revision.
 
         Raises:
             NotFoundError: there is no such scene or revision.
@@ -127,7 +127,7 @@ class SceneStore:
 
     @remembered
     def all(self) -> list[SceneHead]:
-        """Return all scenes, in the order of their creation."""
+        """Returns all scenes, in the order of their creation."""
         newest = select(RevisionRow.scene_id, func.max(RevisionRow.number).label("number"))
         heads = newest.group_by(RevisionRow.scene_id).subquery()
         query = (
@@ -146,7 +146,7 @@ class SceneStore:
 
     @remembered
     def history(self, scene_id: str, before: int | None, limit: int) -> list[Revision]:
-        """Return up to `limit` revisions below `before`, the newest first.
+        """Returns up to `limit` revisions below `before`, the newest first.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -162,7 +162,7 @@ class SceneStore:
     def change(
         self, scene_id: str, edit: Edit, what: str, expected: int | None = None, gesture: str | None = None
     ) -> StoredScene:
-        """Add a revision that `edit` makes from the newest one; an edit that changes nothing adds none.
+        """Adds a revision that `edit` makes from the newest one; an edit that changes nothing adds none.
 
         One undo takes back all consecutive changes with the same `gesture`.
 
@@ -186,7 +186,7 @@ class SceneStore:
         return self._noted(added)
 
     def undo(self, scene_id: str, expected: int | None = None) -> StoredScene:
-        """Add a revision that restores the state before the last change.
+        """Adds a revision that restores the state before the last change.
 
         Raises:
             ConflictError: there is nothing to undo; or as `change`.
@@ -205,7 +205,7 @@ class SceneStore:
         return self._step(scene_id, expected, step)
 
     def redo(self, scene_id: str, expected: int | None = None) -> StoredScene:
-        """Add a revision that restores what the last undo took back.
+        """Adds a revision that restores what the last undo took back.
 
         Raises:
             ConflictError: there is nothing to redo; or as `change`.
@@ -220,7 +220,7 @@ class SceneStore:
         return self._step(scene_id, expected, step)
 
     def duplicate(self, scene_id: str, name: str | None = None) -> StoredScene:
-        """Store a copy of the newest revision as a new scene.
+        """Stores a copy of the newest revision as a new scene.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -233,7 +233,7 @@ class SceneStore:
         return self._noted(added)
 
     def delete(self, scene_id: str, expected: int | None = None) -> None:
-        """Delete a scene that is not active; its revisions stay in the database.
+        """Deletes a scene that is not active; its revisions stay in the database.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -248,7 +248,7 @@ class SceneStore:
             scene.deleted_ns = time.time_ns()
 
     def activate(self, scene_id: str) -> StoredScene:
-        """Make a scene the one that is rendered.
+        """Makes a scene the one that is rendered.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -261,7 +261,7 @@ class SceneStore:
         return self._noted(activated)
 
     def activate_first(self, scene_id: str) -> bool:
-        """Make a scene the one that is rendered, unless one is; return whether it was made so.
+        """Makes a scene the one that is rendered, unless one is; returns whether it was made so.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -273,7 +273,7 @@ class SceneStore:
             return True
 
     def active(self) -> StoredScene | None:
-        """Return the scene that is rendered, if one was chosen."""
+        """Returns the scene that is rendered, if one was chosen."""
         return self._database.answer((self, None), self._active)
 
     def _active(self) -> StoredScene | None:
@@ -285,7 +285,7 @@ class SceneStore:
 
     @remembered
     def active_id(self) -> str | None:
-        """Return the id of the scene that is rendered, if one was chosen."""
+        """Returns the id of the scene that is rendered, if one was chosen."""
         with self._reading() as session:
             return _active_id(session)
 
@@ -395,7 +395,7 @@ def _active_key(room: str | None) -> str:
 
 
 def _active_id(session: Session) -> str | None:
-    """Return the scene that is active in the session's room; one that was deleted while no such room ran is none."""
+    """Returns the scene that is active in the session's room; one that was deleted while no such room ran is none."""
     choice = session.get(ChoiceRow, session.info[ACTIVE])
     scene = None if choice is None else session.get(SceneRow, choice.value)
     return None if scene is None or scene.deleted_ns is not None else scene.id
@@ -408,7 +408,7 @@ def _head(scene: SceneRow, row: RevisionRow, active: str | None) -> SceneHead:
 def _stored(
     session: Session, scene: SceneRow, row: RevisionRow, document: SceneDocument | None = None
 ) -> StoredScene:
-    """Describe a scene at a revision; pass its document if it is available, to avoid reading it."""
+    """Describes a scene at a revision; passes its document if it is available, to avoid reading it."""
     return StoredScene(
         _head(scene, row, _active_id(session)),
         document or _document(session, row),

@@ -16,26 +16,26 @@ _VERSIONS = Table("alembic_version", MetaData(), Column("version_num", String(32
 
 
 def stored_version(connection: Connection) -> int:
-    """Return the version of a database's layout; 0 = it has no tables."""
+    """Returns the version of a database's layout; 0 = it has no tables."""
     if not inspect(connection).has_table(_VERSIONS.name):
         return 0
     return int(connection.execute(select(_VERSIONS.c.version_num)).scalar_one())
 
 
 def make_tables(connection: Connection) -> None:
-    """Make the tables of the newest version."""
+    """Makes the tables of the newest version."""
     Base.metadata.create_all(connection)
     note_version(connection, SCHEMA_VERSION)
 
 
 def note_version(connection: Connection, version: int) -> None:
-    """Tell Alembic which version a database has that it does not know."""
+    """Tells Alembic which version a database has that it does not know."""
     _VERSIONS.create(connection)
     connection.execute(_VERSIONS.insert().values(version_num=str(version)))
 
 
 def migrate(connection: Connection) -> None:
-    """Bring an older layout up to date, in the connection's transaction."""
+    """Brings an older layout up to date, in the connection's transaction."""
     from alembic import command
     from alembic.config import Config
 

@@ -58,7 +58,7 @@ class ShelfItem:
         return f"{self.label}.glb"
 
     def glb(self) -> bytes:
-        """Generate the file; the same bytes each time."""
+        """Generates the file; the same bytes each time."""
         from trimesh.visual import TextureVisuals
         from trimesh.visual.material import PBRMaterial
 
@@ -142,7 +142,7 @@ SHELF: dict[str, ShelfItem | ShelfModel] = {
 
 
 def shelf_item(name: str) -> ShelfItem | ShelfModel:
-    """Return an object of the shelf.
+    """Returns an object of the shelf.
 
     Raises:
         NotFoundError: there is none of this name.

@@ -13,7 +13,7 @@ _Y_FROM_Z = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 
 
 def glb(shape: "trimesh.Trimesh | trimesh.Scene", strengths: Mapping[str, float] | None = None) -> bytes:
-    """Return the file of a shape (z up, metres), the same bytes each time.
+    """Returns the file of a shape (z up, metres), the same bytes each time.
 
     `strengths` multiply the emissive factors of materials of these names.
     """

@@ -51,7 +51,7 @@ class Directions:
 
     @staticmethod
     def grid(rows: Float64[np.ndarray, " h"], columns: Float64[np.ndarray, " w"]) -> "Directions":
-        """Return directions of elevations by rows and azimuths by columns."""
+        """Returns directions of elevations by rows and azimuths by columns."""
         azimuth, elevation = np.meshgrid(columns, rows)
         return Directions(azimuth, elevation)
 
@@ -94,7 +94,7 @@ class Directions:
 
 
 def helmet_glb() -> bytes:
-    """Generate the file."""
+    """Generates the file."""
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
@@ -117,13 +117,13 @@ def _image(picture: Picture) -> Any:  # noqa: ANN401 - Pillow is imported where 
 
 
 def _step(value: Map, width: float) -> Map:
-    """Return 0 below -width, 1 above width, and a smooth way between them."""
+    """Returns 0 below -width, 1 above width, and a smooth way between them."""
     weight = np.clip(0.5 + value / (2 * width), 0, 1)
     return weight * weight * (3 - 2 * weight)
 
 
 def _radius_m(at: Directions) -> Map:
-    """Return the shell's distance from the middle: an ellipsoid with visor, ridge and ears."""
+    """Returns the shell's distance from the middle: an ellipsoid with visor, ridge and ears."""
     shell = 1 / np.linalg.norm(at.unit / RADII_M, axis=-1)
     shell += INSET_M * (0.6 * _step(0.16 - np.abs(at.visor - 1.06), 0.08) - _step(0.93 - at.visor, 0.08))
     shell += RIDGE_M * _step(STRIPE_DEG - at.across, 3.0) * _step(at.elevation - 32.0, 8.0)
@@ -132,7 +132,7 @@ def _radius_m(at: Directions) -> Map:
 
 
 def _mesh() -> "tuple[trimesh.Trimesh, Float64[np.ndarray, 'n 2']]":
-    """Return the shell and its texture coordinates; the first and the last column lie on each other."""
+    """Returns the shell and its texture coordinates; the first and the last column lie on each other."""
     import trimesh
 
     elevations = np.linspace(90, CUT_DEG, ROWS - 2)
@@ -153,7 +153,7 @@ def _mesh() -> "tuple[trimesh.Trimesh, Float64[np.ndarray, 'n 2']]":
 
 
 def _faces(rows: int, columns: int) -> Any:  # noqa: ANN401 - index arrays
-    """Return the triangles of a grid, outward; those that a pole makes a line of are left out."""
+    """Returns the triangles of a grid, outward; those that a pole makes a line of are left out."""
     row, column = (each.ravel() for each in np.indices((rows - 1, columns - 1)))
     a, b = row * columns + column, row * columns + column + 1
     c, d = a + columns, b + columns
@@ -162,7 +162,7 @@ def _faces(rows: int, columns: int) -> Any:  # noqa: ANN401 - index arrays
 
 
 def _normals(points: Float64[np.ndarray, "r c 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Return unit normals by the differences of neighbours, the seam's included."""
+    """Returns unit normals by the differences of neighbours, the seam's included."""
     around = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
     along, down = around[:, 2:] - around[:, :-2], np.gradient(points, axis=0)
     normals = np.cross(down, along)
@@ -171,7 +171,7 @@ def _normals(points: Float64[np.ndarray, "r c 3"]) -> Float64[np.ndarray, "n 3"]
 
 
 def _textures(at: Directions) -> dict[str, Picture]:
-    """Return the pictures by what glTF calls them."""
+    """Returns the pictures by what glTF calls them."""
     is_visor, is_rim = _step(0.95 - at.visor, 0.01), _step(RIM_WIDTH - np.abs(at.visor - 1.05), 0.02)
     is_ear, is_stripe = _step(EAR_DEG - at.ear, 0.5), at.stripe
     wear = _step(at.noise(5.0) + 0.8 * is_rim + 0.7 * at.noise(1.6) - 2.3, 0.2) * (1 - is_visor)
@@ -200,7 +200,7 @@ def _textures(at: Directions) -> dict[str, Picture]:
 
 
 def _line_mask(at: Directions) -> Map:
-    """Return 1 in the grooves between the shell's panels."""
+    """Returns 1 in the grooves between the shell's panels."""
     level = np.min([np.abs(at.elevation - each) for each in PANEL_LINES_DEG], axis=0)
     upright = np.where(
         (at.elevation < PANEL_LINES_DEG[1]) & (np.abs(at.azimuth) > 115),
@@ -211,14 +211,14 @@ def _line_mask(at: Directions) -> Map:
 
 
 def _lamps(at: Directions) -> Map:
-    """Return 1 where it glows: a ring on each ear, and three lamps above the visor."""
+    """Returns 1 where it glows: a ring on each ear, and three lamps above the visor."""
     ring = _step(0.9 - np.abs(at.ear - 0.62 * EAR_DEG), 0.4)
     beside = np.min([np.abs(at.azimuth - each) for each in (-7.0, 0.0, 7.0)], axis=0)
     return np.asarray(np.maximum(ring, _step(1.5 - np.hypot(beside, at.elevation - 30.5), 0.4)))
 
 
 def _height_m(at: Directions, lines: Map) -> Map:
-    """Return what the normal map shows: grooves, rivets beside the level ones, and an uneven paint."""
+    """Returns what the normal map shows: grooves, rivets beside the level ones, and an uneven paint."""
     beside = np.abs((at.azimuth + 7.5) % 15 - 7.5) * np.cos(np.radians(at.elevation))
     rivets = np.zeros_like(at.azimuth)
     for line in PANEL_LINES_DEG:
@@ -229,7 +229,7 @@ def _height_m(at: Directions, lines: Map) -> Map:
 
 
 def _normal_map(height_m: Map, at: Directions) -> Picture:
-    """Return tangent-space normals (glTF 2.0, 3.9.3): x along the columns, y up the rows."""
+    """Returns tangent-space normals (glTF 2.0, 3.9.3): x along the columns, y up the rows."""
     rows, columns = height_m.shape
     radius_m = float(np.mean(RADII_M))
     around_m = 2 * np.pi * radius_m / columns * np.maximum(np.cos(np.radians(at.elevation)), 0.05)

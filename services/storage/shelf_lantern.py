@@ -23,7 +23,7 @@ GLOW_RADIANCE = 2.2  # in camera units, where the camera shows 1 as white
 
 
 def lantern_glb() -> bytes:
-    """Generate the file."""
+    """Generates the file."""
     import trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -54,7 +54,7 @@ def _glass() -> "trimesh.Trimesh":
 
 
 def _frame() -> "trimesh.Trimesh":
-    """Return base, posts, roof and ring; each of them is closed."""
+    """Returns base, posts, roof and ring; each of them is closed."""
     from trimesh.creation import box
     from trimesh.util import concatenate
 
@@ -71,7 +71,7 @@ def _frame() -> "trimesh.Trimesh":
 
 
 def _top(height_m: float) -> "list[trimesh.Trimesh]":
-    """Return the roof, a pyramid, and the ring to hang it by, from a height on."""
+    """Returns the roof, a pyramid, and the ring to hang it by, from a height on."""
     from trimesh.creation import cone, torus
     from trimesh.transformations import rotation_matrix
 

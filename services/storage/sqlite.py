@@ -34,11 +34,11 @@ class SqliteDatabase(Database):
         self._open()
 
     def feed(self) -> Feed:
-        """Return a feed to and from the other processes of the folder."""
+        """Returns a feed to and from the other processes of the folder."""
         return SocketFeed(self._path.parent)
 
     def _version(self, connection: Connection) -> int:
-        """Return the file's own number, by which versions without Alembic refuse it too."""
+        """Returns the file's own number, by which versions without Alembic refuse it too."""
         return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
 
     def _migrate(self, connection: Connection, version: int) -> None:
@@ -78,6 +78,6 @@ class SqliteDatabase(Database):
 
 
 def _prepare(connection: sqlite3.Connection, _entry: ConnectionPoolEntry) -> None:
-    """Leave transactions to this class."""
+    """Leaves transactions to this class."""
     connection.isolation_level = None
     connection.execute("PRAGMA foreign_keys=ON")

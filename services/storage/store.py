@@ -68,7 +68,7 @@ class Store:
         self.close()
 
     def of_room(self, room: str, rooms: Sequence[str]) -> Self:
-        """Return this store with the active scene of one of the `rooms`; it is closed with this one."""
+        """Returns this store with the active scene of one of the `rooms`; it is closed with this one."""
         own = copy.copy(self)
         own.scenes = SceneStore(self._database, room, rooms)
         return own
@@ -83,7 +83,7 @@ class Store:
         return True
 
     def feed(self) -> Feed:
-        """Return a feed to and from the other processes that use this database; the caller closes it.
+        """Returns a feed to and from the other processes that use this database; the caller closes it.
 
         Who has one has the lists and the active scene at hand, if the database goes.
         """
@@ -106,7 +106,7 @@ class Store:
         return self.folder / "recordings"
 
     def close(self) -> None:
-        """Close the database, and let others replace the folder's contents."""
+        """Closes the database, and lets others replace the folder's contents."""
         self._opened.close()
 
 
@@ -122,5 +122,5 @@ def _open_database(folder: Path, address: str | None) -> Database:
 
 
 def default_folder() -> Path:
-    """Return the default data folder (XDG base directory specification)."""
+    """Returns the default data folder (XDG base directory specification)."""
     return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "deltalight"

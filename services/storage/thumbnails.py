@@ -32,7 +32,7 @@ Pixels = Float32[np.ndarray, "h w 4"]
 
 
 def draw_mesh(path: Path, out: str) -> Facts:
-    """Write a three-quarter view of a mesh as PNG on a transparent ground.
+    """Writes a three-quarter view of a mesh as PNG on a transparent ground.
 
     Raises:
         DeltalightError: the mesh cannot be loaded.
@@ -44,7 +44,7 @@ def draw_mesh(path: Path, out: str) -> Facts:
 
 
 def draw_map(path: Path, out: str) -> Facts:
-    """Write a latitude-longitude map as PNG, tone-mapped (Reinhard et al. 2002), in the middle of the picture.
+    """Writes a latitude-longitude map as PNG, tone-mapped (Reinhard et al. 2002), in the middle of the picture.
 
     Raises:
         DeltalightError: the map cannot be loaded.
@@ -80,7 +80,7 @@ class _Shot:
         self._caster = RayCaster(self._positions, self._triangles)
 
     def rays(self, size: int) -> Pixels:
-        """Cast size x size rays around the meshes; return premultiplied linear colour and coverage."""
+        """Casts size x size rays around the meshes; returns premultiplied linear colour and coverage."""
         used = self._positions[self._triangles.ravel()]
         seen = used[:, :2] / -used[:, 2:]
         middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
@@ -107,7 +107,7 @@ class _Shot:
         weights: Float32[np.ndarray, "n 3"],
         directions: Float32[np.ndarray, "n 3"],
     ) -> Float32[np.ndarray, "n 3"]:
-        """Return the radiance of Lambertian surfaces towards the camera; both sides of a triangle are lit."""
+        """Returns the radiance of Lambertian surfaces towards the camera; both sides of a triangle are lit."""
         normals = _mixed(mesh.normals, corners, weights) @ self._camera_from_file.T
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         normals *= np.where((normals * directions).sum(axis=1, keepdims=True) > 0, -1, 1)
@@ -128,7 +128,7 @@ _Z_FROM_Y = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
 
 
 def _camera_axes() -> Float32[np.ndarray, "3 3"]:
-    """Return the rotation from z-up axes to those of the camera: right, up, towards it."""
+    """Returns the rotation from z-up axes to those of the camera: right, up, towards it."""
     azimuth, elevation = np.radians([AZIMUTH_DEG, ELEVATION_DEG])
     back = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
@@ -149,7 +149,7 @@ def _texels(
     corners: Int[np.ndarray, "n 3"],
     weights: Float32[np.ndarray, "n 3"],
 ) -> Float32[np.ndarray, "n 3"]:
-    """Return the nearest colours of a texture, downsampled first if it is finer than the picture; 1 without one."""
+    """Returns the nearest colours of a texture, downsampled first if it is finer than the picture; 1 without one."""
     uv = mesh.uv_of(texture)
     if texture is None or uv is None:
         return np.ones((len(corners), 3), np.float32)
@@ -160,14 +160,14 @@ def _texels(
 
 
 def reduced(pixels: Pixels) -> Pixels:
-    """Average the rays of each pixel; colour is that of the covered part."""
+    """Averages the rays of each pixel; colour is that of the covered part."""
     mean = cv2.resize(pixels, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6)
     return np.asarray(mean)
 
 
 def write_picture(out: str, picture: Pixels) -> None:
-    """Write linear colour and coverage (1 = covered) as PNG in sRGB codes."""
+    """Writes linear colour and coverage (1 = covered) as PNG in sRGB codes."""
     coded = srgb_code(picture[..., :3])
     codes = np.rint(255 * np.dstack([coded[..., ::-1], picture[..., 3]])).astype(np.uint8)
     Path(out).write_bytes(cv2.imencode(".png", codes)[1].tobytes())

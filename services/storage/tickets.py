@@ -27,7 +27,7 @@ class TicketStore:
         self._database = database
 
     def add(self, secret: str, ticket: Ticket, life_s: float) -> None:
-        """Store a ticket until it is taken, or its life ends."""
+        """Stores a ticket until it is taken, or its life ends."""
         now_ns = time.time_ns()
         with self._database.writing(durable=False) as session:  # it need not survive a power cut
             session.execute(delete(TicketRow).where(TicketRow.ends_ns < now_ns))
@@ -42,7 +42,7 @@ class TicketStore:
             )
 
     def take(self, secret: str) -> Ticket | None:
-        """Remove a ticket and return it; None if it is unknown, used or has expired."""
+        """Removes a ticket and returns it; None if it is unknown, used or has expired."""
         with self._database.reading() as session:
             if session.get(TicketRow, _hash(secret)) is None:  # who guesses does not keep writers waiting
                 return None

@@ -24,7 +24,7 @@ class TimedConnection(psycopg.Connection[Any]):
     is_timed = True
 
     def wait(self, gen: Waiting[Answer], *args: Any, **kwargs: Any) -> Answer:  # noqa: ANN401 (psycopg's)
-        """Wait for an answer.
+        """Waits for an answer.
 
         Raises:
             psycopg.OperationalError: it did not come, and the connection is closed.
@@ -33,7 +33,7 @@ class TimedConnection(psycopg.Connection[Any]):
         return super().wait(limited, *args, **kwargs)
 
     def _limited(self, gen: Waiting[Answer], limit_s: float) -> Waiting[Answer]:
-        """Pass on what `gen` waits for; psycopg resumes it ten times a second, also while nothing comes."""
+        """Passes on what `gen` waits for; psycopg resumes it ten times a second, also while nothing comes."""
         ends_s = time.monotonic() + limit_s
         try:
             wanted = next(gen)

@@ -42,7 +42,7 @@ class TokenStore:
         self._database = database
 
     def create(self, name: str, role: Role) -> str:
-        """Create a token and return it; it cannot be shown again.
+        """Creates a token and returns it; it cannot be shown again.
 
         Raises:
             DeltalightError: the name is wrong or taken.
@@ -75,7 +75,7 @@ class TokenStore:
 
     @remembered
     def all(self) -> list[Token]:
-        """Return all tokens, in the order of their creation."""
+        """Returns all tokens, in the order of their creation."""
         with self._database.reading() as session:
             return [_token(row) for row in session.scalars(select(TokenRow).order_by(TokenRow.created_ns))]
 
@@ -87,7 +87,7 @@ class TokenStore:
             return session.scalars(select(func.count()).select_from(TokenRow)).one() == 0
 
     def revoke(self, name: str) -> None:
-        """Revoke a token; it is refused from the next request on.
+        """Revokes a token; it is refused from the next request on.
 
         Raises:
             NotFoundError: there is no token of this name.
@@ -103,7 +103,7 @@ class TokenStore:
         return self._row(token_id) is not None
 
     def verify(self, token: str) -> Token | None:
-        """Return the metadata of a token, None if it is not valid.
+        """Returns the metadata of a token, None if it is not valid.
 
         Raises:
             OutdatedTokenError: it is stored in the way of an earlier version.
@@ -134,7 +134,7 @@ def _hash(secret: str, salt: bytes) -> bytes:
 
 
 def role_named(stored: str) -> Role:
-    """Return the role that the database names."""
+    """Returns the role that the database names."""
     return "control" if stored == "control" else "view"
 
 

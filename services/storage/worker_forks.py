@@ -29,7 +29,7 @@ class WorkerForks:
         self._process: subprocess.Popen[bytes] | None = None
 
     def run(self, words: Sequence[str], timeout_s: float) -> str:
-        """Fork a worker with these arguments and return what it prints; what is left after a crash may be nothing.
+        """Forks a worker with these arguments and returns what it prints; what is left after a crash may be nothing.
 
         Raises:
             TimeoutError: it still runs. The worker ends itself.
@@ -66,7 +66,7 @@ class WorkerForks:
         return ours
 
     def close(self) -> None:
-        """End the process that forks; the next worker starts another."""
+        """Ends the process that forks; the next worker starts another."""
         if self._requests is not None:
             self._requests.close()
         if self._process is not None:

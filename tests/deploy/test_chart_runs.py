@@ -76,7 +76,7 @@ class Release:
         (folder / "ray" / "ray_token").write_text(secrets.token_hex(32))
 
     def start(self, name: str, address: str) -> None:
-        """Start the container of a pod at an address."""
+        """Starts the container of a pod at an address."""
         container = self._pods[name]["spec"]["containers"][0]
         command = [*container.get("command", ["deltalight"]), *container["args"]]
         environment = {

@@ -71,7 +71,7 @@ def _options() -> argparse.Namespace:
 
 
 def write_seeds(target: str, grown: Path) -> None:
-    """Write the first inputs and the corpus as files beside `grown`, which libFuzzer wants."""
+    """Writes the first inputs and the corpus as files beside `grown`, which libFuzzer wants."""
     folder = _seed_folder(grown)
     folder.mkdir(parents=True, exist_ok=True)
     for number, content in enumerate([*(data for name, data in seeds() if name == target), *corpus(target)]):
@@ -80,7 +80,7 @@ def write_seeds(target: str, grown: Path) -> None:
 
 
 def fuzzed(target: str, work: Path, plan: Plan) -> dict[str, Any]:
-    """Run until the time is up or enough was executed, again after each crash; return the figures.
+    """Runs until the time is up or enough was executed, again after each crash; returns the figures.
 
     The corpus grows in the target's folder in `work`.
     """
@@ -114,7 +114,7 @@ def fuzzed(target: str, work: Path, plan: Plan) -> dict[str, Any]:
 
 
 def _left(plan: Plan, passed_s: float, executions: int) -> str | None:
-    """Return libFuzzer's option for what is left to do; None if nothing is."""
+    """Returns libFuzzer's option for what is left to do; None if nothing is."""
     if plan.executions is None:
         left, option = round(60 * plan.minutes - passed_s), "-max_total_time"
     else:
@@ -144,7 +144,7 @@ def run_fuzzer(target: str, grown: Path, kept: Path, *options: str) -> tuple[int
 
 @cache
 def _parent() -> subprocess.Popen[str]:
-    """Start the process that forks fuzzers, which ends with this one: its standard input does."""
+    """Starts the process that forks fuzzers, which ends with this one: its standard input does."""
     parent = subprocess.Popen(
         [sys.executable, "-m", "tests.fuzz.child"],
         stdin=subprocess.PIPE,
@@ -157,7 +157,7 @@ def _parent() -> subprocess.Popen[str]:
 
 
 def told_figure(told: str, name: str) -> int:
-    """Return one of libFuzzer's closing figures or what the child told last, 0 if it is missing."""
+    """Returns one of libFuzzer's closing figures or what the child told last, 0 if it is missing."""
     found = re.findall(rf"stat::{name}:\s+(\d+)", told)
     return int(found[-1]) if found else 0
 

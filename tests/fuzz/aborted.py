@@ -25,7 +25,7 @@ PATIENCE_S = 120.0
 
 
 def main() -> None:
-    """Do it some times, and print a JSON line for each."""
+    """Does it some times, and prints a JSON line for each."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.aborted", description=__doc__)
     parser.add_argument("--rounds", type=int, default=6)
     options = parser.parse_args()
@@ -58,7 +58,7 @@ def aborted(station: Station, crowd: Crowd) -> dict[str, object]:
 
 @contextmanager
 def listening(port: int) -> Iterator[socket.socket]:
-    """Listen where the station expects another node."""
+    """Listens where the station expects another node."""
     with socket.create_server((ports.LOOPBACK, port)) as listener:
         listener.settimeout(1.0)
         yield listener

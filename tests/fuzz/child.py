@@ -20,7 +20,7 @@ SLOW_S = 1.0  # of processor time
 
 
 def main() -> None:
-    """Read jobs from stdin and print the exit code of each one's process, a line each, until stdin ends.
+    """Reads jobs from stdin and prints the exit code of each one's process, a line each, until stdin ends.
 
     A job is JSON: a target, libFuzzer's options and folders, and the file that takes what the process tells.
     """
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def _redirect(told: str) -> None:
-    """Leave the parent's pipes to the parent."""
+    """Leaves the parent's pipes to the parent."""
     with Path(os.devnull).open("r+") as nothing, Path(told).open("w") as file:
         os.dup2(nothing.fileno(), 0)
         os.dup2(nothing.fileno(), 1)

@@ -36,7 +36,7 @@ Say = Callable[[str], None]
 
 
 def main() -> None:
-    """Send them, and print the figures as a JSON line."""
+    """Sends them, and prints the figures as a JSON line."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.over_http", description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
@@ -46,12 +46,12 @@ def main() -> None:
 
 
 def say(line: str) -> None:
-    """Show how far it is."""
+    """Shows how far it is."""
     print(line, file=sys.stderr, flush=True)
 
 
 def requested(station: Station, minutes: float, seed: int, say: Say) -> dict[str, Any]:
-    """Send requests for so long; tell what was answered and what became of the processes and their memory (MB)."""
+    """Sends requests for so long; tells what was answered and what became of the processes and their memory (MB)."""
     with TemporaryDirectory(prefix="deltalight-fuzz-") as name:
         folder = Path(name)
         address = str(station.client.base_url).removesuffix("/api/v1/")
@@ -87,7 +87,7 @@ def requested(station: Station, minutes: float, seed: int, say: Say) -> dict[str
 
 
 def filled(client: httpx.Client, folder: Path) -> dict[str, Sequence[str | int]]:
-    """Put things of every kind into a station; return their ids by the parameter that takes them."""
+    """Puts things of every kind into a station; returns their ids by the parameter that takes them."""
 
     def made(path: str, **body: Any) -> dict[str, Any]:  # noqa: ANN401 - what httpx takes
         return dict(client.post(path, timeout=PATIENCE_S, **body).raise_for_status().json())
@@ -131,7 +131,7 @@ def _command(address: str, minutes: float, seed: int) -> list[str]:
 def _watched(
     running: subprocess.Popen[bytes], station: Station, before: dict[str, float], say: Say
 ) -> dict[str, float]:
-    """Return the peak memory of each process until the requests end."""
+    """Returns the peak memory of each process until the requests end."""
     peaks, began_s, tell_s = dict(before), time.monotonic(), 0.0
     while running.poll() is None:
         station.check()
@@ -145,7 +145,7 @@ def _watched(
 
 
 def _figures(report: dict[str, Any], events: Path) -> dict[str, Any]:
-    """Return what schemathesis's report and list of events say."""
+    """Returns what schemathesis's report and list of events say."""
     statuses, slowest_ms, slowest = Counter[str](), 0.0, ""
     for request, answer in _exchanges(events):
         statuses["none" if answer is None else str(answer["status_code"])] += 1
@@ -165,7 +165,7 @@ def _figures(report: dict[str, Any], events: Path) -> dict[str, Any]:
 
 
 def _exchanges(events: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any] | None]]:
-    """Yield each request with its answer, None if none came."""
+    """Yields each request with its answer, None if none came."""
     with events.open() as lines:  # hundreds of megabytes
         for line in lines:
             recorder = json.loads(line).get("ScenarioFinished", {}).get("recorder", {})

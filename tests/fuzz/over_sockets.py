@@ -32,7 +32,7 @@ SMALLEST_PAUSE_S = 0.05  # after each look: the receivers have their turn too
 
 
 def main() -> None:
-    """Send them, and print the figures as a JSON line."""
+    """Sends them, and prints the figures as a JSON line."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.over_sockets", description=__doc__)
     parser.add_argument("--messages", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
@@ -43,14 +43,14 @@ def main() -> None:
 
 @contextmanager
 def small_station(seed: int) -> Iterator[Station]:
-    """Run a station of profile `small`, whose first picture is there."""
+    """Runs a station of profile `small`, whose first picture is there."""
     with LoopThread("links") as thread, running_station(PROFILES["small"], thread, seed) as station:
         until_shown(station)
         yield station
 
 
 def attacked(station: Station, messages: int, dice: Random) -> dict[str, Any]:
-    """Send so many, and tell what became of the processes, their memory (MB), and the pictures meanwhile."""
+    """Sends so many, and tells what became of the processes, their memory (MB), and the pictures meanwhile."""
     vectors = [unframe_pieces(path.read_bytes()) for path in sorted(FOLDER.glob("*.bin"))]
     before, peaks, gaps = memory_mb(station), memory_mb(station), Gaps(station)
     began_s = time.monotonic()
@@ -99,7 +99,7 @@ class Gaps:
         self._client, self._shown, self._since_s = station.client, b"", time.monotonic()
 
     def look(self) -> None:
-        """Compare the picture with that of the last look."""
+        """Compares the picture with that of the last look."""
         shown = self._shown
         with suppress(httpx.TransportError):  # the web process has just died
             shown = self._client.get("/live.jpg").content
@@ -110,7 +110,7 @@ class Gaps:
 
 
 def until_shown(station: Station) -> None:
-    """Wait for the first picture."""
+    """Waits for the first picture."""
     deadline_s = time.monotonic() + START_S
     while time.monotonic() < deadline_s:
         station.check()
@@ -124,7 +124,7 @@ def until_shown(station: Station) -> None:
 
 
 def _asking(stack: ExitStack, endpoint: str) -> Callable[[Sequence[bytes]], bool]:
-    """Return what sends a request and tells whether an answer came."""
+    """Returns what sends a request and tells whether an answer came."""
     context = open_context()
     stack.callback(context.destroy, 0)
     socket = context.socket(zmq.DEALER)

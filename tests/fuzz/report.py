@@ -112,7 +112,7 @@ class _Job:
 
 
 def fuzz_all(sizes: Sizes, seed: int, out: Path, kept: Path = KEPT) -> FuzzReport:
-    """Run all parts one after the other; `out` is written after each. Files that fail are kept in `kept`."""
+    """Runs all parts one after the other; `out` is written after each. Files that fail are kept in `kept`."""
     parts, load_before = list[Part](), os.getloadavg()[0]
     with TemporaryDirectory(prefix="deltalight-fuzz-") as work:
         job = _Job(sizes, seed, Path(work), kept)

@@ -5,5 +5,5 @@ import schemathesis
 
 @schemathesis.serializer("application/sdp")
 def as_text(_context: object, value: object) -> bytes:
-    """Return any generated value as the body of a request."""
+    """Returns any generated value as the body of a request."""
     return value if isinstance(value, bytes) else str(value).encode(errors="replace")

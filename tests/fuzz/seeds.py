@@ -34,18 +34,18 @@ SMALL = 6000  # bytes of a seed at most
 
 
 def corpus(target: str) -> list[bytes]:
-    """Return the inputs that were found to cover most."""
+    """Returns the inputs that were found to cover most."""
     path = CORPUS / f"{target}.bin"
     return unframe_pieces(path.read_bytes()) if path.is_file() else []
 
 
 def kept(target: str) -> list[bytes]:
-    """Return the inputs that failed once."""
+    """Returns the inputs that failed once."""
     return [path.read_bytes() for path in sorted((KEPT / target).glob("*"))]
 
 
 def seeds() -> Iterator[tuple[str, bytes]]:
-    """Yield (target, input)."""
+    """Yields (target, input)."""
     for path in sorted(FOLDER.glob("*.bin")):
         if path.stat().st_size <= SMALL:
             yield "envelope", path.read_bytes()

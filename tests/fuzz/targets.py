@@ -60,12 +60,12 @@ _WORKSHOP = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.get
 
 
 def packed(pieces: Sequence[bytes]) -> bytes:
-    """Return the pieces as one input."""
+    """Returns the pieces as one input."""
     return b"".join(struct.pack("<I", len(piece)) + piece for piece in pieces)
 
 
 def pieces_of(data: bytes) -> list[bytes]:
-    """Return the pieces of an input; the last takes what is left."""
+    """Returns the pieces of an input; the last takes what is left."""
     pieces, place = [], 0
     while place + 4 <= len(data) and len(pieces) < MOST_PIECES:
         (length,) = struct.unpack_from("<I", data, place)
@@ -208,7 +208,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
 
 
 def attempt(target: str, data: bytes) -> bool:
-    """Run a target; return whether it took the input.
+    """Runs a target; returns whether it took the input.
 
     Raises:
         Exception: what the target must not raise, or a refusal of more than 2000 characters.
@@ -251,7 +251,7 @@ def _read_map(path: Path) -> None:
 
 
 def _recording(pieces: Sequence[bytes]) -> bytes:
-    """Return a finished recording; the first byte of a piece chooses its topic, the second its time."""
+    """Returns a finished recording; the first byte of a piece chooses its topic, the second its time."""
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()

@@ -36,13 +36,13 @@ class RawPeer:
 
     @classmethod
     def accepted(cls, listener: socket.socket, kind: str) -> "RawPeer":
-        """Wait for one that connects to us."""
+        """Waits for one that connects to us."""
         connected, _ = listener.accept()
         connected.settimeout(10)
         return cls(0, kind, connected)
 
     def wait_until_ready(self) -> "RawPeer":
-        """Wait for the other end's READY: what comes before it has sent that is a fault of the protocol."""
+        """Waits for the other end's READY: what comes before it has sent that is a fault of the protocol."""
         received = b""
         while b"READY" not in received:
             chunk = self.socket.recv(4096)
@@ -51,7 +51,7 @@ class RawPeer:
         return self
 
     def send_what_fits(self, data: bytes) -> None:
-        """Send until the other end takes no more for a moment."""
+        """Sends until the other end takes no more for a moment."""
         self.socket.settimeout(0.05)
         try:
             self.socket.sendall(data)
@@ -59,7 +59,7 @@ class RawPeer:
             return
 
     def hang_up(self) -> None:
-        """Reset the connection."""
+        """Resets the connection."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER_NONE)
         self.socket.close()
 

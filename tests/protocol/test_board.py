@@ -77,7 +77,7 @@ def test_rows_lie_below_the_first_and_ids_go_row_by_row() -> None:
 
 
 def printed(spec: BoardSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the board and return the picture and the outline's top-left corner in it."""
+    """Draws the board and returns the picture and the outline's top-left corner in it."""
     outline = spec.sheet_outline()
     size = (outline[2] - outline[0])[:2] * [1, -1] * PIXELS_PER_M
     margin = 40

@@ -43,7 +43,7 @@ class TwoHosts:
         return self._offset + round((self.true_ns - 50 * SECOND) * self._drift)
 
     def step(self, by_ns: int) -> None:
-        """Set the remote clock."""
+        """Sets the remote clock."""
         self._offset += by_ns
 
     def exchange(self) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from deltalight.protocol.source import open_source
 
 
 def link_lists(folder: Path, colors: list[Path], depths: list[Path]) -> None:
-    """List pictures that lie elsewhere, through links, one a tenth of a second."""
+    """Lists pictures that lie elsewhere, through links, one a tenth of a second."""
     for kind, paths in (("rgb", colors), ("depth", depths)):
         (folder / kind).mkdir(parents=True)
         for path in paths:

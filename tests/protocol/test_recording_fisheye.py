@@ -49,7 +49,7 @@ def frames(*fisheyes: FisheyePictures | None) -> list[SensorFrame]:
 
 
 def record(path: Path, made: list[SensorFrame], extrinsics: Extrinsics | None = None) -> list[int]:
-    """Write a recording; returns its size after each frame."""
+    """Writes a recording; returns its size after each frame."""
     ends = []
     with RecordingWriter(path, extrinsics=extrinsics) as writer:
         for frame in made:

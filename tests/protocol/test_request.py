@@ -283,7 +283,7 @@ def test_malformed_requests_get_a_sentence(opened: Callable[[Any], Any], pieces:
 
 @contextmanager
 def answering(answers: Callable[[list[bytes]], list[bytes]]) -> Iterator[str]:
-    """Yield the endpoint of a socket that answers as a server of another version would."""
+    """Yields the endpoint of a socket that answers as a server of another version would."""
     context = open_context()
     socket = context.socket(zmq.REP)
     port = socket.bind_to_random_port("tcp://127.0.0.1")

@@ -30,7 +30,7 @@ SETTLE_S = 30.0
 
 
 def connected(publisher: Publisher, receiver: Receiver, topic: str = "hello") -> None:
-    """Wait until a subscription has arrived at the publisher."""
+    """Waits until a subscription has arrived at the publisher."""
     deadline = time.monotonic() + SETTLE_S
     while time.monotonic() < deadline:
         publisher.send([topic.encode(), b""])

@@ -47,7 +47,7 @@ class Clock:
 
 
 def main() -> None:
-    """Print a line of JSON for each round."""
+    """Prints a line of JSON for each round."""
     parser = argparse.ArgumentParser(prog="python -m tests.render_server.method_rounds", description=__doc__)
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--keep", action="store_true", help="give no free memory back, as before")
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def rounds(folder: Path, gpu: GpuContext, count: int) -> None:
-    """Show all methods so often, in motion and at rest."""
+    """Shows all methods so often, in motion and at rest."""
     document, clock = everyday(Stage(folder)), Clock()
     document = document.replaced(output=document.output.replaced(width=WIDTH))
     renderer = SceneRenderer(gpu, document)
@@ -76,7 +76,7 @@ def rounds(folder: Path, gpu: GpuContext, count: int) -> None:
 
 
 def show(renderer: SceneRenderer, clock: Clock) -> None:
-    """Show a camera that moves, and then stands still."""
+    """Shows a camera that moves, and then stands still."""
     clock.after(PAUSE_NS)
     waits_ns = (MOTION_NS, MOTION_NS, *(REST_NS,) * FRAMES_AT_REST)
     for number, wait_ns in enumerate(waits_ns):
@@ -87,7 +87,7 @@ def show(renderer: SceneRenderer, clock: Clock) -> None:
 
 
 def held(gpu: GpuContext) -> dict[str, object]:
-    """Return memory (MB), GL objects and linked programs."""
+    """Returns memory (MB), GL objects and linked programs."""
     gc.collect()
     libc = ctypes.CDLL(None)
     libc.mallinfo2.restype = MallInfo

@@ -34,7 +34,7 @@ def dlpv(document: SceneDocument, **settings: object) -> SceneDocument:
 
 
 def fill(volume: LightVolume, radiance: float) -> None:
-    """Make light of the volume the same everywhere and from everywhere: E = pi radiance on any surface."""
+    """Makes light of the volume the same everywhere and from everywhere: E = pi radiance on any surface."""
     even = np.zeros((3, CELLS, CELLS, CELLS, 4), np.float32)
     even[..., 0] = 1.5 * radiance / CONSTANT
     volume.total.write(even.tobytes())

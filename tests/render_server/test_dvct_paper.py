@@ -70,7 +70,7 @@ def scene(
 
 
 def frame(exposure_scale: float = 1.0) -> ViewFrame:
-    """Look at the box from the front, a little from above; the whole picture has one code."""
+    """Looks at the box from the front, a little from above; the whole picture has one code."""
     matrix = np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]])
     eye = np.array([0.0, -1.0, 0.55])
     forward = (np.array([0, 0, 0.05]) - eye) / np.linalg.norm(np.array([0, 0, 0.05]) - eye)

@@ -70,14 +70,14 @@ class VoxelLab:
         self._cones = Kernel(gpu, Path(__file__).with_name("cones"))
 
     def place(self, voxel_edge: float) -> None:
-        """Replace the cube by one of other voxels."""
+        """Replaces the cube by one of other voxels."""
         self.placement = VolumePlacement((0.0, 0.0, 0.0), voxel_edge, self.placement.size)
         self._volume.place(self.placement)
 
     def voxelize(
         self, store: VoxelStore, mesh: GpuMesh, behind_m: float = 0.0, chosen: np.ndarray | None = None
     ) -> None:
-        """Fill the empty store with the mesh, or with its backs, or with the chosen triangles."""
+        """Fills the empty store with the mesh, or with its backs, or with the chosen triangles."""
         self._mesh.write(mesh)
         self._voxelize.run(store, [VoxelizedMesh(self._mesh, behind_m, chosen)], self._volume)
 

@@ -54,7 +54,7 @@ def tracker(detector: Counted) -> BoardTracker:
 
 @pytest.fixture
 def misses_px(camera: SyntheticCamera, tracker: BoardTracker) -> Callable[[Picture], float]:
-    """Return how far the tracker places a corner from where a detection of the same picture does, at most."""
+    """Returns how far the tracker places a corner from where a detection of the same picture does, at most."""
     assert camera.board is not None
     alone = BoardDetector(camera.board, camera.camera)
 
@@ -74,7 +74,7 @@ def noisy(picture: Picture, seed: int) -> Picture:
 
 
 def shifted(picture: Picture, x_px: float, y_px: float = 0.0) -> Picture:
-    """Return the picture moved by fractions of a pixel, exactly: by the Fourier transform."""
+    """Returns the picture moved by fractions of a pixel, exactly: by the Fourier transform."""
     rows, columns = (np.fft.fftfreq(size)[:, None] for size in picture.shape[:2])
     turn = np.exp(-2j * np.pi * (rows * y_px + columns.T * x_px))[..., None]
     moved = np.fft.ifft2(np.fft.fft2(picture, axes=(0, 1)) * turn, axes=(0, 1)).real
@@ -142,7 +142,7 @@ def test_corners_at_the_border_and_outside_do_not_count(size: tuple[int, int]) -
 
 
 def hands(still: Picture, corners: Float64[np.ndarray, "n 2"]) -> Iterator[Picture]:
-    """Yield the picture with a hand's disc over one marker, then without it."""
+    """Yields the picture with a hand's disc over one marker, then without it."""
     x, y = corners[:4].mean(axis=0).round().astype(int).tolist()
     for step in range(8):
         picture = noisy(still, step)

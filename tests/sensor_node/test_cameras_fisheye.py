@@ -87,7 +87,7 @@ class Fixed(Sensor):
 
 
 def newest(capture: FisheyeCapture, after: FisheyePictures | None = None) -> FisheyePictures:
-    """Wait for pictures that are newer than those given."""
+    """Waits for pictures that are newer than those given."""
     end = time.monotonic() + WAIT_S
     while (pictures := capture.newest()) is None or pictures is after:
         assert time.monotonic() < end, capture.state

@@ -34,7 +34,7 @@ class RenderServer:
         self.open()
 
     def open(self) -> None:
-        """Answer, again too."""
+        """Answers, again too."""
         self._replies = ReplyServer(ports.endpoint(self._port), self._execute)
 
     def _execute(self, request: object) -> dict[str, object]:

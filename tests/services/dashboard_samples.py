@@ -198,7 +198,7 @@ class Desk:
         page.set_default_timeout(PATIENCE_S * 1000)
 
     def open(self) -> None:
-        """Load the page and wait until it shows a picture of the newest revision."""
+        """Loads the page and waits until it shows a picture of the newest revision."""
         self.page.goto(f"http://{self.stack.address}/")
         self.shows_newest()
 
@@ -206,7 +206,7 @@ class Desk:
         return self.page.get_by_role(role, name=name, exact=True)  # type: ignore[arg-type]
 
     def until(self, condition: Callable[[], object], what: str) -> None:
-        """Wait for something; `what` says for what if it never comes."""
+        """Waits for something; `what` says for what if it never comes."""
         deadline_s = time.monotonic() + PATIENCE_S
         while not condition():
             if time.monotonic() > deadline_s:
@@ -214,7 +214,7 @@ class Desk:
             self.page.wait_for_timeout(50)
 
     def shows_newest(self) -> None:
-        """Wait until the page shows a picture of the scene as REST has it; changes may be on their way there."""
+        """Waits until the page shows a picture of the scene as REST has it; changes may be on their way there."""
         shown = self.page.locator(".status-strip dl div", has_text="Revision").locator("dd")
         self.until(
             lambda: shown.count() and shown.inner_text() == str(self.stack.scene()["revision"]),
@@ -291,7 +291,7 @@ class Desk:
         return outside
 
     def drop(self, name: str, content: bytes, place: tuple[float, float]) -> None:
-        """Drop a file on the picture."""
+        """Drops a file on the picture."""
         sent = {"name": name, "content": base64.b64encode(content).decode()}
         transfer = self.page.evaluate_handle(
             """({ name, content }) => {
@@ -307,12 +307,12 @@ class Desk:
             self.page.dispatch_event("#stage", kind, event)
 
     def photograph(self, name: str) -> None:
-        """Keep a picture of the page where pictures are wanted."""
+        """Keeps a picture of the page where pictures are wanted."""
         photograph(self.page, name)
 
 
 def photograph(page: Page, name: str) -> None:
-    """Keep a picture of a page where pictures are wanted."""
+    """Keeps a picture of a page where pictures are wanted."""
     if SCREENSHOTS:
         path = Path(SCREENSHOTS) / f"dashboard_{name}.jpg"
         page.screenshot(path=path, type="jpeg", quality=JPEG_QUALITY)

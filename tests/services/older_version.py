@@ -30,7 +30,7 @@ main()
 
 @contextmanager
 def running(*arguments: object, is_older: bool = False) -> Iterator[None]:
-    """Run a command of this version or the one before as a process."""
+    """Runs a command of this version or the one before as a process."""
     program = ["-c", OLDER] if is_older else ["-m", "deltalight.services.cli"]
     process = subprocess.Popen([sys.executable, *program, *map(str, arguments)], cwd=ROOT)
     try:

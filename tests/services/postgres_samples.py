@@ -66,7 +66,7 @@ class PostgresServer:
             time.sleep(0.05)
 
     def hang(self) -> None:
-        """Keep all connections and say nothing, until `go_on` or `stop`."""
+        """Keeps all connections and says nothing, until `go_on` or `stop`."""
         for process in self._processes():
             process.suspend()
 
@@ -82,7 +82,7 @@ class PostgresServer:
         return [first, *first.children()]
 
     def stop(self, *, at_once: bool = False) -> None:
-        """Cut all connections; `at_once` like a power cut, so that it recovers from its log at the next start."""
+        """Cuts all connections; `at_once` like a power cut, so that it recovers from its log at the next start."""
         self.go_on()
         process, self._process = self._process, None
         if process is not None:

@@ -79,11 +79,11 @@ class StandInPlacer:
             self._end(epoch)
 
     def report(self, room: str, *, shows: bool = True, slot: str | None = None) -> None:
-        """Have the render server of a room report."""
+        """Has the render server of a room report."""
         self.events.append(PlacementEvent(self.of(room, slot).epoch, "reported", shows=shows))
 
     def lose(self, room: str, *, slot: str | None = None, detail: str = "It broke.", **kind: bool) -> None:
-        """Have the render server of a room die."""
+        """Has the render server of a room die."""
         placement = self.of(room, slot)
         del self.placed[placement.slot]
         self._end(placement.epoch)
@@ -95,7 +95,7 @@ class StandInPlacer:
         return next(found)
 
     def report_all(self) -> None:
-        """Have all render servers report; other threads may place and release meanwhile."""
+        """Has all render servers report; other threads may place and release meanwhile."""
         epochs = [placement.epoch for placement in list(self.placed.values())]
         self.events += [PlacementEvent(epoch, "reported", shows=True) for epoch in epochs]
 
@@ -112,7 +112,7 @@ class NoDirectory:
 
 
 def running(keeper: RoomKeeper, placer: StandInPlacer, *names: str) -> None:
-    """Place rooms and have them report."""
+    """Places rooms and has them report."""
     keeper.poll()
     for name in names:
         placer.report(name)

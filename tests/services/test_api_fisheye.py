@@ -131,7 +131,7 @@ def parts() -> list[bytes]:
 
 
 def wait_for_light(live: LiveApi, publisher: Publisher, message: RadianceMessage) -> None:
-    """Send until the API shows the light of this node."""
+    """Sends until the API shows the light of this node."""
     for _ in range(600):
         publisher.send(encode(message, parts()))
         if live.client.get("/fisheye").json().get("node") == message.node:
@@ -159,7 +159,7 @@ def test_while_a_recording_is_shown_its_light_is_the_one_that_counts(live: LiveA
 
 
 def search(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
-    """Have cameras searched for by another program."""
+    """Has cameras searched for by another program."""
     monkeypatch.setattr(camera_finder, "COMMAND", (sys.executable, "-c", script))
 
 

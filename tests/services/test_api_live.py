@@ -55,7 +55,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
 
 
 def follow(socket: ClientConnection) -> None:
-    """Look until the connection ends."""
+    """Looks until the connection ends."""
     while True:
         socket.send("ack")
         read_frame(socket)

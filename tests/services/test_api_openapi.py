@@ -102,7 +102,7 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
 
 
 def fill(api: RunningApi) -> dict[str, Sequence[str | int]]:
-    """Put things of every kind into the store; gives their ids by the parameter that takes them."""
+    """Puts things of every kind into the store; gives their ids by the parameter that takes them."""
     assets = [upload(api.store, TETRAHEDRON + b"#%d" % n, f"t{n}.obj") for n in range(OF_EACH)]
     scenes = [api.store.scenes.create(SCENE).head.id for _ in range(OF_EACH)]
     api.client.post(f"/scenes/{scenes[0]}/activate").raise_for_status()

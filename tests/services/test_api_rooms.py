@@ -50,7 +50,7 @@ class House:
         return [order["scene"]["name"] for order in self.server(room).payloads("set_scene")]  # type: ignore[index]
 
     def replaced(self, room: str) -> None:
-        """Kill the room's render server and wait until the service talks to the next."""
+        """Kills the room's render server and waits until the service talks to the next."""
         self.placer.lose(room)
         running(self.keeper, self.placer)
         running(self.keeper, self.placer, room)

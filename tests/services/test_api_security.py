@@ -166,7 +166,7 @@ def test_elsewhere_names_that_only_resolve_to_this_host_are_refused(tmp_path: Pa
 
 
 def connect_as(raw: socket.socket, host: str, token: str) -> int | None:
-    """Open a WebSocket under a name; the status with which that is refused, None if it is not."""
+    """Opens a WebSocket under a name; the status with which that is refused, None if it is not."""
     try:
         with connect(f"ws://{host}/api/v1/events", sock=raw, additional_headers=bearer(token)):
             return None
@@ -190,7 +190,7 @@ def test_no_answer_carries_cross_origin_rights_or_cookies(open_api: RunningApi) 
 
 
 def ended(connection: socket.socket) -> bool:
-    """Wait until the service closes a connection."""
+    """Waits until the service closes a connection."""
     connection.settimeout(30)
     return connection.recv(1) == b""
 

@@ -84,7 +84,7 @@ class Station:
         self.wait_for(said)
 
     def kill(self) -> None:
-        """Kill the server, and wait until its spare has taken over and shows a picture."""
+        """Kills the server, and waits until its spare has taken over and shows a picture."""
         spare, now_ns = self.supervisor.spare_ids()[SERVER], time.time_ns()
         psutil.Process(self.supervisor.process_ids()[SERVER]).kill()
         self.wait_for(lambda: self.supervisor.process_ids()[SERVER] == spare)

@@ -94,7 +94,7 @@ class Senders:
         return [each for each in self.answers if each.status_code == 503]
 
     def close(self) -> None:
-        """Let each take its last answer."""
+        """Lets each take its last answer."""
         self._stop.set()
         for each in self._sending:
             each.result(180)

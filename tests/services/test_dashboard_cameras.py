@@ -39,7 +39,7 @@ def page(api: CameraApi, browser: Browser) -> Iterator[Page]:
 
 
 def wait_for_picture(page: Page, camera: str) -> None:
-    """Wait until the page shows a camera's picture."""
+    """Waits until the page shows a camera's picture."""
     page.wait_for_function(IS_SHADE, arg=[SHADES[camera], SHADE_TOLERANCE])
 
 

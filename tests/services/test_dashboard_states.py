@@ -78,7 +78,7 @@ def phone(stack: Stack, browser: Browser) -> Iterator[Desk]:
 
 
 def says(page: Desk, word: str) -> None:
-    """Wait until the top bar tells that of the picture."""
+    """Waits until the top bar tells that of the picture."""
     expect(page.page.locator(".live-state [role=status]")).to_have_text(word)
 
 

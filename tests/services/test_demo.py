@@ -109,7 +109,7 @@ def test_picture_returns_after_node_and_server_are_killed(tmp_path: Path) -> Non
 def wait_for_composite(
     supervisor: Supervisor, receiver: Receiver, *, after_ns: int, restarted: str | None = None
 ) -> None:
-    """Wait for a composite of a frame that was captured later, sent after the named process came back."""
+    """Waits for a composite of a frame that was captured later, sent after the named process came back."""
     deadline_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline_s:
         supervisor.poll()

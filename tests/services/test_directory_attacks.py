@@ -235,7 +235,7 @@ ORDERS = [
 
 
 def flooded(ask: Callable[[Random], int], keeper: RoomKeeper, placer: StandInPlacer) -> list[int]:
-    """Have callers ask at once, each some times, while the keeper goes on; return all statuses."""
+    """Has callers ask at once, each some times, while the keeper goes on; returns all statuses."""
     statuses: list[int] = []
 
     def call(seed: int) -> None:

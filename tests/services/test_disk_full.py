@@ -179,7 +179,7 @@ class Take:
         return next(figures for figures in map(json.loads, self.process.stdout) if condition(figures))
 
     def refused(self, reason: str) -> int:
-        """Wait until the disk refused frames, and see that the ones before can be read; how many these are."""
+        """Waits until the disk refused frames, and sees that the ones before can be read; how many these are."""
         figures = self.until(lambda figures: figures["unkept"] > 0)
         assert (
             f"a.mcap.active cannot grow ({reason}); its {figures['frames']} frames are kept"
@@ -193,7 +193,7 @@ class Take:
         subprocess.run([*inside, str(self._mounted)], check=True, timeout=PATIENCE_S)
 
     def end(self) -> tuple[int, dict[str, Any], list[str]]:
-        """Stop it; the exit code, the summary if there is one, and what it told of the disk that refuses."""
+        """Stops it; the exit code, the summary if there is one, and what it told of the disk that refuses."""
         self.recorder.send_signal(signal.SIGINT)
         code = self.process.wait(PATIENCE_S)
         assert self.process.stdout is not None
@@ -203,7 +203,7 @@ class Take:
         return code, json.loads(lines[-1]) if lines else {}, told
 
     def goes_on_to_its_end(self, before: int) -> None:
-        """See that it goes on by itself, and that at its end all frames are there that the disk did not refuse."""
+        """Sees that it goes on by itself, and that at its end all frames are there that the disk did not refuse."""
         assert "takes data again" in self.until(lambda figures: figures["frames"] > before + 20)["disk"]
         code, last, told = self.end()
         assert code == 0

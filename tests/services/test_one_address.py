@@ -202,7 +202,7 @@ def test_all_say_what_the_one_that_records_and_replays_does(one: Service) -> Non
 
 
 def _until_taken(one: Service, method: str, path: str, body: object = None) -> None:
-    """Repeat what one process alone does, until a connection reaches it."""
+    """Repeats what one process alone does, until a connection reaches it."""
     answers = [one.client.request(method, path, json=body) for _ in range(PROCESSES)]
     assert sum(each.is_success for each in answers) == 1, [each.text for each in answers]
 

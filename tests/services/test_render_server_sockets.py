@@ -238,7 +238,7 @@ def test_a_degraded_state_is_shown_logged_once_and_counted(tmp_path: Path) -> No
     ):
 
         def shown_when(state: str, own: dict[str, object] | None) -> dict[str, Any]:
-            """Send frames with that camera until the web process shows that state of the render server."""
+            """Sends frames with that camera until the web process shows that state of the render server."""
             deadline_s = time.monotonic() + PATIENCE_S
             while time.monotonic() < deadline_s:
                 number = next(numbers)

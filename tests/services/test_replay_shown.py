@@ -176,7 +176,7 @@ def test_it_goes_on_at_its_rate_and_around_or_stays_at_its_end(api: Api) -> None
 
 
 def set_to_work(api: Api, name: str) -> list[psutil.Process]:
-    """Let it show a recording and make another, called `name`; the processes that do so."""
+    """Lets it show a recording and makes another, called `name`; the processes that do so."""
     shown = api.client.put("/replay", json={"recording": "take"})
     assert shown.status_code == 200, shown.text
     api.client.post("/recordings", json={"name": name}).raise_for_status()

@@ -58,7 +58,7 @@ class Page:
         return room.get("state") == "running" and isinstance(since_s, float) and since_s < 1
 
     def rename(self, name: str) -> object:
-        """Change the scene; return the state of the change in the picture."""
+        """Changes the scene; returns the state of the change in the picture."""
         scene = self._client.get("/active-scene").json()["id"]
         return self._client.patch(f"/scenes/{scene}", json={"name": name}).json()["picture"]["state"]
 

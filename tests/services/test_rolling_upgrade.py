@@ -47,7 +47,7 @@ class Station:
         )
 
     def move(self, x_m: float) -> object:
-        """Move the object; return the state of its change in the picture."""
+        """Moves the object; returns the state of its change in the picture."""
         scene = self.client.get("/active-scene").json()
         item = scene["document"]["objects"][0]["id"]
         answer = self.client.patch(

@@ -54,7 +54,7 @@ def installation(hosts: Hosts, tmp_path_factory: pytest.TempPathFactory) -> Iter
 
 
 def arrange(hosts: Hosts, installation: Installation, *rooms: str) -> None:
-    """Bring it about that two hosts take rooms, that these rooms run there, and that the others are drained."""
+    """Brings it about that two hosts take rooms, that these rooms run there, and that the others are drained."""
     directory = installation.directory
     for host in {slot.host for slot in directory.rooms().slots if slot.drained}:
         directory.host_command("undrain-host", host)
@@ -89,7 +89,7 @@ def rendering(host: psutil.Process) -> list[psutil.Process]:
 
 
 def kill_host(hosts: Hosts, installation: Installation, room: str) -> float:
-    """Kill the raylet of a room's host; return the seconds until a viewer has a picture from another."""
+    """Kills the raylet of a room's host; returns the seconds until a viewer has a picture from another."""
     before, server = installation.epoch(room), installation.server(room)
     hosts.kill(host_of(installation, room))
     killed_s = time.monotonic()

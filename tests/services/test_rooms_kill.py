@@ -28,7 +28,7 @@ def installation(
 
 
 def arrange(installation: Installation) -> None:
-    """Bring it about that hall and door run, and that attic is drained."""
+    """Brings it about that hall and door run, and that attic is drained."""
     installation.directory.command("drain", "attic")
     for name in ("hall", "door"):
         installation.directory.command("start", name)
@@ -105,7 +105,7 @@ def test_twenty_kills_in_a_row_lose_no_room_and_leave_no_process(
 
 
 def kill_both(installation: Installation) -> float:
-    """Kill the render servers of two rooms at once; return the seconds until pictures of both come again."""
+    """Kills the render servers of two rooms at once; returns the seconds until pictures of both come again."""
     killed = {name: (installation.epoch(name), installation.server(name)) for name in ("hall", "door")}
     for _, server in killed.values():
         os.kill(server.pid, signal.SIGKILL)

@@ -104,7 +104,7 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 
 def show_until(out: StreamOut, is_enough: Callable[[], object]) -> None:
-    """Show pictures that move, ten a second, until there is enough."""
+    """Shows pictures that move, ten a second, until there is enough."""
     deadline_s, phase = time.monotonic() + PATIENCE_S, 0
     while not is_enough():
         assert time.monotonic() < deadline_s

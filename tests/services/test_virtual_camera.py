@@ -215,7 +215,7 @@ def test_a_room_is_shown_whichever_render_server_it_has(device: Path, tmp_path: 
     command = [sys.executable, "-c", WITH_KERNEL, "virtual-camera", *options]
 
     def wait_for(frame: SensorFrame) -> None:
-        """Wait until the last whole picture is this one."""
+        """Waits until the last whole picture is this one."""
         wanted, deadline_s = yuyv(frame.color), time.monotonic() + 60
         while True:
             data = device.read_bytes()

@@ -35,7 +35,7 @@ MATERIAL_SCENES: tuple[BenchmarkScene, ...] = (glass.SCENE,)
 
 
 def scene_named(name: str) -> BenchmarkScene:
-    """Return a scene.
+    """Returns a scene.
 
     Raises:
         DeltalightError: there is none; names the known ones and the nearest.

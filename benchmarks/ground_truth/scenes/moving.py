@@ -36,7 +36,7 @@ def _real(folder: MeshFolder) -> dict[str, Any]:
 
 
 def _camera(frame: int) -> Matrix:
-    """Return a pose some millimetres further per frame along an arc, rising slowly."""
+    """Returns a pose some millimetres further per frame along an arc, rising slowly."""
     angle = np.radians(-90 + SWING_DEG * frame)
     x_m, y_m = TARGET_M[0] + DISTANCE_M * np.cos(angle), TARGET_M[1] + DISTANCE_M * np.sin(angle)
     return looking((float(x_m), float(y_m), HEIGHT_M + 0.001 * frame), TARGET_M)

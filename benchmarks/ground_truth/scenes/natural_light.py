@@ -23,7 +23,7 @@ ZENITH, HORIZON, GROUND = (
 
 
 def _sky() -> Float32[np.ndarray, "256 512 3"]:
-    """Return a sky that is whitest at the horizon and around the sun, over grass.
+    """Returns a sky that is whitest at the horizon and around the sun, over grass.
 
     Rows from above, centre column +x.
     """

@@ -71,7 +71,7 @@ async def upload_asset(
 
 
 def announced(shared: Context, asset: Asset, response: Response, *, is_new: bool) -> AssetAnswer:
-    """Describe an asset that was kept; tell all listeners."""
+    """Describes an asset that was kept; tells all listeners."""
     shared.events.publish("asset", {"digest": asset.reference, "name": asset.names[0]})
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/api/v1/assets/{asset.reference}"

@@ -244,17 +244,17 @@ class _UnderWay:
         self._acknowledged = asyncio.Event()
 
     async def wait_for(self, viewer: Viewer) -> None:
-        """Wait until another one may be sent."""
+        """Waits until another one may be sent."""
         while self._count >= viewer.window:
             self._acknowledged.clear()
             await self._acknowledged.wait()
 
     def add(self) -> None:
-        """Count a message that is sent."""
+        """Counts a message that is sent."""
         self._count += 1
 
     def acknowledge(self) -> None:
-        """Count an acknowledgement.
+        """Counts an acknowledgement.
 
         Raises:
             ValueError: nothing is under way.
@@ -277,7 +277,7 @@ async def _send_frames(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) 
 
 
 async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay) -> None:
-    """Take acknowledgements, and what the viewer orders: `view NAME`, `camera NAME`, `codec NAME`.
+    """Takes acknowledgements, and what the viewer orders: `view NAME`, `camera NAME`, `codec NAME`.
 
     `view` alone is the scene's own, `camera` alone the first one.
     """
@@ -300,7 +300,7 @@ async def _take_messages(socket: WebSocket, viewer: Viewer, under_way: _UnderWay
 
 
 def _obey(viewer: Viewer, order: str) -> str:
-    """Show a viewer another view or camera, or in another codec; return why not, else nothing."""
+    """Shows a viewer another view or camera, or in another codec; returns why not, else nothing."""
     if order.startswith("view"):
         name = order.removeprefix("view").strip()
         if name and name not in VIEWS:
@@ -321,7 +321,7 @@ def _obey(viewer: Viewer, order: str) -> str:
 
 
 def _why_not(hub: LiveHub, camera: str | None) -> str:
-    """Return why a camera cannot be watched, in as many bytes as fit the close of a WebSocket; else nothing."""
+    """Returns why a camera cannot be watched, in as many bytes as fit the close of a WebSocket; else nothing."""
     try:
         hub.require(camera)
     except NotFoundError as fault:
@@ -330,7 +330,7 @@ def _why_not(hub: LiveHub, camera: str | None) -> str:
 
 
 async def _next_in(hub: LiveHub, view: ShownView, camera: str | None) -> bytes:
-    """Return a camera's next picture in a view.
+    """Returns a camera's next picture in a view.
 
     Raises:
         ProblemError: none came in time.
@@ -373,7 +373,7 @@ async def _send_events(socket: WebSocket, queue: EventQueue) -> None:
 
 
 async def _expect_nothing(socket: WebSocket) -> None:
-    """Wait for the end; clients must not send anything here."""
+    """Waits for the end; clients must not send anything here."""
     try:
         await socket.receive_text()
     except (WebSocketDisconnect, KeyError):

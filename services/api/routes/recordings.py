@@ -140,7 +140,7 @@ class RecordingAnswer(StrictModel):
 
     @classmethod
     def growing(cls, session: RecordingSession) -> Self:
-        """Describe a recording that grows."""
+        """Describes a recording that grows."""
         figures = session.figures or {}
         return cls(
             id=session.id,
@@ -162,7 +162,7 @@ class RecordingAnswer(StrictModel):
 
     @classmethod
     def stored(cls, recording: StoredRecording) -> Self:
-        """Describe a recording on the disk."""
+        """Describes a recording on the disk."""
         facts = recording.facts or {}
         return cls(
             id=recording.id,
@@ -187,7 +187,7 @@ class RecordingAnswer(StrictModel):
 
     @classmethod
     def ended(cls, recording: StoredRecording, session: RecordingSession) -> Self:
-        """Describe a recording that has just ended."""
+        """Describes a recording that has just ended."""
         stored, figures = cls.stored(recording), session.figures or {}
         told = {"detail": session.detail or stored.detail, "unkept": figures.get("unkept", 0)}
         return stored.model_copy(update=told)
@@ -398,14 +398,14 @@ def end_replay(shared: Shared) -> None:
 
 
 def replay_answer(position: Position | None) -> ReplayAnswer:
-    """Describe where a recording is that is shown; None = a live camera is."""
+    """Describes where a recording is that is shown; None = a live camera is."""
     return ReplayAnswer(recording=None) if position is None else ReplayAnswer(**vars(position))
 
 
 def recording_event(
     recordings: RecordingStore, session: RecordingSession, *, is_growing: bool
 ) -> dict[str, Any]:
-    """Return the body of the event about a recording while it grows, and at its end."""
+    """Returns the body of the event about a recording while it grows, and at its end."""
     if is_growing:
         return RecordingAnswer.growing(session).model_dump()
     try:
@@ -415,14 +415,14 @@ def recording_event(
 
 
 def _growing(shared: Context) -> dict[str, RecordingAnswer]:
-    """Return the recordings in progress by name: its own, and those of the web process that records."""
+    """Returns the recordings in progress by name: its own, and those of the web process that records."""
     heard = [_as_heard(RecordingAnswer, body) for body in shared.heard.growing()]
     own = [RecordingAnswer.growing(session) for session in shared.recording_sessions.running()]
     return {each.id: each for each in (*heard, *own) if each is not None}
 
 
 def _as_heard(model: type[Heard], body: Mapping[str, Any]) -> Heard | None:
-    """Return the answer in another web process's event; None for one of a version with other fields."""
+    """Returns the answer in another web process's event; None for one of a version with other fields."""
     try:
         return model.model_validate(body)
     except ValidationError:
@@ -430,7 +430,7 @@ def _as_heard(model: type[Heard], body: Mapping[str, Any]) -> Heard | None:
 
 
 def require_at_rest(shared: Context, recording_id: str) -> None:
-    """Refuse what needs a finished recording.
+    """Refuses what needs a finished recording.
 
     Raises:
         ConflictError: it is still growing.

@@ -191,7 +191,7 @@ def _commanded(rooms: Rooms, op: str, room: str, slot: str | None = None) -> Roo
 
 
 def _ordered(rooms: Rooms, order: Callable[[DirectoryClient], RoomList]) -> RoomList:
-    """Give an order to the directory, and return all rooms after it."""
+    """Gives an order to the directory, and returns all rooms after it."""
     if rooms.directory is None:
         raise ConflictError(
             "this installation has a single room, which stays where it is; for several, use `deltalight up --rooms`."

@@ -68,13 +68,13 @@ LONGEST_WHAT = 200  # characters of what a revision says of itself
 
 
 def _named(body: object, key: str, otherwise: str) -> str:
-    """Return a name from a body that is not validated yet."""
+    """Returns a name from a body that is not validated yet."""
     name = body.get(key) if isinstance(body, Mapping) else None
     return name[: LONGEST_WHAT // 2] if isinstance(name, str) and name else otherwise
 
 
 def _changed(name: str, patch: Mapping[str, Any]) -> str:
-    """Say for people what a patch changes, such as `knot: pose changed`."""
+    """Says for people what a patch changes, such as `knot: pose changed`."""
     keys = [key.replace("_", " ") for key in sorted(patch)]
     place = f"{name}: " if name else ""
     return f"{place}{', '.join(keys) or 'nothing'} changed"[:LONGEST_WHAT]
@@ -342,7 +342,7 @@ def delete_light(
 
 
 def _add_part(part: str, model: Any, body: Any, text: str) -> None:  # noqa: ANN401 - types for the description
-    """Add the three routes of a part; `model` and `body` describe what is read and sent."""
+    """Adds the three routes of a part; `model` and `body` describe what is read and sent."""
 
     def get(shared: Shared, scene_id: SceneId, response: Response) -> object:
         document = shared.store.scenes.get(scene_id).document

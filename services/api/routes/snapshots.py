@@ -191,7 +191,7 @@ def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) ->
 
 
 def _before_and_after(shared: Context, snapshot_id: str) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Return the camera's picture and the first composite."""
+    """Returns the camera's picture and the first composite."""
     files = [(each.view, each.file) for each in shared.snapshots.get(snapshot_id).pictures if each.file]
     found = dict(reversed(files))
     for view in BEFORE_AFTER:

@@ -11,7 +11,7 @@ from deltalight.services.storage.store import Store
 
 
 def write_openapi(target: Path) -> None:
-    """Write the document; the application is created over an empty store and never started."""
+    """Writes the document; the application is created over an empty store and never started."""
     with tempfile.TemporaryDirectory() as folder, Store(Path(folder)) as store:
         document = create_app(ApiSettings(), store).openapi()
     target.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n")

@@ -10,7 +10,7 @@ down_revision = None
 
 
 def upgrade() -> None:
-    """Make the tables of the first version."""
+    """Makes the tables of the first version."""
     op.create_table(
         "scenes",
         sa.Column("id", sa.String, primary_key=True),

@@ -8,5 +8,5 @@ down_revision = "1"
 
 
 def upgrade() -> None:
-    """Add the gesture of a revision."""
+    """Adds the gesture of a revision."""
     op.add_column("revisions", sa.Column("gesture", sa.String))

@@ -10,7 +10,7 @@ down_revision = "2"
 
 
 def upgrade() -> None:
-    """Make the table of tickets."""
+    """Makes the table of tickets."""
     op.create_table(
         "tickets",
         sa.Column("hash", sa.LargeBinary, primary_key=True),
