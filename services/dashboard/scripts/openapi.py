@@ -1,4 +1,4 @@
-"""Write the OpenAPI document of the REST API to a file: `python scripts/openapi.py FILE`."""
+"""Writes the OpenAPI document of the REST API to a file: `python scripts/openapi.py FILE`."""
 
 import json
 import sys
