@@ -340,11 +340,11 @@ def test_the_command_line_makes_tokens_in_the_database(
 
 
 def test_texts_that_postgresql_cannot_keep_are_refused(postgres: PostgresServer, tmp_path: Path) -> None:
-    with (
-        Store(tmp_path, database=postgres.fresh_database()) as store,
-        pytest.raises(DeltalightError, match="remove NUL characters"),
-    ):
-        store.scenes.create({"name": "a\0b"})
+    with Store(tmp_path, database=postgres.fresh_database()) as store:
+        with pytest.raises(DeltalightError, match="must not hold a NUL character"):
+            store.scenes.create({"name": "a\0b"})
+        with pytest.raises(DeltalightError, match="remove NUL characters"):
+            store.scenes.get("a\0b")
 
 
 @pytest.fixture
