@@ -15,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from cv2.utils import logging as logs
 from jaxtyping import UInt8
 
 from deltalight.protocol.codecs import decode_color
@@ -33,6 +32,7 @@ SHEET_COLUMNS = 5
 SHEET_WIDTH = 256
 VIDEO_CODEC = "mp4v"  # in every OpenCV wheel, which contains FFmpeg
 FALLBACK_RATE = 10.0
+LOG_LEVEL_ERROR = 2  # of OpenCV
 VIDEO_RATES = (1.0, 60.0)  # frames a second; encoders refuse that of pictures a millisecond apart
 
 
@@ -161,11 +161,17 @@ class CompositeCollector:
 @contextmanager
 def _no_warnings() -> Iterator[None]:
     """Keeps OpenCV from warning of each picture that the disk refuses."""
-    before = logs.setLogLevel(logs.LOG_LEVEL_ERROR)
+    before = _set_log_level(LOG_LEVEL_ERROR)
     try:
         yield
     finally:
-        logs.setLogLevel(before)
+        _set_log_level(before)
+
+
+def _set_log_level(level: int) -> int:
+    """Returns the level of before; OpenCV 5 has the function in a module of its own."""
+    setting = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    return int(setting(level))
 
 
 def _is_whole(path: Path) -> bool:

@@ -121,7 +121,7 @@ def test_a_view_that_there_is_not_ends_the_connection(live: LiveApi, query: str,
             socket.send(order)
         with pytest.raises(websockets.ConnectionClosed, match="no such view; ask for one of composite, "):
             follow(socket)
-    assert socket.close_code == 1008
+    assert socket.protocol.close_code == 1008
 
 
 def test_a_composite_without_a_camera_is_refused() -> None:
@@ -242,8 +242,8 @@ def test_who_changes_view_or_codec_all_the_time_is_closed(live: LiveApi, orders:
                 socket.send(order)
         while True:
             socket.recv(timeout=PATIENCE_S)
-    assert socket.close_code == 1008
-    assert "less often" in str(socket.close_reason)
+    assert socket.protocol.close_code == 1008
+    assert "less often" in str(socket.protocol.close_reason)
 
 
 def test_mjpeg_streams_pictures_and_live_jpg_is_the_newest(live: LiveApi) -> None:
