@@ -87,6 +87,8 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
         limit = beyond_limits(error)
         if limit is not None:
             raise DeltalightError(f"{name} {limit}.") from error
+        if isinstance(error, _DoubledKeyError):
+            raise DeltalightError(f"{name}: {error}; remove one of them.") from error
         detail = " ".join(str(error).split())[:160]
         raise DeltalightError(f"{name} is not valid {kind} ({detail}); correct it there.") from error
     if not isinstance(data, dict):
@@ -105,11 +107,15 @@ def beyond_limits(error: ValueError | RecursionError) -> str | None:
     return None
 
 
+class _DoubledKeyError(ValueError):
+    """An object of JSON has a key twice, which its grammar allows."""
+
+
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         ((doubled, _),) = Counter(key for key, _ in pairs).most_common(1)
-        raise ValueError(f"`{doubled[:LONGEST_WORD]}` appears twice")
+        raise _DoubledKeyError(f"`{doubled[:LONGEST_WORD]}` appears twice")
     return found
 
 

@@ -240,7 +240,7 @@ def test_files_that_cannot_be_used(tmp_path: Path, name: str, text: str, message
 def test_a_key_that_comes_twice_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "scene.json"
     path.write_text('{"output": {"width": 80, "height": 60, "width": 96}}')
-    with pytest.raises(DeltalightError, match=r"scene\.json is not valid JSON \(`width` appears twice\)"):
+    with pytest.raises(DeltalightError, match=r"scene\.json: `width` appears twice; remove one of them"):
         load_scene(path)
 
 
