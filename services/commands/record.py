@@ -59,7 +59,7 @@ def record(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Record every raw frame of a node until Ctrl-C, or for --duration or --frames."""
+    """Record every raw frame of a node, or of that of --room, until Ctrl-C, or for --duration or --frames."""
     from rich.console import Console
 
     from deltalight.protocol.calibration import load_extrinsics_yaml
