@@ -5,6 +5,7 @@ real scene is neither voxelised nor lit. It is written as a plugin's method is (
 measuring process only: no scene document may name it.
 """
 
+from functools import partial
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Literal
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from deltalight.render_server.graph import Graph, Resource
     from deltalight.render_server.lights.lights import LightSet
     from deltalight.render_server.methods.method import Setup
-    from deltalight.render_server.methods.surface_shading import Layers
+    from deltalight.render_server.methods.surface_shading import Layers, SurfaceShading
     from deltalight.render_server.passes.cones import ConeFields, LowResGrid
     from deltalight.render_server.passes.lights import LightBuffers
 
@@ -50,37 +51,39 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
     options = surface_shading.ShadingOptions()
     shading = surface_shading.SurfaceShading(g.gpu, size, setup.resolved, buffers, direct, options)
 
-    def place(lights: "LightSet") -> "LightBuffers":
-        """Gives the lamps to the shaders; without points to shine on they get no shadow maps."""
-        nowhere = np.zeros((0, 3))
-        buffers.set_environment(lights.environment)
-        buffers.place(list(lights.lights), nowhere, nowhere, nowhere)
-        return buffers
-
-    def fill(lights: "LightSet") -> "ConeFields":
-        """Writes the mean of the environment in place of what cones gather."""
-        width, height = shading.grid.size
-        even = np.ones((height, width, 4), np.float16)
-        even[..., :3] = lights.environment.mean(axis=(0, 1))
-        fields = shading.cones
-        for radiance in (fields.specular_mu, fields.specular_rho, fields.virtual_specular):
-            radiance.write(even)
-        even[..., :3] *= np.pi
-        for irradiance in (fields.mu, fields.rho, fields.virtual):
-            irradiance.write(even)
-        return fields
-
     def gather(_scene: "Resource[Bindings]", _grid: "Resource[LowResGrid]") -> "Resource[ConeFields]":
-        return g.stage("even light", fill, s.lights)
+        return g.stage("even light", partial(_even_light, shading), s.lights)
 
     g.own(buffers)
-    lamps = g.stage("lamps", place, s.lights)
+    lamps = g.stage("lamps", partial(_place_lamps, buffers), s.lights)
     volume = PlacedVolume(g.gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, LEAST.volume_size))
     placed = g.value("volume", lambda _: volume, s.surfaces)
     g.own(volume)
     lit = LitScene(buffers, lamps, lamps, lamps)
     own = surface_shading.MethodStages(placed, gather, light_directly=lambda *_: direct)
     return surface_shading.shading_stages(g, s, shading, lit, own)
+
+
+def _place_lamps(buffers: "LightBuffers", lights: "LightSet") -> "LightBuffers":
+    """Gives the lamps to the shaders; without points to shine on they get no shadow maps."""
+    nowhere = np.zeros((0, 3))
+    buffers.set_environment(lights.environment)
+    buffers.place(list(lights.lights), nowhere, nowhere, nowhere)
+    return buffers
+
+
+def _even_light(shading: "SurfaceShading", lights: "LightSet") -> "ConeFields":
+    """Writes the mean of the environment in place of what cones gather."""
+    width, height = shading.grid.size
+    even = np.ones((height, width, 4), np.float16)
+    even[..., :3] = lights.environment.mean(axis=(0, 1))
+    fields = shading.cones
+    for radiance in (fields.specular_mu, fields.specular_rho, fields.virtual_specular):
+        radiance.write(even)
+    even[..., :3] *= np.pi
+    for irradiance in (fields.mu, fields.rho, fields.virtual):
+        irradiance.write(even)
+    return fields
 
 
 def _resolve(_settings: RasterMethod, _defaults: ResolvedSettings) -> ResolvedSettings:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Discriminator, Tag
 
+from deltalight.protocol.method_names import METHODS, split_short_name
 from deltalight.protocol.plugins import LoadedPlugins, Plugin, installed_plugins, load_plugins
 from deltalight.protocol.scene_method import BUILT_IN_METHODS, DEFAULT_METHOD, MethodSettings
 
@@ -58,10 +59,19 @@ def _name(value: Any) -> Any:  # noqa: ANN401 - whatever the document holds
 
 def _refuse_faulty(value: Any) -> Any:  # noqa: ANN401 - as above
     name = _name(value)
-    fault = PLUGINS.fault(name) if isinstance(name, str) and name not in SETTINGS else None
-    if fault is not None:
-        raise ValueError(fault)
+    if isinstance(name, str) and name not in SETTINGS:
+        fault = PLUGINS.fault(name) or _short_name_fault(name)
+        if fault is not None:
+            raise ValueError(fault)
     return value
+
+
+def _short_name_fault(name: str) -> str | None:
+    """Says how a scene document writes what command lines call by a short name; None if `name` is none of those."""
+    if name not in METHODS:
+        return None
+    method, operator = split_short_name(name)
+    return f"`{name}` is a short name for command lines; here write {{name: {method}, operator: {operator}}}"
 
 
 if TYPE_CHECKING:

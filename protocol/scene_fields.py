@@ -1,9 +1,11 @@
 """Field types that the parts of the scene document share."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, StringConstraints
+
+T = TypeVar("T")
 
 # How a map of radiance is cut into lights, in scenes, settings of nodes and messages alike.
 LightCount = Annotated[int, Field(ge=1, le=16)]
@@ -35,14 +37,18 @@ def _unit_quaternion(values: tuple[float, float, float, float]) -> tuple[float, 
     return w, x, y, z
 
 
-def _without_nul(text: str) -> str:
-    """Refuses what no text in PostgreSQL can hold, and no file name."""
-    if "\0" in text:
+def without_nul(value: T) -> T:
+    """Refuses what no text in PostgreSQL can hold, and no file name.
+
+    Raises:
+        ValueError: the value is a text with a NUL character.
+    """
+    if isinstance(value, str) and "\0" in value:
         raise ValueError("must not hold a NUL character; leave it out")
-    return text
+    return value
 
 
-Text = Annotated[str, AfterValidator(_without_nul)]
+Text = Annotated[str, AfterValidator(without_nul)]
 Coordinate = Annotated[float, Field(gt=-1e4, lt=1e4)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9)]

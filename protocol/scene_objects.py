@@ -21,6 +21,7 @@ from deltalight.protocol.scene_fields import (
     Quaternion,
     Radiance,
     Text,
+    without_nul,
 )
 
 SheetEdge = Annotated[float, Field(gt=0, le=100)]
@@ -117,9 +118,9 @@ AnyMaterial = Annotated[
 class Animation(StrictModel):
     """Plays a clip of the asset; what it shows follows from a frame's capture time alone."""
 
-    clip: Annotated[int, Field(ge=0)] | Annotated[str, Field(min_length=1)] | None = Field(
-        default=None, description="Name or number (from 0) of the asset's clip; null = the first."
-    )
+    clip: Annotated[
+        Annotated[int, Field(ge=0)] | Annotated[str, Field(min_length=1)] | None, AfterValidator(without_nul)
+    ] = Field(default=None, description="Name or number (from 0) of the asset's clip; null = the first.")
     speed: float = Field(
         default=1.0,
         ge=-100,
@@ -272,7 +273,7 @@ class Region(StrictModel):
     sheet: SheetRegion | None = Field(
         default=None, description="A diffuse sheet on the board's plane; it lies on every declared surface."
     )
-    material: str | None = Field(
+    material: Text | None = Field(
         default=None, min_length=1, description="Name of a material of the given model."
     )
 

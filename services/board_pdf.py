@@ -58,10 +58,13 @@ def choose_page(board: BoardSpec, paper: str) -> Page:
 
 
 def margins_m(board: BoardSpec, page: Page) -> tuple[float, float, float, float]:
-    """Returns the paper left of, above, right of and below the printed board, in metres (BoardSpec.margins_m)."""
+    """Returns the paper left of, above, right of and below the printed board, in metres (BoardSpec.margins_m).
+
+    In whole micrometres, so that board.yaml shows no digits that nobody measures.
+    """
     width, height = _board_mm(board)
-    left, top, right, bottom = _margins_mm(width, height, page)
-    return left / 1e3, top / 1e3, right / 1e3, bottom / 1e3
+    left, top, right, bottom = (round(margin / 1e3, 6) for margin in _margins_mm(width, height, page))
+    return left, top, right, bottom
 
 
 def _margins_mm(width: float, height: float, page: Page) -> tuple[float, float, float, float]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from zeroconf import ServiceInfo, ServiceStateChange, Zeroconf
 
 # Answers come within 0.12 s (RFC 6762, section 6); the first question is repeated after one second.
-PATIENCE_S = 2.5
+LISTEN_S = 2.5
 ANSWER_MS = 1000
 ONLY_NODE = "auto"
 
@@ -60,13 +60,13 @@ class FoundNode:
 
 
 def find_nodes(
-    *, name: str | None = None, patience_s: float = PATIENCE_S, interfaces: Sequence[str] | None = None
+    *, name: str | None = None, listen_s: float = LISTEN_S, interfaces: Sequence[str] | None = None
 ) -> list[FoundNode]:
     """Returns the nodes that announce themselves, by name.
 
     Args:
         name: stop as soon as this one is found; None = wait for all.
-        patience_s: how long to listen.
+        listen_s: how long to listen.
         interfaces: addresses of this host to listen on; None = all but loopback.
 
     Raises:
@@ -97,7 +97,7 @@ def find_nodes(
         ) from error
     try:
         ServiceBrowser(zeroconf, SERVICE_TYPE, handlers=[changed])
-        is_found.wait(patience_s)
+        is_found.wait(listen_s)
     finally:
         zeroconf.close()
     return sorted(found.values(), key=lambda node: (node.name, node.address))

@@ -104,6 +104,10 @@ def appearing(path: Path) -> Iterator[Path]:
         require_absent(path)
         temporary.rename(path)
     except OSError as fault:
+        if isinstance(fault, FileNotFoundError) and not path.parent.is_dir():
+            raise DeltalightError(
+                f"the folder {path.parent} does not exist; create it or choose another name."
+            ) from fault
         raise DeltalightError(
             f"{path} cannot be written ({fault.strerror}); free some space or choose another name."
         ) from fault

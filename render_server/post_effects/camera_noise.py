@@ -9,7 +9,6 @@ of neighbours is 2 k / (1 + 2 k^2).
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import cv2
 import numpy as np
@@ -49,16 +48,6 @@ class NoiseModel:
 
     variances: Float64[np.ndarray, "k 3"]
     correlation: tuple[float, float]
-
-    @classmethod
-    def of_line(
-        cls,
-        read: Float64[np.ndarray, " 3"],
-        shot: Float64[np.ndarray, " 3"],
-        correlation: tuple[float, float],
-    ) -> Self:
-        """Returns the noise of variance read + shot I."""
-        return cls(read + shot * LEVELS[:, None], correlation)
 
     def variance(self, intensity: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         """Returns the variance at linear intensities, R G B."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32
+from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
 from deltalight.protocol.board import BoardSpec
@@ -73,40 +73,6 @@ class SurfaceTable:
         one, other = edge * rows[:, 4, 3:], np.cross(normal, edge) * rows[:, 0, 3:]
         middle = rows[:, None, 3, :3]
         return np.asarray(middle + np.stack([-one - other, one - other, one + other, other - one], axis=1))
-
-    def lookup(
-        self, points: Float[np.ndarray, "k 3"], materials: Int32[np.ndarray, " k"] | None = None
-    ) -> Int32[np.ndarray, " k"]:
-        """Returns the row of each world point's surface, -1 for diffuse (reference for the shaders, without noise).
-
-        `materials` are the material indices of points on a given model.
-        """
-        entry = np.full(len(points), -1, np.int32)
-        for index in reversed(range(len(self.packed))):
-            is_diffuse = self.packed[index, 3, 3] == SHEET
-            entry[_inside(self.packed[index], points, materials)] = -1 if is_diffuse else index
-        return entry
-
-
-def _inside(
-    row: Float32[np.ndarray, "5 4"],
-    points: Float[np.ndarray, "k 3"],
-    materials: Int32[np.ndarray, " k"] | None,
-) -> Bool[np.ndarray, " k"]:
-    first, second = row[3], row[4]
-    if first[3] == PLANE:
-        inside = np.abs((points - first[:3]) @ second[:3]) <= second[3]
-    elif first[3] == BOX:
-        inside = short_axis.all_of((points >= first[:3]) & (points <= second[:3]))
-    elif first[3] == SHEET:
-        normal, edge = row[0, :3], second[:3]
-        along = np.abs((points - first[:3]) @ np.array([edge, np.cross(normal, edge), normal]).T)
-        inside = short_axis.all_of(along <= np.array([second[3], row[0, 3], row[1, 1]]))
-    elif materials is None:
-        inside = np.zeros(len(points), bool)
-    else:
-        inside = (materials == first[0]) & (first[0] >= 0)
-    return np.asarray(inside)
 
 
 def build_surface_table(

@@ -27,11 +27,6 @@ class TrackedCamera(AccompaniedCamera):
         super().__init__(camera, self._tracker)
 
     @property
-    def tracking_port(self) -> int:
-        """UDP port at which poses are received."""
-        return self._tracker.port
-
-    @property
     def state(self) -> StreamState | None:
         """The camera's state; while that is live, what is wrong with the tracker."""
         state, remark = self._camera.state, self._tracker.remark(time.time_ns())

@@ -33,7 +33,9 @@ def record(
     ],
     subscribe: NodeStreams = None,
     node: NodeName = None,
-    name: Annotated[str | None, typer.Option(help="Name of the node, if several publish there.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the node, if several publish there or the room has several.")
+    ] = None,
     scene: Annotated[Path | None, typer.Option(help="Scene document to attach.")] = None,
     control: Annotated[
         str | None, typer.Option(help="Control endpoint of the render server whose scene is attached.")
@@ -57,16 +59,20 @@ def record(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Record every raw frame of a node until Ctrl-C, or for --duration or --frames."""
+    """Record every raw frame of a node, or of that of --room, until Ctrl-C, or for --duration or --frames."""
     from rich.console import Console
 
     from deltalight.protocol.calibration import load_extrinsics_yaml
     from deltalight.protocol.keys import KeySettings
     from deltalight.services.recorder import Recorder, RecordJob
+    from deltalight.services.rooms.follower import streams_of_room
     from deltalight.services.settings import load_configuration
 
     settings = load_configuration(config_file).section("keys", KeySettings)
-    places = node_endpoints(subscribe, node, settings)
+    if rooms is None or room is None or subscribe or node is not None:
+        places = node_endpoints(subscribe, node, settings)
+    else:
+        places = [streams_of_room(rooms, room, name, settings.load([rooms]))]
     keys = settings.load([*places, *(each for each in (control, composites, rooms) if each is not None)])
     job = RecordJob(
         out,

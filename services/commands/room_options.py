@@ -15,9 +15,7 @@ if TYPE_CHECKING:
 
 Rooms = Annotated[
     str | None,
-    typer.Option(
-        help="Directory of rooms (`up --rooms`), such as tcp://127.0.0.1:5604, to use the relit pictures of --room."
-    ),
+    typer.Option(help="Directory of rooms (`up --rooms`) that has --room, such as tcp://127.0.0.1:5604."),
 ]
 Room = Annotated[
     str | None,

@@ -12,7 +12,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.message_fields import as_sentence
 from deltalight.services.rooms.directory import DirectoryClient
-from deltalight.services.rooms.status import RoomEndpoints, RoomList
+from deltalight.services.rooms.status import RoomEndpoints, RoomList, RoomStatus
 
 POLL_INTERVAL_S = 0.2
 
@@ -129,13 +129,34 @@ def following(
     with closing(client):
         follower = RoomFollower(client, follow)
         follower.look()
-        names = [each.name for each in follower.newest.rooms]
-        if room not in names:
-            known = nearest(room, names) or ", ".join(names) or "none"
-            raise DeltalightError(f"there is no room {room[:80]}; did you mean {known}?")
+        _find(follower.newest, room)
         follower.start()
         try:
             yield
         finally:
             follower.close()
             use(None)
+
+
+def streams_of_room(directory: str, room: str, node: str | None, keys: Keys | None) -> str:
+    """Returns the endpoint of a room's node of this name, None = its first.
+
+    Raises:
+        DeltalightError: the directory does not answer, or has no such room, or the room no such node.
+    """
+    with closing(DirectoryClient(directory, keys)) as client:
+        nodes = _find(client.rooms(), room).nodes
+    found = next((each for each in nodes if node in (None, each.name)), None)
+    if found is None:
+        known = ", ".join(each.name for each in nodes)
+        raise DeltalightError(f"the room {room} has no node {str(node)[:80]}; choose one of {known}.")
+    return found.endpoint
+
+
+def _find(found: RoomList, room: str) -> RoomStatus:
+    status = next((each for each in found.rooms if each.name == room), None)
+    if status is None:
+        names = [each.name for each in found.rooms]
+        known = nearest(room, names) or ", ".join(names) or "none"
+        raise DeltalightError(f"there is no room {room[:80]}; did you mean {known}?")
+    return status

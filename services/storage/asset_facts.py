@@ -31,6 +31,8 @@ def mesh_facts(path: Path) -> Facts:
 
     asset = load_asset(path)
     meshes, clips = asset.meshes, () if asset.animated is None else asset.animated.clips
+    if any("\0" in clip.name for clip in clips):
+        raise DeltalightError(f"{path}: an animation's name must not hold a NUL character; leave it out.")
     bounds = np.stack([mesh.bounds() for mesh in meshes])
     return {
         "triangles": sum(len(mesh.triangles) for mesh in meshes),

@@ -106,7 +106,7 @@ def _advice(head: bytes, name: str) -> str:
     if head.lstrip()[:1] == b"{":
         return f"{name} looks like a glTF document, referring to other files; pack them in a .zip, or export a .glb."
     known = ", ".join(each.name.upper() for each in FORMATS)
-    return f"{name} is not in a known format; upload one of {known}."
+    return f"{name} is not in a known format; upload one of {known}, or a ZIP with a glTF document and its files."
 
 
 def clean_name(name: str) -> str:

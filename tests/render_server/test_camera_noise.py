@@ -12,6 +12,7 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.render_server.post_effects.camera_noise import (
+    LEVELS,
     CameraNoise,
     NoiseModel,
     add_noise,
@@ -69,7 +70,7 @@ def test_equal_pictures_have_no_noise() -> None:
 
 def test_added_noise_is_the_models() -> None:
     """Variance within 15 % at every intensity, and correlation, as measured in pictures with the noise."""
-    model = NoiseModel.of_line(np.full(3, 2e-5), np.full(3, 3e-4), (0.4, 0.2))
+    model = NoiseModel(2e-5 + 3e-4 * LEVELS[:, None].repeat(3, 1), (0.4, 0.2))
     clean, cover = srgb_bytes(LINEAR), np.ones(SIZE, np.float32)
     noisy = [add_noise(clean, cover, model, number, None) for number in (1, 2)]
     found = estimate_noise(noisy[0], noisy[1], None)
@@ -83,7 +84,7 @@ def test_added_noise_is_the_models() -> None:
 
 def test_noise_follows_coverage() -> None:
     """None without coverage, and at edges what the real part lacks: (1 - c) of the real noise stays there."""
-    model = NoiseModel.of_line(np.full(3, 1e-4), np.zeros(3), (0.0, 0.0))
+    model = NoiseModel(np.full((len(LEVELS), 3), 1e-4), (0.0, 0.0))
     clean = np.full((*SIZE, 3), 150, np.uint8)
     cover = np.zeros(SIZE, np.float32)
     cover[:, 100:200], cover[:, 200:] = 0.5, 1.0

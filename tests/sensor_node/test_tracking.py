@@ -227,7 +227,7 @@ def test_a_node_takes_poses_and_lens_from_udp() -> None:
     static = {"camera": {"activeSensorPhysicalDimensions": {"width": 6.4, "height": 4.8}}}
     told = of_json(sample(sourceNumber=7, lens=lens, static=static))
     receiver = camera._tracker
-    with receiver, sending(camera.tracking_port) as out:
+    with receiver, sending(receiver.port) as out:
         out.send(told)
         assert receiver.with_lens(PATIENCE_S) is not None
         out.send(b"noise")
@@ -267,7 +267,7 @@ def test_a_silent_tracker_leaves_the_board() -> None:
         state = camera.state
         assert state is not None
         assert (state.name, "no pose comes from the tracker" in state.detail) == ("stale", True)
-        taken = TrackingSettings(listen="127.0.0.1", port=camera.tracking_port)
+        taken = TrackingSettings(listen="127.0.0.1", port=camera._tracker.port)
         with pytest.raises(DeltalightError, match="cannot be received at UDP port"), TrackingReceiver(taken):
             pass
 

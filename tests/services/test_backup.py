@@ -101,6 +101,8 @@ def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(cli: RunCli, tm
     filled(data)
     write_backup(data, kept)
     assert "already exists" in cli("backup", kept, "--data", data).stderr
+    nowhere = cli("backup", tmp_path / "disk" / "kept.zip", "--data", data).stderr
+    assert f"the folder {tmp_path / 'disk'} does not exist; create it" in nowhere
     with Store(data):
         refused = cli("restore", kept, "--data", data)
     assert refused.returncode == 2

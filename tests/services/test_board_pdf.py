@@ -68,6 +68,14 @@ def test_printed_marks_are_where_board_yaml_says_within_a_tenth_of_a_millimetre(
     np.testing.assert_allclose(paper - wanted.mean(axis=0), edges - printed.mean(axis=0), atol=0.2)
 
 
+def test_board_yaml_shows_no_digits_below_a_micrometre(tmp_path: Path) -> None:
+    done = board_command(
+        "--out", tmp_path / "board.pdf", "--paper", "a3", "--marker-mm", 60, "--separation-mm", 15
+    )
+    assert done.exit_code == 0, done.output
+    assert "margins_m: [0.0675, 0.018, 0.0675, 0.069]\n" in (tmp_path / "board.yaml").read_text()
+
+
 def seen_by(
     camera: CameraModel, sheet: UInt8[np.ndarray, "h w 3"], pose: Float64[np.ndarray, "4 4"]
 ) -> UInt8[np.ndarray, "h w 3"]:

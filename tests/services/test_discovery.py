@@ -26,7 +26,7 @@ def keys(tmp_path: Path) -> Keys:
 @pytest.mark.slow
 def test_a_node_is_found_with_all_it_says_and_is_trusted_by_its_key(keys: Keys, tmp_path: Path) -> None:
     with announced("desk", "tcp://127.0.0.1:5999", STREAMS, keys, interfaces=LOOPBACK):
-        found = find_nodes(name="desk", patience_s=10, interfaces=LOOPBACK)
+        found = find_nodes(name="desk", listen_s=10, interfaces=LOOPBACK)
         node = FoundNode("desk", "127.0.0.1", 5999, STREAMS, SCHEMA_VERSION, keys.public.decode())
         assert node in found
         settings = KeySettings(folder=tmp_path / "server")
@@ -34,7 +34,7 @@ def test_a_node_is_found_with_all_it_says_and_is_trusted_by_its_key(keys: Keys, 
             node_endpoint("desk", settings, interfaces=LOOPBACK)
         trust(keys.folder / "desk-host.key", tmp_path / "server")
         assert node_endpoint("desk", settings, interfaces=LOOPBACK) == "tcp://desk-host@127.0.0.1:5999"
-    assert "desk" not in [each.name for each in find_nodes(patience_s=1, interfaces=LOOPBACK)]
+    assert "desk" not in [each.name for each in find_nodes(listen_s=1, interfaces=LOOPBACK)]
 
 
 def test_a_node_that_stays_on_its_host_is_not_announced() -> None:
@@ -42,7 +42,7 @@ def test_a_node_that_stays_on_its_host_is_not_announced() -> None:
         announced("hidden", "tcp://127.0.0.1:5998", STREAMS, None),
         announced("x", "ipc:///run/x", STREAMS, None),
     ):
-        assert find_nodes(name="hidden", patience_s=1, interfaces=LOOPBACK) == []
+        assert find_nodes(name="hidden", listen_s=1, interfaces=LOOPBACK) == []
 
 
 def test_the_announcement_never_holds_a_secret(keys: Keys) -> None:

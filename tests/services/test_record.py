@@ -28,6 +28,7 @@ from deltalight.services.recorder import RecordJob
 from deltalight.services.rooms.directory import DirectoryServer
 from deltalight.services.rooms.follower import following
 from deltalight.services.rooms.keeper import RoomKeeper
+from deltalight.services.rooms.status import RoomNode
 from tests.services.conftest import ROOT, RunCli
 from tests.services.record_samples import (
     BOARD,
@@ -281,6 +282,21 @@ def test_a_room_to_record_is_one_of_a_directory_that_answers(cli: RunCli, tmp_pa
     with closing(DirectoryServer(directory, RoomKeeper(plans(tmp_path, "hall"), StandInPlacer()))):
         assert "did you mean hall?" in refused("--rooms", directory, "--room", "hal")
     assert not out.exists()
+
+
+def test_a_room_is_recorded_without_its_nodes_address(cli: RunCli, tmp_path: Path) -> None:
+    directory, out = ports.endpoint(ports.private_ports(1)[0]), tmp_path / "a.mcap"
+    (plan,) = plans(tmp_path, "hall")
+    with feeding() as (endpoint, _):
+        fed = replace(plan, nodes=(RoomNode(name="cam", endpoint=endpoint), *plan.nodes))
+        options = ("record", "--out", out, "--rooms", directory, "--room", "hall", "--frames", "2")
+        with closing(DirectoryServer(directory, RoomKeeper([fed], StandInPlacer()))):
+            refused = cli(*options, "--name", "third")
+            assert refused.returncode == 2
+            assert "the room hall has no node third; choose one of cam, desk." in refused.stderr
+            done = cli(*options)
+    assert done.returncode == 0, done.stderr
+    assert len(open_source(out)) == 2
 
 
 def test_a_node_that_goes_and_comes_back_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

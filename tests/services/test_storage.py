@@ -253,7 +253,7 @@ def test_the_same_content_is_kept_once_under_both_names(store: Store) -> None:
 @pytest.mark.parametrize(
     ("content", "name", "sentence"),
     [
-        (b"MZ\x90\x00 program", "chair.glb", "not in a known format"),
+        (b"MZ\x90\x00 program", "chair.glb", r"not in a known format; upload one of GLB, .*, or a ZIP"),
         (b'{"asset": {"version": "2.0"}}', "chair.gltf", "pack them in a .zip"),
         (TETRAHEDRON, "chair.ply", "is a OBJ file and not PLY"),
         (b"", "chair.obj", "not in a known format"),

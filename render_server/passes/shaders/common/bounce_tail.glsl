@@ -3,9 +3,9 @@
 const int TAIL_CELLS = 8;   // along each edge of a volume
 const float TAIL_FIXED_POINT = 1048576.0;   // as in voxel_store.glsl
 
-// Sums of a cell, weighted by area: what one more bounce adds to the irradiance; the area; and in luminance, without sign, that
-// amount, and how much of it returns to surfaces of the volume when these have reflected it.
-const int TAIL_NEXT = 0, TAIL_AREA = 3, TAIL_AMOUNT = 4, TAIL_RETURNED = 5;
+// Sums of a cell, weighted by area: what one more bounce adds to the irradiance (three); the area; and in luminance, without
+// sign, that amount, and how much of it returns to surfaces of the volume when these have reflected it.
+const int TAIL_AREA = 3, TAIL_AMOUNT = 4, TAIL_RETURNED = 5;
 const int TAIL_SUMS = 6;
 const int TAIL_PLACES = 6 * TAIL_CELLS * TAIL_CELLS * TAIL_CELLS;   // of a volume
 
