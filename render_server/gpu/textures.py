@@ -52,6 +52,15 @@ def texture_2d(
     return texture
 
 
+def texture_rows(count: int) -> int:
+    """Returns how many rows a texture of `count` rows of records or triangles gets: a multiple of three.
+
+    Mesa's llvmpipe compiles all kernels that read a texture anew where its height becomes a power of two, or is no
+    longer one, as with a lamp or an object more; no multiple of three is one.
+    """
+    return 3 * max(1, -(-count // 3))
+
+
 def texture_3d(
     gpu: GpuContext, size: tuple[int, int, int], components: int, dtype: str
 ) -> moderngl.Texture3D:

@@ -11,7 +11,7 @@ from deltalight.protocol import short_axis
 from deltalight.protocol.octahedral import resize_octahedral
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.gpu.textures import release_all, texture_2d, texture_rows
 from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
 from deltalight.render_server.lights.light_models import DirectionalLight, Light, RectangleLight
 from deltalight.render_server.lights.mirror_lights import MirrorLight
@@ -32,9 +32,6 @@ from deltalight.render_server.passes.shadow_maps import (
 
 LIGHT_BYTES = 160  # of a std430 Light (shaders/common/light_shapes.glsl)
 TEXEL_BYTES, LIGHT_TEXELS, VIEW_TEXELS = 16, 10, 7  # of a Light and a LightView (shaders/common/)
-ROWS_STEP = 3
-"""Of records. Mesa's llvmpipe compiles all kernels that read lights anew where the height of a texture becomes a
-power of two, or is no longer one, as with a lamp more; no multiple of this is one."""
 BRIGHTEST = float(np.finfo(np.float16).max)
 GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up has to fit, too
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
@@ -56,7 +53,7 @@ class LightingBlock(Block):
 
 
 class _Rows:
-    """Records in a texture, a row each, with rows of zeros that make it a multiple of ROWS_STEP high."""
+    """Records in a texture, a row each, with rows of zeros (`texture_rows`)."""
 
     def __init__(self, gpu: GpuContext, texels: int) -> None:
         self._gpu, self._texels = gpu, texels
@@ -73,8 +70,8 @@ class _Rows:
             self.texture.write(self._data)
 
     def _padded(self, records: bytes) -> bytes:
-        step_bytes = ROWS_STEP * self._texels * TEXEL_BYTES
-        return records.ljust(max(1, -(-len(records) // step_bytes)) * step_bytes, b"\0")
+        row_bytes = self._texels * TEXEL_BYTES
+        return records.ljust(texture_rows(-(-len(records) // row_bytes)) * row_bytes, b"\0")
 
     def _made(self) -> moderngl.Texture:
         size = self._texels, len(self._data) // (self._texels * TEXEL_BYTES)

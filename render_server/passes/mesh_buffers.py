@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int32
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
-from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.gpu.textures import release_all, texture_2d, texture_rows
 from deltalight.render_server.scene.bvh import Bvh, build_bvh
 from deltalight.render_server.scene.material_tables import coating_table, map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
@@ -98,7 +98,7 @@ class MeshBuffers:
         """Returns the positions of the triangles' corners."""
         assert self._written is not None
         if self._corners is None or not self._shows_corners:
-            rows = max(-(-len(self.triangles) // CORNERS_ROW), 1)
+            rows = texture_rows(-(-len(self.triangles) // CORNERS_ROW))
             if len(self._corner_texels) != rows * CORNERS_ROW:
                 self._corner_texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
             self._corner_texels[: len(self.triangles), :, :3] = self._written.corners
@@ -211,7 +211,7 @@ def rewritten(
 
 def bvh_rows(packed: bytes) -> bytes:
     """Returns packed nodes or triangles as whole rows of texels, as shaders/common/ray_mesh.glsl reads them."""
-    return packed.ljust(max(-(-len(packed) // BVH_ROW_BYTES), 1) * BVH_ROW_BYTES, b"\0")
+    return packed.ljust(texture_rows(-(-len(packed) // BVH_ROW_BYTES)) * BVH_ROW_BYTES, b"\0")
 
 
 def bvh_texture(gpu: GpuContext, rows: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:

@@ -34,9 +34,10 @@ float lit_fraction(sampler2D map, LightView view, vec2 s, float depth) {
     vec2 t = tile_texel(view, s);
     if (t.x < 0.0) return 1.0;
     t = clamp(t, view.tile.xy + 0.5, view.tile.xy + view.tile.z - 0.5);
-    vec4 d = textureGather(map, t / vec2(textureSize(map, 0)), 0);   // (0,1) (1,1) (1,0) (0,0)
+    vec2 first = floor(t - 0.5);
+    vec4 d = textureGather(map, (first + 1.0) / vec2(textureSize(map, 0)), 0);   // (0,1) (1,1) (1,0) (0,0)
     vec4 lit = vec4(greaterThanEqual(d, vec4(min(depth <= view.range.x ? 0.0 : map_depth(view, depth), 1.0))));
-    vec2 f = fract(t - 0.5);
+    vec2 f = t - 0.5 - first;
     return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
 }
 
