@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import moderngl
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +13,8 @@ from scipy.spatial.distance import cdist
 
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings
+from deltalight.render_server.gpu.textures import texture_2d
 from deltalight.render_server.lights.light_models import RectangleLight, SpotLight
 from deltalight.render_server.lights.lights import build_lights
 from deltalight.render_server.passes.lights import LightBuffers
@@ -32,6 +35,7 @@ from tests.render_server.scenes import (
     shifted,
     solve,
 )
+from tests.render_server.tiny_kernel import MakeKernel, floats
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 BURIED = (0.0, 0.0, -0.6)  # under the floor an object changes nothing that is seen
@@ -300,6 +304,41 @@ def test_rows_of_lights_come_and_go_and_are_never_a_power_of_two(gpu: GpuContext
             rows = np.frombuffer(texture.read(), np.uint32).reshape(texture.height, -1)
             assert rows.any(axis=1).tolist() == [True] * records + [False] * (len(rows) - records)
     buffers.release()
+
+
+NO_SWITCH: Bindings = dict.fromkeys(("has_rectangles", "has_mirror_images", "has_virtual_lights"), False)
+COMPARED = """
+#include "common/soft_shadows.glsl"
+uniform float tile, edge;
+"""
+NEXT_TO_CENTRES = """
+LightView view = LightView(mat4(1.0), vec4(tile, 0.0, edge, 1.0), vec4(0.0, 2.0, 1.0, 0.0), vec4(0.0));
+for (int x = 0; x < int(edge); ++x) {
+    float s = 2.0 * (float(x) + 0.5) / edge - 1.0;
+    float error = 0.0;
+    for (float side = -1.0; side <= 1.0; ++side) {
+        float lit = lit_fraction(real_light_depth, view, vec2(s + side * 1e-5, 0.0), 1.0);
+        error = max(error, abs(lit - texelFetch(real_light_depth, ivec2(int(tile) + x, 0), 0).r));
+    }
+    values[0] = max(values[0], error);
+}
+"""
+
+
+@pytest.mark.parametrize("edge", [64, 260])
+def test_shadow_maps_compare_the_texels_whose_weights_they_use(
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer, edge: int
+) -> None:
+    """Next to a texel's centre that texel counts, in whatever tile; at 1300 texels, rounding found its neighbour."""
+    stripes = np.tile(np.arange(5 * edge, dtype=np.float32) % 2, (edge, 1))
+    depth = texture_2d(gpu, (5 * edge, edge), 1, "f4", data=stripes.tobytes())
+    kernel = make(COMPARED, NEXT_TO_CENTRES)
+    for tile in range(5):
+        out.write(bytes(4))
+        own: Bindings = {"real_light_depth": depth, "tile": float(tile * edge), "edge": float(edge)}
+        kernel.run((1,), NO_SWITCH, own, Out=out)
+        assert floats(out, 1)[0] < 0.02, tile
+    depth.release()
 
 
 def test_documents_lights_keep_their_numbers() -> None:

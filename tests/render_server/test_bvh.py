@@ -13,7 +13,13 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.mesh_buffers import MeshBuffers, ObjectBvh, bvh_rows, bvh_texture
+from deltalight.render_server.passes.mesh_buffers import (
+    BVH_ROW_BYTES,
+    MeshBuffers,
+    ObjectBvh,
+    bvh_rows,
+    bvh_texture,
+)
 from deltalight.render_server.scene.bvh import COUNT_BITS, LEAF_SIZE, ROUNDING, Bvh, RayCaster, build_bvh
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
@@ -298,3 +304,15 @@ def test_without_any_package_a_sentence_says_what_to_install(monkeypatch: pytest
     only("none", monkeypatch)
     with pytest.raises(DeltalightError, match="-m pip install embreex"):
         RayCaster(torus().reshape(-1, 3), vertices_of(torus()))
+
+
+@pytest.mark.parametrize(
+    "size", [0, 16, BVH_ROW_BYTES, BVH_ROW_BYTES + 1, 4 * BVH_ROW_BYTES, 8 * BVH_ROW_BYTES]
+)
+def test_textures_are_never_a_power_of_two_high(size: int) -> None:
+    """Else llvmpipe would compile all kernels that trace rays anew with an object more."""
+    padded = bvh_rows(b"x" * size)
+    rows, beyond = divmod(len(padded), BVH_ROW_BYTES)
+    assert beyond == 0
+    assert rows & (rows - 1)
+    assert padded == b"x" * size + bytes(len(padded) - size)
