@@ -7,6 +7,7 @@
 #include "common/low_res_grid.glsl"
 #include "common/march_into.glsl"
 #include "common/least_change.glsl"
+#include "common/rolled.glsl"
 
 #include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D lattice_change;   // rgb (E_rho - E_mu) / E_mu; a: 1 where known
@@ -27,7 +28,7 @@ int part_of(ivec2 point) { return (point.x & 1) + 2 * (point.y & 1); }
 ivec2 texel_of(ivec2 point) {
     ivec2 found = ivec2(-1);
     float nearest = 1e9;
-    for (int i = 0; i < LATTICE_STEP * LATTICE_STEP; ++i) {
+    for (int i = 0; i < rolled(LATTICE_STEP * LATTICE_STEP); ++i) {
         ivec2 inside = ivec2(i % LATTICE_STEP, i / LATTICE_STEP), texel = point * LATTICE_STEP + inside;
         if (any(greaterThanEqual(texel, low_resolution_size)) || texelFetch(sample_pixels, texel, 0).x < 0) continue;
         vec2 offset = vec2(inside) - 0.5 * float(LATTICE_STEP - 1);

@@ -8,6 +8,7 @@
 #include "common/object_light.glsl"
 #include "common/mirror_rays.glsl"
 #include "common/upsample.glsl"
+#include "common/rolled.glsl"
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
@@ -30,7 +31,7 @@ Indirect gathered(ivec2 pixel, MeshSurface s, float seen_at, out float open) {
     Indirect sum = Indirect(vec3(0.0), vec3(0.0));
     float total = 0.0;
     open = 0.0;
-    for (int j = 0; j < 4; ++j) {
+    for (int j = 0; j < rolled(4); ++j) {
         float w;
         ivec2 texel = low_texel(pixel, j, w);
         vec4 position = texelFetch(hit_position, texel, 0);
@@ -95,7 +96,7 @@ void main() {
     if (j != 0 || pixel.x < 0) return;
     vec4 sum = vec4(0.0);
     float count = 0.0, met = 0.0, total = 0.0;
-    for (int k = 0; k < RAY_COUNT; ++k) {
+    for (int k = 0; k < rolled(RAY_COUNT); ++k) {
         sum += of_ray[inside + uint(k)];
         count += counted[inside + uint(k)];
         total += distances[inside + uint(k)];

@@ -2,6 +2,7 @@
 // x 3, and does not show as grain.
 #include "common/mirror.glsl"
 #include "common/work_list.glsl"
+#include "common/rolled.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D reflection;
@@ -19,7 +20,7 @@ void smooth_pixel(ivec2 pixel) {
     float entry = mirror_entry(pixel), farthest = 0.0, count = 0.0;
     vec4 own = texelFetch(traced, pixel, 0), around = vec4(0.0);
     ivec2 last = textureSize(traced, 0) - 1;
-    for (int k = 0; k < 9; ++k) {
+    for (int k = 0; k < rolled(9); ++k) {
         ivec2 at = clamp(pixel + ivec2(k % 3, k / 3) - 1, ivec2(0), last);
         if (mirror_entry(at) != entry || !shows_mirror(texelFetch(object_coverage, at, 0).r)) continue;
         around += texelFetch(traced, at, 0);

@@ -12,6 +12,7 @@
 #include "common/voxel_store.glsl"
 #include "common/resolved_voxels.glsl"
 #include "common/mark_occupancy.glsl"
+#include "common/rolled.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image3D mipmap;
@@ -24,7 +25,7 @@ void main() {
     for (uint i = first_item(); i < slot_count; i += items_apart()) {
         uint voxel = touched[i];
         ivec3 v = enter_volume_of(voxel, volume_size);
-        for (int k = 0; k < 6; ++k) {
+        for (int k = 0; k < rolled(6); ++k) {
 #ifdef RHO
             vec4 c = joint_texel(int(i), virtual_grid[voxel], k);
 #else
@@ -41,7 +42,7 @@ void main() {
         uint voxel = virtual_touched[i];
         if (grid[voxel] != 0u) continue;
         ivec3 v = enter_volume_of(voxel, volume_size);
-        for (int k = 0; k < 6; ++k) imageStore(mipmap, level_base(0, k) + v, virtual_texel(int(i), k));
+        for (int k = 0; k < rolled(6); ++k) imageStore(mipmap, level_base(0, k) + v, virtual_texel(int(i), k));
         if (marks) occupy(v);
     }
 #endif
