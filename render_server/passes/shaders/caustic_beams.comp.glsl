@@ -155,13 +155,19 @@ Passage first_passage(LightView view, vec2 s, LampPart part) {
 
 bool meets_transparent(MeshHit hit) { return hit.triangle >= 0 && is_transparent(material_of_triangle(max(hit.triangle, 0))); }
 
-Interface met_by(Passage way, MeshHit hit) { return interface_at(hit, Ray(way.from, way.direction), 0.0); }
+// A surface that a path meets, what it reflects of it, and how far away it is.
+struct Meeting { Interface surface; vec3 reflectance; float distance; };
 
-// What a surface `i`, this far away, reflects of a path (`back`) or lets on; its part is 0 if there is no such path.
-Passage divided(Passage way, Interface i, float distance, bool back) {
+Meeting meeting(Passage way, MeshHit hit) {
+    Interface i = interface_at(hit, Ray(way.from, way.direction), 0.0);
+    return Meeting(i, interface_reflectance(i, way.direction, way.medium >= 0), hit.distance);
+}
+
+// What a surface reflects of a path (`back`) or lets on; its part is 0 if there is no such path.
+Passage divided(Passage way, Meeting met, bool back) {
+    Interface i = met.surface;
     bool inside = way.medium >= 0;
-    vec3 reflectance = interface_reflectance(i, way.direction, inside);
-    way.part *= kept_over(way.medium, distance) * (back ? reflectance : (1.0 - reflectance) * i.surface.passing);
+    way.part *= kept_over(way.medium, met.distance) * (back ? met.reflectance : (1.0 - met.reflectance) * i.surface.passing);
     float index = max(materials[i.material].medium.w, 1.0), alpha = i.surface.roughness * i.surface.roughness;
     way.bent = length(vec2(way.bent, alpha * (back ? (inside ? index : 1.0) : 0.5 * (index - 1.0))));
     if (!back) way.medium = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
@@ -176,7 +182,7 @@ Passage along_ways(LightView view, vec2 s, LampPart part, uint ways) {
     Passage way = first_passage(view, s, part);
     for (int k = findMSB(ways) - 1; k >= 0; --k) {
         MeshHit hit = closest_hit(Ray(way.from, way.direction));
-        if (meets_transparent(hit)) way = divided(way, met_by(way, hit), hit.distance, (ways >> uint(k) & 1u) != 0u);
+        if (meets_transparent(hit)) way = divided(way, meeting(way, hit), (ways >> uint(k) & 1u) != 0u);
         else way.part = vec3(0.0);
         if (way.part == vec3(0.0)) { way.ways = 0u; break; }
     }
@@ -212,7 +218,7 @@ void send_paths(LightView view, ivec2 texel, float side, LampPart part, vec3 flu
     held_count = 0;
     hold(first_passage(view, texel_lateral(view, texel), part));
     int sent = 0;
-    for (int met = 0; met < MOST_SURFACES && held_count > 0 && sent < PATHS; ++met) {
+    for (int k = 0; k < MOST_SURFACES && held_count > 0 && sent < PATHS; ++k) {
         Passage way = strongest_held();
         MeshHit hit = closest_hit(Ray(way.from, way.direction));
         bool is_first = way.ways == 1u;
@@ -221,9 +227,9 @@ void send_paths(LightView view, ivec2 texel, float side, LampPart part, vec3 flu
             leave_objects(view, texel, side, part, way, hit, flux, radius);
             ++sent;
         } else if (findMSB(way.ways) < LONGEST_WAY) {
-            Interface i = met_by(way, hit);
-            hold(divided(way, i, hit.distance, false));
-            if (!is_first) hold(divided(way, i, hit.distance, true));
+            Meeting met = meeting(way, hit);
+            hold(divided(way, met, false));
+            if (!is_first) hold(divided(way, met, true));
         }
     }
 }
