@@ -212,10 +212,17 @@ Coating mapped_coating(MaterialEntry e, Coating maps) {
 
 MapValues values_of_maps(int index, vec2 uv, float color_level, float data_level) {
     MapValues s = no_maps();
+#ifdef EXTENDED
     for (uint left = maps_of(index, COLOR_MAPS); left != 0u; left &= left - 1u)
         take_color(s, findLSB(left), map_level(color_maps, materials[index].maps[findLSB(left)], uv, color_level));
     for (uint left = maps_of(index, DATA_MAPS); left != 0u; left &= left - 1u)
         take_data(s, findLSB(left), map_level(data_maps, materials[index].maps[findLSB(left)], uv, data_level));
+#else   // so few that a loop would gain nothing
+    MaterialEntry e = materials[index];
+    take_color(s, BASE_COLOR, map_level(color_maps, e.maps[BASE_COLOR], uv, color_level));
+    take_color(s, EMISSIVE, map_level(color_maps, e.maps[EMISSIVE], uv, color_level));
+    take_data(s, METALLIC_ROUGHNESS, map_level(data_maps, e.maps[METALLIC_ROUGHNESS], uv, data_level));
+#endif
     return s;
 }
 
