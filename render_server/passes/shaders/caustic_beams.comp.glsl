@@ -100,8 +100,8 @@ float unmasked(float n_dot_v, float n_dot_l, float alpha) {
     return (1.0 + lambda.x) / (1.0 + lambda.x + lambda.y);
 }
 
-void send(vec3 from, vec3 direction, vec3 flux, float spread, Drift x, Drift y) {
-    MeshHit hit = closest_hit(Ray(from, direction));
+// `hit`: where it ends.
+void send(vec3 from, vec3 direction, MeshHit hit, vec3 flux, float spread, Drift x, Drift y) {
     SentBeam beam = SentBeam(vec4(from, hit.triangle < 0 ? 1e30 : hit.distance), vec4(direction, spread), vec4(flux, 0.0),
         vec4(x.start, 0.0), vec4(x.turn, 0.0), vec4(y.start, 0.0), vec4(y.turn, 0.0));
     uint at = atomicAdd(sent_count, 1u);
@@ -155,12 +155,19 @@ Passage first_passage(LightView view, vec2 s, LampPart part) {
 
 bool meets_transparent(MeshHit hit) { return hit.triangle >= 0 && is_transparent(material_of_triangle(max(hit.triangle, 0))); }
 
-// What a surface reflects of a path (`back`) or lets on; its part is 0 if there is no such path.
-Passage divided(Passage way, MeshHit hit, bool back) {
+// A surface that a path meets, what it reflects of it, and how far away it is.
+struct Meeting { Interface surface; vec3 reflectance; float distance; };
+
+Meeting meeting(Passage way, MeshHit hit) {
     Interface i = interface_at(hit, Ray(way.from, way.direction), 0.0);
+    return Meeting(i, interface_reflectance(i, way.direction, way.medium >= 0), hit.distance);
+}
+
+// What a surface reflects of a path (`back`) or lets on; its part is 0 if there is no such path.
+Passage divided(Passage way, Meeting met, bool back) {
+    Interface i = met.surface;
     bool inside = way.medium >= 0;
-    vec3 reflectance = interface_reflectance(i, way.direction, inside);
-    way.part *= kept_over(way.medium, hit.distance) * (back ? reflectance : (1.0 - reflectance) * i.surface.passing);
+    way.part *= kept_over(way.medium, met.distance) * (back ? met.reflectance : (1.0 - met.reflectance) * i.surface.passing);
     float index = max(materials[i.material].medium.w, 1.0), alpha = i.surface.roughness * i.surface.roughness;
     way.bent = length(vec2(way.bent, alpha * (back ? (inside ? index : 1.0) : 0.5 * (index - 1.0))));
     if (!back) way.medium = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
@@ -175,7 +182,7 @@ Passage along_ways(LightView view, vec2 s, LampPart part, uint ways) {
     Passage way = first_passage(view, s, part);
     for (int k = findMSB(ways) - 1; k >= 0; --k) {
         MeshHit hit = closest_hit(Ray(way.from, way.direction));
-        if (meets_transparent(hit)) way = divided(way, hit, (ways >> uint(k) & 1u) != 0u);
+        if (meets_transparent(hit)) way = divided(way, meeting(way, hit), (ways >> uint(k) & 1u) != 0u);
         else way.part = vec3(0.0);
         if (way.part == vec3(0.0)) { way.ways = 0u; break; }
     }
@@ -195,27 +202,34 @@ Drift drift_through(LightView view, ivec2 texel, ivec2 axis, LampPart part, Pass
     return Drift(across, vec3(0.0));
 }
 
-void leave_objects(LightView view, ivec2 texel, float side, LampPart part, Passage way, vec3 flux, float radius) {
-    Drift x = drift_through(view, texel, ivec2(1, 0), part, way, side), y = drift_through(view, texel, ivec2(0, 1), part, way, side);
-    send(way.from, way.direction, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * LAMP_FRACTION * radius)), x, y);
+void leave_objects(LightView view, ivec2 texel, float side, LampPart part, Passage way, MeshHit hit, vec3 flux, float radius) {
+    Drift x, y;
+    int axis = 0;
+    do {   // in a loop, because drivers compile each call of a long function anew
+        Drift drift = drift_through(view, texel, ivec2(1 - axis, axis), part, way, side);
+        if (axis == 0) x = drift;
+        else y = drift;
+    } while (++axis < 2);
+    send(way.from, way.direction, hit, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * LAMP_FRACTION * radius)), x, y);
 }
 
 // Sends a beam for each of the strongest PATHS paths of a ray; what its first surface reflects, mirrors' beams bring.
 void send_paths(LightView view, ivec2 texel, float side, LampPart part, vec3 flux, float radius) {
-    Passage start = first_passage(view, texel_lateral(view, texel), part);
-    MeshHit first = closest_hit(Ray(start.from, start.direction));
     held_count = 0;
-    if (meets_transparent(first)) hold(divided(start, first, false));
+    hold(first_passage(view, texel_lateral(view, texel), part));
     int sent = 0;
-    for (int met = 1; met < MOST_SURFACES && held_count > 0 && sent < PATHS; ++met) {
+    for (int k = 0; k < MOST_SURFACES && held_count > 0 && sent < PATHS; ++k) {
         Passage way = strongest_held();
         MeshHit hit = closest_hit(Ray(way.from, way.direction));
+        bool is_first = way.ways == 1u;
         if (!meets_transparent(hit)) {
-            leave_objects(view, texel, side, part, way, flux, radius);
+            if (is_first) return;
+            leave_objects(view, texel, side, part, way, hit, flux, radius);
             ++sent;
         } else if (findMSB(way.ways) < LONGEST_WAY) {
-            hold(divided(way, hit, false));
-            hold(divided(way, hit, true));
+            Meeting met = meeting(way, hit);
+            hold(divided(way, met, false));
+            if (!is_first) hold(divided(way, met, true));
         }
     }
 }
@@ -275,7 +289,8 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // half a disc's radius
     float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
     Drift x = drift_along(view, texel, ivec2(1, 0), spot, side), y = drift_along(view, texel, ivec2(0, 1), spot, side);
-    send(spot.point + normal_offset * spot.normal, direction, flux, spread, x, y);
+    vec3 from = spot.point + normal_offset * spot.normal;
+    send(from, direction, closest_hit(Ray(from, direction)), flux, spread, x, y);
 }
 #endif
 

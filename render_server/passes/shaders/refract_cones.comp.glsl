@@ -55,18 +55,18 @@ vec3 radiance_beyond(Path path, float object, float ratio) {
 vec3 radiance_through(Ray ray, MeshHit hit, float ratio) {
     vec3 sum = vec3(0.0);
     pending_count = 0;
-    split_path(interface_at(hit, ray, ratio * hit.distance), Path(ray.from, ray.direction, vec3(1.0), -1), false);
-    int met = 1;
-    if (pending_count > 0) do {   // a loop that tests at its end: march.glsl
-        Path path = pending[--pending_count];
-        Ray next = Ray(path.from, path.direction);
-        MeshHit object = closest_hit(next);
-        bool divides = path.medium >= 0 && met < MOST_SURFACES && bends(object);
-        path.weight *= kept_over(path.medium, object.triangle < 0 ? 0.0 : object.distance);
-        if (divides) split_path(interface_at(object, next, ratio * object.distance), path, false);
-        else sum += path.weight * radiance_beyond(path, object.distance, ratio);
+    Path path = Path(ray.from, ray.direction, vec3(1.0), -1);
+    int met = 0;
+    do {   // one turn for the first surface, too, because drivers compile each call of a long function anew
+        bool divides = met == 0 || (path.medium >= 0 && met < MOST_SURFACES && bends(hit));
+        path.weight *= kept_over(path.medium, hit.triangle < 0 ? 0.0 : hit.distance);
+        if (divides) split_path(interface_at(hit, Ray(path.from, path.direction), ratio * hit.distance), path, false);
+        else sum += path.weight * radiance_beyond(path, hit.distance, ratio);
         ++met;
-    } while (pending_count > 0);
+        if (pending_count == 0) break;
+        path = pending[--pending_count];
+        hit = closest_hit(Ray(path.from, path.direction));
+    } while (true);
     return sum;
 }
 

@@ -122,9 +122,19 @@ vec4 reflection(ivec2 pixel, Lobe lobe) {
     ivec2 raster = raster_texel(pixel);
     Material m = coated_material(raster);
     vec3 fraction = coat_fraction(reflected_towards(m, lobe.normal.xyz, normalize(camera_position - lobe.position.xyz)));
-    vec4 base = any_reflection(pixel, lobe.position, lobe.normal, m.roughness, false, has_interface(m.f0));
+    vec4 base, coat, normal = lobe.normal;
+    float roughness = m.roughness;
+    bool of_coat = false, wanted = has_interface(m.f0);
+    int count = lobe.is_single ? 1 : 2;
+    do {   // in a loop, because drivers compile each call of a long function anew
+        vec4 seen = any_reflection(pixel, lobe.position, normal, roughness, of_coat, wanted);
+        if (of_coat) coat = seen;
+        else base = seen;
+        normal = shown_normal(raster, true);
+        roughness = m.over.roughness;
+        of_coat = wanted = true;
+    } while (--count > 0);
     if (lobe.is_single) return base;
-    vec4 coat = any_reflection(pixel, lobe.position, shown_normal(raster, true), m.over.roughness, true, true);
     return vec4(mix(base.rgb, coat.rgb, fraction), mix(base.a, coat.a, dot(fraction, vec3(1.0 / 3.0))));
 }
 #else

@@ -46,10 +46,10 @@ vec3 lamps_along(vec3 from, vec3 d, float spread) {
     return sum;
 }
 
-// What a path sees that leaves the transparent objects; `object`: distance of the next surface of any object.
-vec3 outside(vec3 from, vec3 d, float spread, float object) {
-    ScreenHit hit = screen_hit(from, d, spread);
-    vec4 seen = hit.fraction > 0.0 && hit.distance < object ? shown_at(hit, spread) : vec4(0.0);
+// What a path sees that leaves the transparent objects: the picture where it `shows` the hit there, and what lies beyond; `object`:
+// distance of the next surface of any object.
+vec3 outside(vec3 from, vec3 d, float spread, float object, ScreenHit hit, bool shows) {
+    vec4 seen = shows ? shown_at(hit, spread) : vec4(0.0);
     if (seen.a >= 1.0) return seen.rgb;
     float open = 1.0;
 #ifdef VOXELS
@@ -65,27 +65,33 @@ vec3 outside(vec3 from, vec3 d, float spread, float object) {
 vec3 trace_paths(Ray ray, MeshHit hit, float spread) {
     vec3 sum = vec3(0.0);
     pending_count = 0;
-    float length_m = hit.distance;
-    // What the first surface reflects is left out: it is the object's own reflection already.
-    split_path(interface_at(hit, ray, pixel_size * length_m), Path(ray.from, ray.direction, vec3(1.0), -1), true);
-    for (int met = 0; met < MOST_SURFACES && pending_count > 0; ++met) {
-        Path path = pending[--pending_count];
-        Ray next = Ray(path.from, path.direction);
-        MeshHit object = closest_hit(next);
+    Path path = Path(ray.from, ray.direction, vec3(1.0), -1);
+    MeshHit object = hit;
+    float before = 0.0;   // m, of the way to the ray's start
+    int met = 0;
+    do {   // one turn for the first surface, too, because drivers compile each call of a long function anew
+        bool is_first = met == 0;
         bool stops = object.triangle < 0 || !is_transparent(material_of_triangle(max(object.triangle, 0)));
-        bool shown = false;
-        if (path.medium < 0 && !stops) {
-            ScreenHit real = screen_hit(path.from, path.direction, spread);
+        bool is_last = stops || met == MOST_SURFACES, shown = false;
+        ScreenHit real;
+        if (!is_first && (is_last || path.medium < 0)) {
+            real = screen_hit(path.from, path.direction, spread);
             shown = real.fraction > 0.0 && real.distance < object.distance;
         }
-        if (stops || shown || met == MOST_SURFACES - 1) {
+        if (is_last || shown) {
             float inside_m = object.triangle < 0 ? 0.0 : object.distance;
-            sum += path.weight * kept_over(path.medium, inside_m) * outside(path.from, path.direction, spread, object.distance);
+            sum += path.weight * kept_over(path.medium, inside_m)
+                * outside(path.from, path.direction, spread, object.distance, real, shown);
         } else {
             path.weight *= kept_over(path.medium, object.distance);
-            split_path(interface_at(object, next, pixel_size * (length_m + object.distance)), path, false);
+            // What the first surface reflects is left out: it is the object's own reflection already.
+            split_path(interface_at(object, Ray(path.from, path.direction), pixel_size * (before + object.distance)), path, is_first);
         }
-    }
+        if (pending_count == 0) break;
+        before = hit.distance;
+        path = pending[--pending_count];
+        object = closest_hit(Ray(path.from, path.direction));
+    } while (++met <= MOST_SURFACES);
     return sum;
 }
 

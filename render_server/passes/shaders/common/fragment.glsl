@@ -71,13 +71,16 @@ Surface surface_at(Fragment f, bool shows) {
     vec3 view = camera_position - f.world, n = facing_normal(f, view);
     vec2 uv = f.uv;
     vec4 tint = vec4(f.tint, 1.0);
+#ifdef MATERIAL_MAPS
+    MapValues maps = fragment_values(f, shows);
+#endif
 #ifdef PACKS_EXTENDED
-    Extended extended = fragment_extended(f, shows);
+    Extended extended = Extended(mapped_coating(materials[f.material], maps.over), maps.f0, maps.transmission);
     extended.over.normal = bent_normal(f, materials[f.material].maps[COAT_NORMAL], n, normalize(view));
 #endif
 #ifdef MATERIAL_MAPS
     n = bent_normal(f, materials[f.material].maps[NORMAL], n, normalize(view));
-    pack_maps(fragment_maps(f, shows), uv, tint);
+    pack_maps(shown_maps(f, maps), uv, tint);
 #ifdef MEASURED
     if (is_by_light(f.material)) uv = place_on_texture(f, n, uv.x);
 #endif

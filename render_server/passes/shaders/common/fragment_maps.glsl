@@ -11,13 +11,13 @@ vec4 slopes_of(Fragment f, MapEntry m) {
 // length, of the mip level of its width. Samplers' own anisotropic filters differ between drivers; Mesa's blurs what is enlarged.
 const float PROBES = 8.0;
 
-// 1 if not wanted. (llvmpipe executes both sides of a branch, but no turn of a loop too many.)
-vec4 map_here(sampler2DArray maps, Fragment f, MapEntry m, bool wanted) {
+// 1 without a map. (llvmpipe executes both sides of a branch, but no turn of a loop too many.)
+vec4 map_here(sampler2DArray maps, Fragment f, MapEntry m) {
     float edge = float(textureSize(maps, 0).x);
     vec4 s = slopes_of(f, m) * edge;
     vec2 along = dot(s.xy, s.xy) > dot(s.zw, s.zw) ? s.xy : s.zw;
     float major = length(along), minor = max(abs(s.x * s.w - s.y * s.z) / max(major, 1e-12), max(major / PROBES, 1.0));
-    int count = wanted && has_map(m) ? int(clamp(ceil(major / minor), 1.0, PROBES)) : 0;
+    int count = has_map(m) ? int(clamp(ceil(major / minor), 1.0, PROBES)) : 0;
     vec2 place = place_on(m, uv_of(f, m));
     float margin = 0.5 * minor / edge;
     vec4 sum = vec4(0.0);
@@ -28,28 +28,25 @@ vec4 map_here(sampler2DArray maps, Fragment f, MapEntry m, bool wanted) {
     return count == 0 ? vec4(1.0) : sum / float(count);
 }
 
-ShownMaps fragment_maps(Fragment f, bool wanted) {
-    MaterialEntry e = materials[f.material];
-    vec2 rough_metal = map_here(data_maps, f, e.maps[METALLIC_ROUGHNESS], wanted).gb;
-    float occlusion = 1.0 + e.maps[OCCLUSION].sampling.w * (map_here(data_maps, f, e.maps[OCCLUSION], wanted).r - 1.0);
-    vec3 base = f.tint * map_here(color_maps, f, e.maps[BASE_COLOR], wanted).rgb;
-    vec3 glow = glow_tint(e, f.tint) * map_here(color_maps, f, e.maps[EMISSIVE], wanted).rgb;
-    return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, glow);
+// All 1 if not wanted.
+MapValues fragment_values(Fragment f, bool wanted) {
+    MapValues s = no_maps();
+    for (uint left = wanted ? maps_of(f.material, COLOR_MAPS) : 0u; left != 0u; left &= left - 1u)
+        take_color(s, findLSB(left), map_here(color_maps, f, materials[f.material].maps[findLSB(left)]));
+    for (uint left = wanted ? maps_of(f.material, DATA_MAPS | 1u << OCCLUSION) : 0u; left != 0u; left &= left - 1u)
+        take_data(s, findLSB(left), map_here(data_maps, f, materials[f.material].maps[findLSB(left)]));
+    return s;
 }
 
-#ifdef EXTENDED
-Extended fragment_extended(Fragment f, bool wanted) {
+ShownMaps shown_maps(Fragment f, MapValues s) {
     MaterialEntry e = materials[f.material];
-    vec3 f0 = map_here(color_maps, f, e.maps[SPECULAR_COLOR], wanted).rgb * map_here(color_maps, f, e.maps[SPECULAR], wanted).a;
-    Coating over = mapped_coating(e, map_here(data_maps, f, e.maps[COAT], wanted).r, map_here(data_maps, f, e.maps[COAT_ROUGHNESS], wanted).g,
-        map_here(color_maps, f, e.maps[SHEEN], wanted).rgb, map_here(color_maps, f, e.maps[SHEEN_ROUGHNESS], wanted).a);
-    return Extended(over, f0, map_here(data_maps, f, e.maps[TRANSMITTED], wanted).r);
+    float occlusion = 1.0 + e.maps[OCCLUSION].sampling.w * (s.occlusion - 1.0);
+    return ShownMaps(f.tint * s.base, s.metallic, s.roughness, occlusion, glow_tint(e, f.tint) * s.glow);
 }
-#endif
 
 float fragment_opacity(Fragment f) {
     MaterialEntry e = materials[f.material];
-    float own = e.alpha.y * map_here(color_maps, f, e.maps[BASE_COLOR], true).a;
+    float own = e.alpha.y * map_here(color_maps, f, e.maps[BASE_COLOR]).a;
 #ifdef CUTOUTS
     own *= f.opacity;
 #endif
@@ -83,7 +80,7 @@ vec3 bent_normal(Fragment f, MapEntry m, vec3 n, vec3 v) {
     float side = materials[f.material].flags.x > 0.5 && dot(n, f.normal) < 0.0 ? -1.0 : 1.0;
     tangent_frame(f, m, n, side, tangent, across);
     if (!has_map(m) || tangent == vec3(0.0)) return n;
-    vec3 tilt = map_here(data_maps, f, m, true).rgb * 2.0 - 1.0;
+    vec3 tilt = map_here(data_maps, f, m).rgb * 2.0 - 1.0;
     vec3 bent = side * m.sampling.w * (tilt.x * tangent + tilt.y * across) + tilt.z * n;
     bent = normalize(dot(bent, bent) == 0.0 ? n : bent);
     return normalize(bent + max(1e-2 - dot(bent, v), 0.0) * v);

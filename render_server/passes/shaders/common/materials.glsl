@@ -142,34 +142,101 @@ MaterialEntry with_dielectric(MaterialEntry e, vec3 f0, float transmission) {
     e.emission.a *= transmission;
     return e;
 }
+#endif
 
-// The material's own, times what maps give.
-Coating mapped_coating(MaterialEntry e, float coat, float roughness, vec3 sheen, float sheen_roughness) {
-    return Coating(e.coat.x * coat, e.coat.y * roughness, vec3(0.0), e.sheen.rgb * sheen, e.coat.z * sheen_roughness);
+// What maps give of a material, relative to its own; 1 without.
+struct MapValues {
+    vec3 base; vec3 glow; float occlusion; float roughness; float metallic;
+#ifdef EXTENDED
+    vec3 f0; float transmission; Coating over;
+#endif
+};
+
+// Numbers of the maps of each array, as bits.
+#ifdef EXTENDED
+const uint COLOR_MAPS = 1u << BASE_COLOR | 1u << EMISSIVE | 1u << SHEEN | 1u << SHEEN_ROUGHNESS | 1u << SPECULAR | 1u << SPECULAR_COLOR;
+const uint DATA_MAPS = 1u << METALLIC_ROUGHNESS | 1u << COAT | 1u << COAT_ROUGHNESS | 1u << TRANSMITTED;
+#else
+const uint COLOR_MAPS = 1u << BASE_COLOR | 1u << EMISSIVE;
+const uint DATA_MAPS = 1u << METALLIC_ROUGHNESS;
+#endif
+
+// Those of `maps` that a material has. Loops over them, which drivers do not unroll, look each up by one call: drivers compile every
+// call anew, and llvmpipe makes many instructions of one.
+uint maps_of(int index, uint maps) {
+    uint had = 0u;
+    for (uint left = maps; left != 0u; left &= left - 1u)
+        if (has_map(materials[index].maps[findLSB(left)])) had |= 1u << findLSB(left);
+    return had;
 }
 
-Coating coating_of(MaterialEntry e, vec2 uv, float color_level, float data_level) {
-    return mapped_coating(e, map_level(data_maps, e.maps[COAT], uv, data_level).r,
-        map_level(data_maps, e.maps[COAT_ROUGHNESS], uv, data_level).g, map_level(color_maps, e.maps[SHEEN], uv, color_level).rgb,
-        map_level(color_maps, e.maps[SHEEN_ROUGHNESS], uv, color_level).a);
+MapValues no_maps() {
+    MapValues s;
+    s.base = s.glow = vec3(1.0);
+    s.occlusion = s.roughness = s.metallic = 1.0;
+#ifdef EXTENDED
+    s.f0 = vec3(1.0);
+    s.transmission = 1.0;
+    s.over = Coating(1.0, 1.0, vec3(0.0), vec3(1.0), 1.0);
+#endif
+    return s;
+}
+
+void take_color(inout MapValues s, int map, vec4 value) {
+    if (map == BASE_COLOR) s.base = value.rgb;
+    if (map == EMISSIVE) s.glow = value.rgb;
+#ifdef EXTENDED
+    if (map == SHEEN) s.over.sheen = value.rgb;
+    if (map == SHEEN_ROUGHNESS) s.over.sheen_roughness = value.a;
+    if (map == SPECULAR) s.f0 *= value.a;
+    if (map == SPECULAR_COLOR) s.f0 *= value.rgb;
+#endif
+}
+
+void take_data(inout MapValues s, int map, vec4 value) {
+    if (map == OCCLUSION) s.occlusion = value.r;
+    if (map == METALLIC_ROUGHNESS) { s.roughness = value.g; s.metallic = value.b; }
+#ifdef EXTENDED
+    if (map == COAT) s.over.coat = value.r;
+    if (map == COAT_ROUGHNESS) s.over.roughness = value.g;
+    if (map == TRANSMITTED) s.transmission = value.r;
+#endif
+}
+
+#ifdef EXTENDED
+// The material's own, times what maps give.
+Coating mapped_coating(MaterialEntry e, Coating maps) {
+    return Coating(e.coat.x * maps.coat, e.coat.y * maps.roughness, vec3(0.0), e.sheen.rgb * maps.sheen, e.coat.z * maps.sheen_roughness);
 }
 #endif
+
+MapValues values_of_maps(int index, vec2 uv, float color_level, float data_level) {
+    MapValues s = no_maps();
+#ifdef EXTENDED
+    for (uint left = maps_of(index, COLOR_MAPS); left != 0u; left &= left - 1u)
+        take_color(s, findLSB(left), map_level(color_maps, materials[index].maps[findLSB(left)], uv, color_level));
+    for (uint left = maps_of(index, DATA_MAPS); left != 0u; left &= left - 1u)
+        take_data(s, findLSB(left), map_level(data_maps, materials[index].maps[findLSB(left)], uv, data_level));
+#else   // so few that a loop would gain nothing
+    MaterialEntry e = materials[index];
+    take_color(s, BASE_COLOR, map_level(color_maps, e.maps[BASE_COLOR], uv, color_level));
+    take_color(s, EMISSIVE, map_level(color_maps, e.maps[EMISSIVE], uv, color_level));
+    take_data(s, METALLIC_ROUGHNESS, map_level(data_maps, e.maps[METALLIC_ROUGHNESS], uv, data_level));
+#endif
+    return s;
+}
 
 // `tint`: the vertex colour, which multiplies the base colour. `size`: of the footprint, m.
 Material material_of(int index, vec2 uv, vec3 tint, float size) {
     MaterialEntry e = materials[index];
-    float level = level_of(e, color_maps, size);
-    vec3 base = e.base_color.rgb * tint * map_level(color_maps, e.maps[BASE_COLOR], uv, level).rgb;
-    vec2 rough_metal = map_level(data_maps, e.maps[METALLIC_ROUGHNESS], uv, level_of(e, data_maps, size)).gb;
-    vec3 glow = glow_tint(e, tint) * map_level(color_maps, e.maps[EMISSIVE], uv, level).rgb;
+    MapValues s = values_of_maps(index, uv, level_of(e, color_maps, size), level_of(e, data_maps, size));
+    vec3 base = e.base_color.rgb * tint * s.base, glow = glow_tint(e, tint) * s.glow;
 #ifdef EXTENDED
-    float data_level = level_of(e, data_maps, size);
-    vec3 f0 = map_level(color_maps, e.maps[SPECULAR_COLOR], uv, level).rgb * map_level(color_maps, e.maps[SPECULAR], uv, level).a;
-    e = with_dielectric(e, f0, map_level(data_maps, e.maps[TRANSMITTED], uv, data_level).r);
+    e = with_dielectric(e, s.f0, s.transmission);
 #endif
-    Material m = mapped(e, base, rough_metal.y, rough_metal.x, 1.0, glow);
+    Material m = mapped(e, base, s.metallic, s.roughness, 1.0, glow);
 #ifdef EXTENDED
-    m.over = coating_of(e, uv, level, data_level);
+    m.over = mapped_coating(e, s.over);
 #endif
     return m;
 }
