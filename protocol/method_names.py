@@ -30,14 +30,6 @@ def require_method(name: str) -> str:
     raise DeltalightError(f"'{name}' is not a method; the nearest is {nearest}, of {', '.join(known)}.")
 
 
-def split_short_name(method: str) -> tuple[str, str]:
-    """Returns a method's name in scene documents and its operator, "" = the default one, from one of METHODS."""
-    if method in ("exact", "paper"):
-        return "dvct", method
-    name, _, operator = method.partition("-")
-    return name, operator
-
-
 def with_method(scene: "SceneDocument", method: str) -> "SceneDocument":
     """Returns the scene with a method: `exact` or `paper` (operators of dvct), or NAME[-OPERATOR].
 
@@ -46,6 +38,11 @@ def with_method(scene: "SceneDocument", method: str) -> "SceneDocument":
     Raises:
         DeltalightError: there is no such method.
     """
-    name, operator = split_short_name(method) if require_method(method) in METHODS else (method, "")
+    from deltalight.protocol.methods import PLUGINS
+
+    if require_method(method) in ("exact", "paper"):
+        name, operator = "dvct", method
+    else:
+        name, _, operator = (method, "", "") if method in PLUGINS.values else method.partition("-")
     chosen = scene if scene.method.method_name() == name else scene.replaced(method={"name": name})
     return chosen.replaced(method=chosen.method.replaced(operator=operator)) if operator else chosen

@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from pydantic import BeforeValidator, Discriminator, Tag
 
-from deltalight.protocol.method_names import METHODS, split_short_name
 from deltalight.protocol.plugins import LoadedPlugins, Plugin, installed_plugins, load_plugins
 from deltalight.protocol.scene_method import BUILT_IN_METHODS, DEFAULT_METHOD, MethodSettings
 
@@ -68,10 +67,13 @@ def _refuse_faulty(value: Any) -> Any:  # noqa: ANN401 - as above
 
 def _short_name_fault(name: str) -> str | None:
     """Says how a scene document writes what command lines call by a short name; None if `name` is none of those."""
-    if name not in METHODS:
-        return None
-    method, operator = split_short_name(name)
-    return f"`{name}` is a short name for command lines; here write {{name: {method}, operator: {operator}}}"
+    for model in BUILT_IN_METHODS:
+        method, field = model.method_name(), model.model_fields.get("operator")
+        for operator in () if field is None else get_args(field.annotation):
+            if name in (operator, f"{method}-{operator}"):
+                written = f"{{name: {method}, operator: {operator}}}"
+                return f"`{name}` is a short name for command lines; here write {written}"
+    return None
 
 
 if TYPE_CHECKING:
