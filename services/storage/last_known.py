@@ -21,7 +21,7 @@ Answer = TypeVar("Answer")
 class _Known:
     answer: Any
     read: Callable[[], Any]
-    read_s: float  # of the monotonic clock
+    read_s: float  # when the read began, of the monotonic clock
     asked_s: float
 
 
@@ -41,6 +41,10 @@ class LastKnown:
         Raises:
             DatabaseGoneError: the database is away, and nothing is known.
         """
+        return self._answer(key, read, self._clock_s())
+
+    def _answer(self, key: Hashable, read: Callable[[], Answer], asked_s: float) -> Answer:
+        begun_s = self._clock_s()
         try:
             answer = read()
         except DatabaseGoneError:
@@ -55,14 +59,23 @@ class LastKnown:
             with self._lock:
                 self._known.pop(key, None)
             raise
-        self.note(key, answer, read)
+        self._note(key, _Known(answer, read, begun_s, asked_s))
         return answer
 
     def note(self, key: Hashable, answer: Answer, read: Callable[[], Answer]) -> None:
         """Notes what `read` would answer now."""
         now_s = self._clock_s()
+        self._note(key, _Known(answer, read, now_s, now_s))
+
+    def _note(self, key: Hashable, found: _Known) -> None:
+        """Notes an answer unless a read that began later, on another thread, has given one."""
         with self._lock:
-            self._known[key] = _Known(answer, read, now_s, now_s)
+            known = self._known.get(key)
+            if known is not None:
+                known.asked_s = found.asked_s = max(known.asked_s, found.asked_s)
+                if known.read_s > found.read_s:
+                    return
+            self._known[key] = found
             self._known.move_to_end(key)
             if len(self._known) > MOST_ANSWERS:
                 self._known.popitem(last=False)
@@ -92,7 +105,4 @@ class LastKnown:
             asked = [(key, known) for key, known in self._known.items() if known.asked_s >= since_s]
         for key, known in asked:
             with suppress(DeltalightError):
-                self.answer(key, known.read)
-                with self._lock:  # it was not asked for now
-                    if key in self._known:
-                        self._known[key].asked_s = known.asked_s
+                self._answer(key, known.read, known.asked_s)  # it was not asked for now

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from itertools import cycle
+from itertools import count, cycle
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -295,6 +295,22 @@ def test_what_is_known_ends_and_is_bounded() -> None:
     now_s += 2
     with pytest.raises(DatabaseGoneError):
         known.answer(1, lambda: read(1))
+
+
+def test_a_slow_read_does_not_replace_the_answer_of_a_later_one() -> None:
+    """A process reads again what was asked for when others change something, beside requests that read it too."""
+    clock_s = count()
+    known = LastKnown(lambda: float(next(clock_s)))
+
+    def slow() -> str:
+        assert known.answer("name", lambda: "two") == "two"  # on another thread, after a change
+        return "one"
+
+    def gone() -> str:
+        raise DatabaseGoneError("gone")
+
+    assert known.answer("name", slow) == "one"
+    assert known.answer("name", gone) == "two"
 
 
 def test_a_service_that_begins_waits_for_its_database(
