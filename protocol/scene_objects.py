@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz
@@ -115,11 +115,20 @@ AnyMaterial = Annotated[
 ]
 
 
+def _clip(value: object) -> object:
+    """Refuses what neither names nor numbers a clip, in one sentence for both."""
+    if value == "" or not isinstance(value, str | int | None):
+        raise ValueError("must be the name of a clip, or its number (from 0)")
+    return value
+
+
 class Animation(StrictModel):
     """Plays a clip of the asset; what it shows follows from a frame's capture time alone."""
 
     clip: Annotated[
-        Annotated[int, Field(ge=0)] | Annotated[str, Field(min_length=1)] | None, AfterValidator(without_nul)
+        Annotated[int, Field(ge=0)] | Annotated[str, Field(min_length=1)] | None,
+        AfterValidator(without_nul),
+        BeforeValidator(_clip),
     ] = Field(default=None, description="Name or number (from 0) of the asset's clip; null = the first.")
     speed: float = Field(
         default=1.0,

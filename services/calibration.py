@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,20 +55,21 @@ class Watch:
         from deltalight.sensor_node.calibration.picture_sources import collect_views
 
         if self.total is None:
-            self.console.print(
-                f"Show the target from all sides and hold it still each time; {enough} views are needed,"
-                " or press Ctrl-C to stop early."
-            )
-            return collect_views(series, target, enough=enough, tell=self._tell_live)
+            return collect_views(series, target, enough=enough, tell=partial(self._tell_live, enough=enough))
         columns = (TextColumn("looking for the target"), BarColumn(), MofNCompleteColumn())
         hidden = not self.console.is_terminal  # it would leave an empty line in a file
         with Progress(*columns, console=self.console, transient=True, disable=hidden) as progress:
             task = progress.add_task("pictures", total=self.total)
             return collect_views(series, target, enough=enough, tell=lambda *_: progress.advance(task))
 
-    def _tell_live(self, collected: "ViewCollector", taken: bool) -> None:
+    def _tell_live(self, collected: "ViewCollector", taken: bool, *, enough: int) -> None:
         from deltalight.sensor_node.calibration.coverage import measure_coverage
 
+        if collected.seen == 1:  # not before: a camera may be missing
+            self.console.print(
+                f"Show the target from all sides and hold it still each time; {enough} views are needed,"
+                " or press Ctrl-C to stop early."
+            )
         if taken:
             coverage = measure_coverage(collected.views, collected.size)
             self.console.print(

@@ -1,6 +1,6 @@
 """`deltalight calibrate extrinsics`: one transform of calibration/extrinsics.yaml from a recording."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -71,7 +71,7 @@ def _find(
     )
 
     poses = rgb_from_fisheye_poses if what == "rgb_from_fisheye" else world_from_fisheye_poses
-    placement = mean_placement(list(poses(_watched(source), board)), what)
+    placement = mean_placement(list(poses(_with_fisheye(_watched(source)), board)), what)
     figures = {
         "poses": placement.poses,
         "outliers": placement.outliers,
@@ -104,3 +104,20 @@ def _watched(source: Source) -> Iterator[SensorFrame]:
     yield from track(
         source, "looking for the board", len(source), console=console, transient=True, disable=hidden
     )
+
+
+def _with_fisheye(frames: Iterable[SensorFrame]) -> Iterator[SensorFrame]:
+    """Yields the frames that have a picture of the fish-eye camera.
+
+    Raises:
+        DeltalightError: none has one.
+    """
+    found = False
+    for frame in frames:
+        if frame.fisheye is not None:
+            found = True
+            yield frame
+    if not found:
+        raise DeltalightError(
+            "the source holds no pictures of a fish-eye camera; record a node that has one (`--fisheye`)."
+        )

@@ -237,6 +237,11 @@ def test_json_and_yaml_say_the_same_and_assets_become_absolute(tmp_path: Path) -
         ),
         (
             "s.json",
+            '{"objects": [{"asset": "a.glb", "animation": {"clip": ""}}]}',
+            r"`objects\[0\]\.animation\.clip` is wrong: must be the name of a clip, or its number \(from 0\)",
+        ),
+        (
+            "s.json",
             r'{"real": {"surfaces": [{"region": {"material": "\u0000"}}]}}',
             r"`real\.surfaces\[0\]\.region\.material` is wrong: must not hold a NUL character",
         ),

@@ -129,6 +129,12 @@ def test_wrong_use_ends_with_code_2_and_one_sentence(cli: RunCli, shots: Path, t
     assert "only 0 of 14 pictures" in sentence(wrong)
 
 
+def test_a_camera_that_is_not_there_asks_nobody_to_show_the_target(tmp_path: Path) -> None:
+    done = calibrate("camera", "uvc:63", "--out", tmp_path, *TARGET)
+    assert "uvc:63" in sentence(done)
+    assert "Show the target" not in done.output
+
+
 def test_what_is_refused_leaves_no_folder(shots: Path, take: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     for out in (tmp_path / "new" / "out", tmp_path / "out"):
@@ -161,7 +167,7 @@ def test_extrinsics_are_refused_or_kept_and_never_overwritten(take: Path, tmp_pa
     before = path.read_bytes()
     arguments = ("extrinsics", take, "--out", tmp_path, "--what")
     assert "has world_from_fisheye already" in sentence(calibrate(*arguments, "world_from_fisheye"))
-    assert "only 0 moments" in sentence(calibrate(*arguments, "rgb_from_fisheye"))
+    assert "no pictures of a fish-eye camera" in sentence(calibrate(*arguments, "rgb_from_fisheye"))
     assert "leave depth_from_rgb uncertain" in sentence(calibrate(*arguments, "depth_from_rgb"))
     assert path.read_bytes() == before
 
