@@ -49,7 +49,7 @@ class CastBeams:
         if not casts_caustics(objects):
             return None
         low, high = objects.bounds
-        offset = SELF_SHADOW_TEXELS * self._lights.virtual_texel_m((low + high) / 2)
+        offset = SELF_SHADOW_TEXELS * self._lights.object_texel_m((low + high) / 2)
         materials = objects.materials
         scene = {**seen.bindings, **materials.bindings, **self._lights.bindings, "normal_offset": offset}
         self._beams.trace(self._lights, bvh, materials, scene, bias_m=seen.scan.bias_m)

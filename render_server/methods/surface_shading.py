@@ -168,7 +168,7 @@ class SurfaceShading:
         self._unchanged: DirectLight | None = None
         self._rays: MirrorRays | None = None
         self._object_rays: MirrorRays | None = None
-        self._texel_m = options.texel_m or lights.virtual_texel_m
+        self._texel_m = options.texel_m or lights.object_texel_m
 
     def scene(
         self,
