@@ -227,12 +227,13 @@ def light_stages(
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
 
 
-def bounced_later(
+def lagging_behind_objects(
     g: Graph, s: FrameResources, lit: LitScene, tier: QualityTier, *also: Resource[Any]
 ) -> AbstractContextManager[None]:
-    """Context whose stages may lag behind moving objects (`QualityTier.bounce_turns`).
+    """Context whose stages may lag some frames behind moving objects (`QualityTier.bounce_turns`, `Graph.lagging`).
 
-    `also`: other resources that follow the objects.
+    So a frame with a moved object need not wait for its bounced light. `also`: other resources that follow the
+    objects.
     """
     followers = s.objects, object_extent(g, s), lit.object_maps
     return g.lagging(tier.bounce_turns, *followers, *lit.mirrored, *also)

@@ -83,10 +83,10 @@ class _Rows:
 
 
 class LightBuffers:
-    """GPU buffers of the lights: reflective shadow maps (RSM) of the real scene and of the objects, and their records.
+    """GPU buffers of the lights: their records, and reflective shadow maps (RSM) of real scene and objects.
 
-    Lamps that come with objects shine in rho alone: the picture was taken without them. Buffers of a solution of its
-    own (`is_joint`; methods/differential.py), whose `real` maps hold real scene and objects, need no such distinction.
+    Lamps that come with objects shine in rho alone, because the picture was taken without them. With `is_joint`, the
+    buffers are those of rho alone, and their `real` maps show the objects too (methods/differential.py).
     """
 
     def __init__(
@@ -217,7 +217,9 @@ class LightBuffers:
         ):
             ranges = (first_real, len(real_part), first_object, len(object_part))
             if index < 0:
-                records += _pack_light(light, ranges, tail=OBJECT_LAMP if index >= first_lamp else NOT_MIRRORED)
+                records += _pack_light(
+                    light, ranges, tail=OBJECT_LAMP if index >= first_lamp else NOT_MIRRORED
+                )
             else:
                 records += _pack_mirror(self.mirrors[index], index, axes[index], ranges)
             first_real += len(real_part)

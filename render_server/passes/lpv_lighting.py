@@ -37,7 +37,9 @@ class LpvInjectMaps:
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
     ) -> None:
         """Adds the light that the real scene reflects as if there were no objects."""
-        views = [view for view in range(len(lights.real_views)) if view not in lights.real_views_of_object_lamps]
+        views = [
+            view for view in range(len(lights.real_views)) if view not in lights.real_views_of_object_lamps
+        ]
         self._inject_views(self._real, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
     def add_change(
