@@ -307,7 +307,7 @@ class LiveScene:
         for graph, camera, each in zip(graphs, real.cameras, taken, strict=True):
             size = each.view.size
             # While nothing moves, the pose's own jitter must not shake the picture.
-            view = camera.seen.at(size).view
+            view = camera.moved_frame.at(size).view
             view = view.with_antialiasing if output.antialiasing else view
             graph.set_inputs(
                 FrameInputs(

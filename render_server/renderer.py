@@ -313,8 +313,8 @@ class SceneRenderer:
             camera.relit = None
             return FrameSource(camera, frame, None, None, None, [])
         buffers = None if camera.relit is None else camera.relit.shown()
-        seen = camera.posed.view if buffers is None else buffers.view
-        return FrameSource(camera, frame, camera.relit, buffers, seen, self._live.describe_lights())
+        view = camera.posed.view if buffers is None else buffers.view
+        return FrameSource(camera, frame, camera.relit, buffers, view, self._live.describe_lights())
 
     @property
     def graph(self) -> Graph | None:

@@ -84,7 +84,7 @@ class ShadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers that a method hands to composition.
+    """The layers that a method declares for composition, which reads their values as `RelitLayers`.
 
     Attributes:
         direct, cones, grid: light at visible surfaces, and the grid that `cones` are on.

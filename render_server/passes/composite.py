@@ -94,7 +94,7 @@ class ChangeRatio:
 
 @dataclass(frozen=True)
 class RelitLayers:
-    """The layers that a relighting method hands to composition.
+    """The values of a method's `Layers` (methods/surface_shading.py) in one frame, and the objects' coverage.
 
     `voxels`, `volume`, `lights` and `error` are for debug views.
     """
