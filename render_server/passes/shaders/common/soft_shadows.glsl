@@ -93,7 +93,7 @@ vec2 light_sample(LightExtent k, int j, int count) {
 
 // Every loop over a light's samples appears twice, once for discs and once for squares, with no iterations for the
 // other kind: llvmpipe leaves a loop early, but executes both sides of a branch. Loops test at their end, because it runs
-// the body of those that test at their beginning once more, for no lane.
+// the body of those that test at their beginning once more, with all lanes masked.
 
 struct Blocking { float sum; float hits; float deepest; };   // depths
 
