@@ -240,9 +240,9 @@ class SurfaceShading:
         *_kept: DirectLight,
     ) -> DirectLight:
         """Computes the direct light on the real surfaces, except where the last frame's is reused."""
-        joint = None if voxels is None else voxels.texture
+        shadow_voxels = None if voxels is None else voxels.texture
         traced = bvh if scene["TRANSMISSION"] else None
-        self._direct.run(grid, scene, joint=joint, caustics=caustics, objects=traced)
+        self._direct.run(grid, scene, shadow_voxels=shadow_voxels, caustics=caustics, objects=traced)
         return self._direct
 
     def light_unchanged(self, scene: Bindings, grid: LowResGrid) -> DirectLight:
