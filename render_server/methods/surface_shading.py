@@ -413,7 +413,7 @@ def shading_stages(
     voxels: Resource[Any] = own.voxels or g.value("voxels", no_voxels, volume)
     marching = own.marching or g.value("marching", no_bindings, volume)
     g.section("shading")
-    scene = whole_scene = g.value(
+    scene = plain_scene = g.value(
         "shading scene", shading.scene, s.geometry, s.objects, s.view, volume, s.lit_area, *lit.all, s.lights
     )
     bvh = object_bvh(g, s)
@@ -429,7 +429,8 @@ def shading_stages(
         )
     direct_mu = None
     if own.light_directly is None:
-        direct_mu = g.stage("direct light mu", shading.light_unchanged, whole_scene, grid)
+        # For estimates, which try other lights: nothing of the last frame's light serves.
+        direct_mu = g.stage("direct light mu", shading.light_unchanged, plain_scene, grid)
     cones = own.trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     light = own.light_directly or shading.light_directly
