@@ -6,7 +6,7 @@
 #define GRID_ACCESS readonly
 #include "common/voxel_store.glsl"
 #include "common/light_rays.glsl"
-#include "common/even_noise.glsl"
+#include "common/interleaved_gradient_noise.glsl"
 #ifdef VIRTUAL
 #include "common/materials.glsl"
 #ifdef EXTENDED
@@ -56,7 +56,7 @@ float even = -1.0;           // 0..1: what is added before rounding down, anothe
 
 void choose_rounding(LightView view, ivec2 texel, float depth) {
     float across = voxel_edge / texel_side(view, depth);
-    even = across * across > MANY ? even_noise(vec2(texel)) : -1.0;
+    even = across * across > MANY ? interleaved_gradient_noise(vec2(texel)) : -1.0;
 }
 
 int rounded(float amount) { return even < 0.0 ? fixed_point(amount) : int(floor(amount * FIXED_POINT + even)); }
