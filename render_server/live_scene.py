@@ -237,7 +237,11 @@ class LiveScene:
         changed |= self._note_change(objects, first, moved=False)
         relit = self._relit(taken, level, changed=changed)
         best = self._refined(self._real, taken, objects, surfaces) if self._is_at_rest(first) else []
-        return self._with_refined(relit, best, at_once=full_size or again)
+        if not best:
+            self._refined_ns = None
+            return relit
+        pairs = zip(relit, best, strict=True)
+        return [self._fading(each, graph, at_once=full_size or again) for each, graph in pairs]
 
     def _upload(self, sized: Sequence[PosedFrame]) -> list[FrameGraph]:
         """Uploads the frames' pictures; returns the graphs that fit them."""
@@ -338,15 +342,6 @@ class LiveScene:
         self._set_inputs(best, real, taken, objects, surfaces)
         options, until_s = self._options(self._plan.scene.output), time.monotonic() + REFINE_S
         return best if all(graph.advance(options, until_s) for graph in best) else []
-
-    def _with_refined(
-        self, relit: list[RelitFrame], best: Sequence[FrameGraph], *, at_once: bool
-    ) -> list[RelitFrame]:
-        """Returns the frames, or their refined ones if there are graphs of these."""
-        if not best:
-            self._refined_ns = None
-            return relit
-        return [self._fading(each, graph, at_once=at_once) for each, graph in zip(relit, best, strict=True)]
 
     def _fading(self, before: RelitFrame, best: FrameGraph, *, at_once: bool) -> RelitFrame:
         """Returns the refined frame, faded in within FADE_NS unless it is shown `at_once`."""
