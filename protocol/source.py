@@ -49,7 +49,7 @@ class Source(Protocol):
 
     @property
     def timestamps_ns(self) -> list[int]:
-        """Captures time of every frame."""
+        """Capture time of every frame."""
 
     def __len__(self) -> int: ...
 

@@ -66,7 +66,7 @@ class CameraState:
 class FrameSource:
     """What all views of one frame are made from.
 
-    `relit`, `buffers` (of `relit`) and the view `seen` are None without a pose, the first two also without
+    `relit`, `buffers` (of `relit`) and `camera_view` are None without a pose, the first two also without
     anything to relight. `lights` are plain values.
     """
 
@@ -74,7 +74,7 @@ class FrameSource:
     frame: ViewFrame
     relit: RelitFrame | None
     buffers: ShownBuffers | None
-    seen: CameraView | None
+    camera_view: CameraView | None
     lights: list[dict[str, Any]]
 
     @property
@@ -84,11 +84,11 @@ class FrameSource:
 
     def note_shown(self, views: Sequence[ShownView], model: Sequence[TriangleMesh]) -> None:
         """Notes what the camera's newest pictures show; `model`: the real scene's meshes, if given."""
-        seen = next((seen for seen in map(self.seen_in, views) if seen is not None), None)
-        self.camera.shown = ShownFrame(self.frame, seen, self.buffers, model)
+        shown = (each for each in map(self.camera_view_in, views) if each is not None)
+        self.camera.shown = ShownFrame(self.frame, next(shown, None), self.buffers, model)
 
-    def seen_in(self, view: ShownView) -> CameraView | None:
+    def camera_view_in(self, view: ShownView) -> CameraView | None:
         """Returns the camera's view; None if the picture is not the camera's, or there is no pose."""
         if view == "lights" and self.is_lit:
-            return self.seen if self.frame.radiance_map is None else None
-        return None if view == "rsm" and self.relit is not None else self.seen
+            return self.camera_view if self.frame.radiance_map is None else None
+        return None if view == "rsm" and self.relit is not None else self.camera_view

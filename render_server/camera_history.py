@@ -40,8 +40,8 @@ class CameraHistory:
         self._has_depth, self._on_gpu = has_depth, on_gpu
         self._expected: FrameSamples | None = None
         self._newest: FrameSamples | None = None
-        self._last: FrameSamples | None = None  # in which anything moved
-        self._seen: PosedFrame | None = None
+        self._moved_samples: FrameSamples | None = None  # in which anything moved
+        self._moved_frame: PosedFrame | None = None
         self.moved = False  # in the newest frame
         self._built_from: PosedFrame | None = None
         self._surfaces: dict[PosedFrame, DepthSurface] = {}
@@ -64,7 +64,7 @@ class CameraHistory:
         # Depth without a surface (a camera that starts) explains nothing: the next frame counts as another scene.
         self.moved = self._motion.update(samples) or is_unknown
         if self.moved:
-            self._last, self._seen = samples, taken
+            self._moved_samples, self._moved_frame = samples, taken
             self._surfaces.clear()
             self._scans.clear()
         return self.moved
@@ -76,7 +76,7 @@ class CameraHistory:
         """
         if self._kept is None:
             return True
-        kept, samples, last, built = self._kept, self._newest, self._last, self._kept.built_from
+        kept, samples, last, built = self._kept, self._newest, self._moved_samples, self._kept.built_from
         assert samples is not None
         if built is None or is_unknown:
             return True
@@ -95,27 +95,27 @@ class CameraHistory:
 
     def renew(self, taken: PosedFrame) -> PosedFrame:
         """Returns the frame to build the real scene from: `taken`, or the last that moved if it was not used yet."""
-        if self._kept is not None and self._kept.built_from is not self._last:
-            taken, self.moved = self.seen, True
-            self._kept.built_from = self._last
+        if self._kept is not None and self._kept.built_from is not self._moved_samples:
+            taken, self.moved = self.moved_frame, True
+            self._kept.built_from = self._moved_samples
         return taken
 
     def set_built(self) -> None:
-        """Records that the real scene was built from the frame `seen`."""
-        self._built_from = self.seen
+        """Records that the real scene was built from `moved_frame`."""
+        self._built_from = self.moved_frame
         self._scans.clear()
         self._measurements.clear()
 
     @property
-    def seen(self) -> PosedFrame:
+    def moved_frame(self) -> PosedFrame:
         """The frame in which anything last moved, the camera included; there was one."""
-        assert self._seen is not None
-        return self._seen
+        assert self._moved_frame is not None
+        return self._moved_frame
 
     @property
     def is_settled(self) -> bool:
         """Whether a kept world was built from the frame in which everything came to rest."""
-        return self._kept is not None and self._kept.built_from is self._last
+        return self._kept is not None and self._kept.built_from is self._moved_samples
 
     def measurement(self, size: tuple[int, int]) -> Measurement:
         """Returns the frame that the real scene was last built from, at a picture's size, always the same object."""
@@ -127,7 +127,7 @@ class CameraHistory:
 
     def scan(self, size: tuple[int, int]) -> Scan:
         """Returns the camera's measurement from when something last moved, at a picture's size."""
-        return self._scan_of(self.seen.at(size))
+        return self._scan_of(self.moved_frame.at(size))
 
     def _scan_of(self, taken: PosedFrame) -> Scan:
         if taken not in self._scans:

@@ -101,8 +101,8 @@ class FrameInputs:
 
 
 @dataclass(frozen=True, eq=False)
-class Fields:
-    """Light at the camera's pixels before composition."""
+class EvaluatedLight:
+    """Light that `FrameGraph.evaluate` found at the camera's pixels."""
 
     direct: DirectLight
     cones: ConeFields
@@ -309,7 +309,7 @@ class FrameGraph:
         edges = surface.value.coverage.interior_edges
         return mixed_radiance(read_texture(radiance.value)[..., :3], read_texture(edges))
 
-    def evaluate(self, lights: LightSet) -> Fields:
+    def evaluate(self, lights: LightSet) -> EvaluatedLight:
         """Evaluates the light without objects under other lights, at every pixel and not only near the objects.
 
         Only mu of the result is sure to follow these lights. They stay set until `set_lights` or `set_inputs`.
@@ -317,7 +317,7 @@ class FrameGraph:
         cones, layers = self.gather(lights, (0, 0, *self.resources.view.value.size)), self.layers
         direct = layers.direct_mu or layers.direct
         self._run(direct, layers.grid)
-        return Fields(direct.value, cones, layers.grid.value)
+        return EvaluatedLight(direct.value, cones, layers.grid.value)
 
     def gather(self, lights: LightSet, area: Rectangle) -> ConeFields:
         """Gathers the light that cones find under other lights, in a part of the picture; else as `evaluate`."""

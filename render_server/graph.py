@@ -315,8 +315,8 @@ class Graph:
     def _update(self, stage: Stage) -> None:
         """Runs a stage if the version of any input differs from the one that it saw last."""
         versions = tuple([item.version for item in stage.inputs])
-        if versions == stage.seen or (
-            stage.lag is not None and stage.lag.holds(stage.inputs, stage.seen, versions)
+        if versions == stage.input_versions or (
+            stage.lag is not None and stage.lag.holds(stage.inputs, stage.input_versions, versions)
         ):
             return
         if 0 in versions:
@@ -329,7 +329,7 @@ class Graph:
             raise
         for output, value in zip(stage.outputs, values, strict=True):
             output.write(value, stage.same)
-        stage.seen, stage.ran_in = versions, self._runs
+        stage.input_versions, stage.ran_in = versions, self._runs
 
     def _call(self, stage: Stage) -> Sequence[Any]:
         """Runs a stage's function, timed; returns a value for each output."""
@@ -397,12 +397,16 @@ class Graph:
         """
         last_ms = {} if self.timers is None else self.timers.last_ms
         kept = [stage for stage in self._sorted() if stage.name not in ran and stage.name in last_ms]
-        return {stage.name: last_ms[stage.name] for stage in kept if stage.is_read and stage.seen is not None}
+        return {
+            stage.name: last_ms[stage.name]
+            for stage in kept
+            if stage.is_read and stage.input_versions is not None
+        }
 
     def invalidate(self) -> None:
         """Makes every stage run again with the next run that needs it."""
         for stage in self._stages:
-            stage.seen = None
+            stage.input_versions = None
 
     def report(self) -> list[StageReport]:
         """Every stage in the order in which they run, as the frame left it."""
@@ -470,7 +474,7 @@ def _forget(stage: Stage) -> None:
     """Makes a stage that failed run again, and all that lead to it: it may have changed a part of what they made."""
     for item in needed_for(stage.outputs):
         if item.stage is not None:
-            item.stage.seen = None
+            item.stage.input_versions = None
 
 
 def _of_view(name: str, view: int) -> str:

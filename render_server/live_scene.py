@@ -201,12 +201,13 @@ class LiveScene:
         state = None if self._real is None else self._real.state
         return None if state is None else state.corners
 
-    def relight(self, taken: Sequence[PosedFrame], *, whole: bool = False) -> list[RelitFrame]:
+    def relight(self, taken: Sequence[PosedFrame], *, full_size: bool = False) -> list[RelitFrame]:
         """Prepares a frame of each camera in the room for composition.
 
-        Returns none if there is nothing to compose, because no object is visible or no light is known yet. `whole`:
-        at the camera's size, whatever the budget. Boards on objects, and the lights, are those of the first camera.
-        Relighting the same frames again, in another view or by another method, adds nothing to averages over frames.
+        Returns none if there is nothing to compose, because no object is visible or no light is known yet.
+        `full_size`: at the camera's size, whatever the budget. Boards on objects, and the lights, are those of the
+        first camera. Relighting the same frames again, in another view or by another method, adds nothing to averages
+        over frames.
         """
         if self._plan.method.document.quality != self._budget.level.quality:
             self._apply(self._planned(self._plan.scene))
@@ -218,12 +219,9 @@ class LiveScene:
         objects = self._objects.update(self._plan.scene.objects, first.board, first.timestamp_ns)
         if objects is None or self._real is None or not lit:
             return []
-        level = self._level(whole=whole)
+        level = self._level(full_size=full_size)
         sized = [each.at(scaled_size(each.view.size, level.scale)) for each in taken]
-        graphs = self._graphs.fit([each.view for each in sized], self._plan.method)
-        with self.timers.measure("upload"):
-            for graph, each in zip(graphs, sized, strict=True):
-                graph.upload(each.frame)
+        graphs = self._upload(sized)
         moved = not again and self._real.update(taken)
         if self._real.state is None:
             self._notify(
@@ -243,7 +241,15 @@ class LiveScene:
             self._refined_ns = None
             return relit
         pairs = zip(relit, best, strict=True)
-        return [self._fading(each, graph, is_whole=whole or again) for each, graph in pairs]
+        return [self._fading(each, graph, at_once=full_size or again) for each, graph in pairs]
+
+    def _upload(self, sized: Sequence[PosedFrame]) -> list[FrameGraph]:
+        """Uploads the frames' pictures; returns the graphs that fit them."""
+        graphs = self._graphs.fit([each.view for each in sized], self._plan.method)
+        with self.timers.measure("upload"):
+            for graph, each in zip(graphs, sized, strict=True):
+                graph.upload(each.frame)
+        return graphs
 
     def _relit(self, taken: Sequence[PosedFrame], level: Level, *, changed: bool) -> list[RelitFrame]:
         options = self._options(self._plan.scene.output)
@@ -284,11 +290,11 @@ class LiveScene:
         assert self._real is not None
         return self._real.is_settled and frame.timestamp_ns - self._changed_ns >= REST_NS
 
-    def _level(self, *, whole: bool) -> Level:
+    def _level(self, *, full_size: bool) -> Level:
         """Returns the level of the next frame; debug views are never enlarged."""
         level = self._budget.level
-        whole = whole or self._plan.scene.output.view != "composite"
-        return replace(level, scale=1.0) if whole else level
+        full_size = full_size or self._plan.scene.output.view != "composite"
+        return replace(level, scale=1.0) if full_size else level
 
     def _set_inputs(
         self,
@@ -305,7 +311,7 @@ class LiveScene:
         for graph, camera, each in zip(graphs, real.cameras, taken, strict=True):
             size = each.view.size
             # While nothing moves, the pose's own jitter must not shake the picture.
-            view = camera.seen.at(size).view
+            view = camera.moved_frame.at(size).view
             view = view.with_antialiasing if output.antialiasing else view
             graph.set_inputs(
                 FrameInputs(
@@ -337,13 +343,13 @@ class LiveScene:
         options, until_s = self._options(self._plan.scene.output), time.monotonic() + REFINE_S
         return best if all(graph.advance(options, until_s) for graph in best) else []
 
-    def _fading(self, before: RelitFrame, best: FrameGraph, *, is_whole: bool) -> RelitFrame:
-        """Returns the refined frame, faded in within FADE_NS unless `is_whole`."""
+    def _fading(self, before: RelitFrame, best: FrameGraph, *, at_once: bool) -> RelitFrame:
+        """Returns the refined frame, faded in within FADE_NS unless it is shown `at_once`."""
         if self._refined_ns is None:
-            self._refined_ns = before.frame.timestamp_ns - FADE_NS * is_whole
+            self._refined_ns = before.frame.timestamp_ns - FADE_NS * at_once
         fraction = (before.frame.timestamp_ns - self._refined_ns) / FADE_NS
         refined = replace(before, graph=best, level=Level("best"), moves=False, enlarge=None)
-        if is_whole or not 0 <= fraction < 1 or before.options.output.view != "composite":
+        if at_once or not 0 <= fraction < 1 or before.options.output.view != "composite":
             return refined
         size = before.frame.color.shape[1::-1]
         if self._crossfade is None or self._crossfade.size != size:

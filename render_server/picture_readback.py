@@ -27,12 +27,12 @@ class StartedView:
     """A picture of one view that was started on the GPU, or is the camera's own.
 
     `take` returns the picture, and `take_linear`, which follows it, its linear radiance (None if nobody asked for
-    it). Both wait for the GPU if the picture was `composed` there. `seen` is the camera's view, as
-    `FrameSource.seen_in` returns it.
+    it). Both wait for the GPU if the picture was `composed` there. `camera_view` is as
+    `FrameSource.camera_view_in` returns it.
     """
 
     view: ShownView
-    seen: CameraView | None
+    camera_view: CameraView | None
     take: Callable[[], UInt8[np.ndarray, "h w 3"]]
     composed: RelitFrame | None
     take_linear: Callable[[], Float32[np.ndarray, "h w 3"]] | None = None
@@ -40,7 +40,7 @@ class StartedView:
     @property
     def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
         """The pose that the picture was made with; None if there is none, or it is not the camera's."""
-        return None if self.seen is None else self.seen.world_from_camera
+        return None if self.camera_view is None else self.camera_view.world_from_camera
 
 
 class PictureReadback:
@@ -63,22 +63,22 @@ class PictureReadback:
             if isinstance(composite, Composite) and with_linear:
                 self._queue.push(composite.linear, "f2")
                 take_linear = self._take_linear
-        return StartedView(view, source.seen_in(view), take, relit, take_linear)
+        return StartedView(view, source.camera_view_in(view), take, relit, take_linear)
 
     def start_other(
         self, source: FrameSource, view: ShownView, output: Output, live: LiveScene
     ) -> StartedView:
         """Starts the frame in a view that was requested beside the document's own."""
-        frame, relit, seen = source.frame, source.relit, source.seen_in(view)
+        frame, relit, camera_view = source.frame, source.relit, source.camera_view_in(view)
         if view == "lights" and source.is_lit:
             lights = live.lighting.picture(frame)
-            return StartedView(view, seen, lambda: lights, None)
+            return StartedView(view, camera_view, lambda: lights, None)
         if view == "camera" or relit is None:
-            return StartedView(view, seen, lambda: frame.color, None)
+            return StartedView(view, camera_view, lambda: frame.color, None)
         composite = relit.compose_view(view)
         with live.timers.measure("readback"):
             take = self._begin(source, relit, view, output, composite)
-        return StartedView(view, seen, take, relit)
+        return StartedView(view, camera_view, take, relit)
 
     def _begin(
         self, source: FrameSource, relit: RelitFrame, view: ShownView, output: Output, composite: Picture

@@ -177,7 +177,7 @@ class RealGeometry:
 
         What several cameras see is kept of the one that shows it largest.
         """
-        frames = [camera.seen for camera in self.cameras]
+        frames = [camera.moved_frame for camera in self.cameras]
         surfaces = [partial(_posed_surface, *each) for each in zip(self.cameras, frames, strict=True)]
         seen = SeenDepth(frames, surfaces)
         budget = self.budget // len(frames)  # of the room, however many cameras see it

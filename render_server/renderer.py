@@ -171,26 +171,26 @@ class SceneRenderer:
         frame: ViewFrame,
         *,
         with_linear: bool = False,
-        whole: bool = False,
+        full_size: bool = False,
         others: Sequence[ShownView] = (),
     ) -> PendingComposite:
         """Starts a frame on the GPU; reading its picture back does not stall later frames.
 
-        `whole`: at full size whatever the budget, as `with_linear` always is. `others`: views in which the frame is
-        rendered beside the document's own.
+        `full_size`: at the output's size whatever the budget, as `with_linear` always is. `others`: views in which
+        the frame is rendered beside the document's own.
 
         Raises:
             DeltalightError: the frame or the scene cannot be rendered, or the GPU's memory is full.
             GpuResetError: the GPU was reset; this process renders nothing any more. `finish` raises the same.
         """
-        return self.submit_views([frame], with_linear=with_linear, whole=whole, others=others)[0]
+        return self.submit_views([frame], with_linear=with_linear, full_size=full_size, others=others)[0]
 
     def submit_views(
         self,
         frames: Sequence[ViewFrame],
         *,
         with_linear: bool = False,
-        whole: bool = False,
+        full_size: bool = False,
         others: Sequence[ShownView] = (),
     ) -> list[PendingComposite]:
         """Starts a frame of each camera in one room, taken at one moment (`submit_cameras`).
@@ -202,7 +202,7 @@ class SceneRenderer:
         if len(frames) != len(self._cameras):
             self._cameras = {}
         return self.submit_cameras(
-            CameraFrame.numbered(frames), with_linear=with_linear, whole=whole, others=others
+            CameraFrame.numbered(frames), with_linear=with_linear, full_size=full_size, others=others
         )
 
     def submit_cameras(
@@ -210,7 +210,7 @@ class SceneRenderer:
         taken: Sequence[CameraFrame],
         *,
         with_linear: bool = False,
-        whole: bool = False,
+        full_size: bool = False,
         others: Sequence[ShownView] = (),
     ) -> list[PendingComposite]:
         """Starts the pictures of frames that cameras in one room took at one moment; otherwise as `submit`.
@@ -225,27 +225,18 @@ class SceneRenderer:
         with_linear = with_linear or self._with_linear
         self._begin(taken)
         sized = [self._resized(camera, each.frame) for camera, each in zip(self._newest, taken, strict=True)]
-        all_sources = self._sources(sized, whole=whole or with_linear or self.scene.output.has_bloom)
+        all_sources = self._sources(sized, full_size=full_size or with_linear or self.scene.output.has_bloom)
         sources = [source for source, each in zip(all_sources, taken, strict=True) if each.is_shown]
         started = [self._start_all(source, others, with_linear=with_linear) for source in sources]
         for source in all_sources:
             source.note_shown((self.scene.output.view, *others), self._live.model)
         times = self._end_frame(sources)
         submitted_ms = 1e3 * (time.perf_counter() - started_s)
-
-        def finish(source: FrameSource, views: Sequence[StartedView], *, accounts: bool) -> CompositeFrame:
-            main, *rest = views
-            if accounts and main.composed is not None:
-                self._live.account(main.composed, max(submitted_ms, sum(times.ran.values())))
-            done = self._finished(source, main, rest, times)
-            self._check_device()
-            return done
-
-        is_immediate = all(each.composed is None for views in started for each in views)
+        immediate = self._gpu.is_software or all(each.composed is None for views in started for each in views)
         return [
             PendingComposite(
-                partial(finish, source, views, accounts=source is sources[0]),
-                is_immediate or self._gpu.is_software,
+                partial(self._finish, source, views, times, submitted_ms if source is sources[0] else None),
+                immediate,
             )
             for source, views in zip(sources, started, strict=True)
         ]
@@ -301,7 +292,7 @@ class SceneRenderer:
         self._live = self._build(self.scene, waits=False)
         self._out_of_memory = None
 
-    def _sources(self, frames: Sequence[ViewFrame], *, whole: bool) -> list[FrameSource]:
+    def _sources(self, frames: Sequence[ViewFrame], *, full_size: bool) -> list[FrameSource]:
         """Relights the frames together. Without a pose, all there is to show is the camera's picture."""
         for camera in self._cameras.values():
             camera.forget_picture()
@@ -310,7 +301,9 @@ class SceneRenderer:
                 camera.posed = PosedFrame(frame, CameraView(frame.camera, frame.pose.world_from_camera))
         known = [camera for camera in self._newest if camera.posed is not None]
         if any(frame.pose is not None for frame in frames):
-            relit = self._live.relight([each.posed for each in known if each.posed is not None], whole=whole)
+            relit = self._live.relight(
+                [each.posed for each in known if each.posed is not None], full_size=full_size
+            )
             for camera, found in zip(known, relit, strict=False):
                 camera.relit = found
         return [self._source(camera, frame) for camera, frame in zip(self._newest, frames, strict=True)]
@@ -320,8 +313,8 @@ class SceneRenderer:
             camera.relit = None
             return FrameSource(camera, frame, None, None, None, [])
         buffers = None if camera.relit is None else camera.relit.shown()
-        seen = camera.posed.view if buffers is None else buffers.view
-        return FrameSource(camera, frame, camera.relit, buffers, seen, self._live.describe_lights())
+        view = camera.posed.view if buffers is None else buffers.view
+        return FrameSource(camera, frame, camera.relit, buffers, view, self._live.describe_lights())
 
     @property
     def graph(self) -> Graph | None:
@@ -402,28 +395,44 @@ class SceneRenderer:
         depth_m = np.where(coverage >= SHOWN_FRACTION, of_objects, np.maximum(real, 0))
         return PictureLayers(*(values.astype(np.float32) for values in (coverage, radiance, depth_m)))
 
-    def _finished(
-        self, source: FrameSource, main: StartedView, rest: Sequence[StartedView], times: PassTimes
+    def _finish(
+        self,
+        source: FrameSource,
+        views: Sequence[StartedView],
+        times: PassTimes,
+        submitted_ms: float | None,
     ) -> CompositeFrame:
-        """Takes the pictures in the order in which they were started."""
-        frame, color = source.frame, main.take()
-        linear = None if main.take_linear is None else main.take_linear()
-        return CompositeFrame(
-            frame.frame_id,
-            frame.timestamp_ns,
-            color,
-            linear,
-            "no_pose" if frame.pose is None else "ok",
-            frame.camera,
-            main.world_from_camera,
-            times.ran,
-            times.reused,
-            source.lights,
-            None if main.composed is None else main.composed.level,
-            tuple(OtherView(each.view, each.take(), each.world_from_camera) for each in rest),
-        )
+        """Waits for a frame's pictures; accounts the time of all cameras' frames unless `submitted_ms` is None."""
+        main, *rest = views
+        if submitted_ms is not None and main.composed is not None:
+            self._live.account(main.composed, max(submitted_ms, sum(times.ran.values())))
+        done = _finished(source, main, rest, times)
+        self._check_device()
+        return done
 
     def release(self) -> None:
         """Frees all GL objects."""
         self._live.release()
         self._readback.release()
+
+
+def _finished(
+    source: FrameSource, main: StartedView, rest: Sequence[StartedView], times: PassTimes
+) -> CompositeFrame:
+    """Takes the pictures in the order in which they were started."""
+    frame, color = source.frame, main.take()
+    linear = None if main.take_linear is None else main.take_linear()
+    return CompositeFrame(
+        frame_id=frame.frame_id,
+        timestamp_ns=frame.timestamp_ns,
+        color=color,
+        linear=linear,
+        status="no_pose" if frame.pose is None else "ok",
+        camera=frame.camera,
+        world_from_camera=main.world_from_camera,
+        pass_times_ms=times.ran,
+        reused_pass_times_ms=times.reused,
+        lights=source.lights,
+        level=None if main.composed is None else main.composed.level,
+        others=tuple(OtherView(each.view, each.take(), each.world_from_camera) for each in rest),
+    )

@@ -60,7 +60,7 @@ class Stage:
         plugin: the plugin that declared the stage, if any.
         lag: decides in which frames it may wait, if any.
         view: number of the view that declared it.
-        seen: versions of the inputs when it last ran; None: it never ran, or must run again.
+        input_versions: versions of the inputs when it last ran; None: it never ran, or must run again.
         ran_in: number of the graph's run in which it last ran.
         is_read: whether a stage reads what it writes (known once the graph has run).
     """
@@ -73,7 +73,7 @@ class Stage:
     plugin: Plugin | None = None
     lag: Lag | None = None
     view: int = 0
-    seen: tuple[int, ...] | None = None
+    input_versions: tuple[int, ...] | None = None
     ran_in: int = 0
     is_read: bool = False
 

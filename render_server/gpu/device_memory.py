@@ -10,9 +10,8 @@ from deltalight.render_server.gpu.context import create_context
 
 _NVX, _ATI = "GL_NVX_gpu_memory_info", "GL_ATI_meminfo"
 _DEDICATED_NVX, _AVAILABLE_NVX = 0x9047, 0x9049  # kB (NVX_gpu_memory_info)
-_TEXTURE_FREE_ATI = (
-    0x87FC  # kB free, of all and of the largest block, the same of auxiliary memory (ATI_meminfo)
-)
+# kB free, of all and of the largest block, the same of auxiliary memory (ATI_meminfo).
+_TEXTURE_FREE_ATI = 0x87FC
 _CONTROL_GROUP, _USED_BY_IT = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
 _MEMORY = Path("/proc/meminfo")
 

@@ -202,7 +202,7 @@ class SolutionLights:
         receivers = shadow_receivers(real, extent.upright) if is_around_objects else real.points
         receivers, points = (np.concatenate([each, extent.points]) for each in (receivers, real.points))
         for buffers, own in ((self.mu, ()), (self.rho, lamps)):
-            buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)), virtual_lights=own)
+            buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)), object_lamps=own)
         return self.rho.real_records
 
     def draw_mu(self, _views: bytes, real: GeometryState) -> LightBuffers:

@@ -13,7 +13,7 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels, dvct_paper
-from deltalight.render_server.methods.light_maps import bounced_later, light_stages
+from deltalight.render_server.methods.light_maps import lagging_behind_objects, light_stages
 from deltalight.render_server.methods.method import (
     RelightingMethod,
     ResolvedSettings,
@@ -174,7 +174,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     )
     g.section("voxels")
     voxels = g.shared("voxels", lambda: DeltaVoxels(g.gpu, settings, resolved.volume_size))
-    with bounced_later(g, s, lit, settings.tier):
+    with lagging_behind_objects(g, s, lit, settings.tier):
         placement = voxel_placements(g, s, setup, DIRECTIONS)
         mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
     shading = _shading(g.gpu, setup, lit.buffers)

@@ -13,7 +13,7 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages
+from deltalight.render_server.methods.light_maps import LitScene, lagging_behind_objects, light_stages
 from deltalight.render_server.methods.method import Setup
 from deltalight.render_server.methods.per_volume import PerVolume, VolumePool
 from deltalight.render_server.methods.surface_shading import (
@@ -206,7 +206,7 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("voxels")
     voxels = g.shared("voxels", lambda: InjectedVoxels(g.gpu, resolved.volume_size))
-    with bounced_later(g, s, lit, settings.tier):
+    with lagging_behind_objects(g, s, lit, settings.tier):
         placement = voxel_placements(g, s, setup, voxels.directions)
         lights = g.shared(
             "volume lights", lambda: VolumeLights(g.gpu, resolved, settings.shadow_samples, settings.tier)

@@ -108,7 +108,7 @@ class LightStages:
         ):
             self._place(*fitted)
             self._fitted = fitted
-        return self.buffers.real_records, self.buffers.virtual_records
+        return self.buffers.real_records, self.buffers.object_records
 
     def _place(
         self,
@@ -132,7 +132,7 @@ class LightStages:
             receivers,
             extent.points,
             mirrors=mirrors,
-            virtual_lights=lamps,
+            object_lamps=lamps,
             blocking=blocking.points,
             groups=points_of_groups(extent),
         )
@@ -154,8 +154,8 @@ class LightStages:
     def draw_objects(self, _views: bytes, objects: GeometryState) -> LightBuffers:
         """Draws the objects as seen from the lights."""
         buffers = self.buffers
-        self._maps.run(buffers.virtual_atlas, [objects.buffers], buffers.virtual_views)
-        self._maps.measure_distances(buffers.virtual_atlas)
+        self._maps.run(buffers.object_atlas, [objects.buffers], buffers.object_views)
+        self._maps.measure_distances(buffers.object_atlas)
         return buffers
 
     def map_mirrors(
@@ -227,12 +227,13 @@ def light_stages(
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
 
 
-def bounced_later(
+def lagging_behind_objects(
     g: Graph, s: FrameResources, lit: LitScene, tier: QualityTier, *also: Resource[Any]
 ) -> AbstractContextManager[None]:
-    """Context whose stages may lag behind moving objects (`QualityTier.bounce_turns`).
+    """Context whose stages may lag some frames behind moving objects (`QualityTier.bounce_turns`, `Graph.lagging`).
 
-    `also`: other resources that follow the objects.
+    So a frame with a moved object need not wait for its bounced light. `also`: other resources that follow the
+    objects.
     """
     followers = s.objects, object_extent(g, s), lit.object_maps
     return g.lagging(tier.bounce_turns, *followers, *lit.mirrored, *also)

@@ -15,7 +15,12 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.methods.light_maps import LitScene, bounced_later, light_stages, object_extent
+from deltalight.render_server.methods.light_maps import (
+    LitScene,
+    lagging_behind_objects,
+    light_stages,
+    object_extent,
+)
 from deltalight.render_server.methods.lpv_cells import cell_stages, release_held
 from deltalight.render_server.methods.lpv_memory import PrintedSizes, affordable_count, state_memory
 from deltalight.render_server.methods.lpv_propagated import Propagated
@@ -385,7 +390,7 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("propagation volumes")
     declare = printed_stages if settings.operator == "paper" else difference_stages
-    with bounced_later(g, s, lit, settings.tier):
+    with lagging_behind_objects(g, s, lit, settings.tier):
         placed = volume_placements(g, s, _volume_sizes(settings), settings.volume_edge_m, settings.tier)
         cells = declare(g, s, lit, settings, g.value("volume cubes", PerVolume, placed))
     options = ShadingOptions(

@@ -14,7 +14,7 @@ from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.cast_beams import casts_caustics
+from deltalight.render_server.methods.caustic_beams import casts_caustics
 from deltalight.render_server.methods.light_maps import LitScene
 from deltalight.render_server.methods.per_volume import ForEachVolume, PerVolume, volume_pool
 from deltalight.render_server.methods.voxel_sets import SURFEL_SHADOW_SAMPLES, surfel_scene

@@ -13,7 +13,7 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
-from deltalight.render_server.methods.cast_beams import SentBeams, beam_stages, casts_caustics
+from deltalight.render_server.methods.caustic_beams import TracedBeams, beam_stages, casts_caustics
 from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, Points, object_bvh
 from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.methods.volume_placement import object_boxes
@@ -84,7 +84,7 @@ class ShadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers that a method hands to composition.
+    """The layers that a method declares for composition, which reads their values as `RelitLayers`.
 
     Attributes:
         direct, cones, grid: light at visible surfaces, and the grid that `cones` are on.
@@ -168,7 +168,7 @@ class SurfaceShading:
         self._unchanged: DirectLight | None = None
         self._rays: MirrorRays | None = None
         self._object_rays: MirrorRays | None = None
-        self._texel_m = options.texel_m or lights.virtual_texel_m
+        self._texel_m = options.texel_m or lights.object_texel_m
 
     def scene(
         self,
@@ -217,11 +217,11 @@ class SurfaceShading:
         is_diffuse = not scene["specular_surfaces"]
         return {**scene, **self._history.run(scene, light if is_diffuse else None, view)}, self._direct
 
-    def end_beams(self, sent: SentBeams | None, seen: Observation) -> Caustics | None:
+    def end_beams(self, traced: TracedBeams | None, seen: Observation) -> Caustics | None:
         """Ends beams where the camera sees a surface; None if there are none."""
-        if self._caustics is None or sent is None:
+        if self._caustics is None or traced is None:
             return None
-        self._caustics.end_beams(sent.beams, seen.bindings, sent.reach_m)
+        self._caustics.end_beams(traced.beams, seen.bindings, traced.reach_m)
         return self._caustics
 
     def cast_caustics(self, scene: Bindings, _grid: LowResGrid, beams: Caustics | None) -> Caustics | None:
@@ -240,9 +240,9 @@ class SurfaceShading:
         *_kept: DirectLight,
     ) -> DirectLight:
         """Computes the direct light on the real surfaces, except where the last frame's is reused."""
-        joint = None if voxels is None else voxels.texture
+        shadow_voxels = None if voxels is None else voxels.texture
         traced = bvh if scene["TRANSMISSION"] else None
-        self._direct.run(grid, scene, joint=joint, caustics=caustics, objects=traced)
+        self._direct.run(grid, scene, shadow_voxels=shadow_voxels, caustics=caustics, objects=traced)
         return self._direct
 
     def light_unchanged(self, scene: Bindings, grid: LowResGrid) -> DirectLight:
@@ -413,12 +413,12 @@ def shading_stages(
     voxels: Resource[Any] = own.voxels or g.value("voxels", no_voxels, volume)
     marching = own.marching or g.value("marching", no_bindings, volume)
     g.section("shading")
-    scene = plain = g.value(
+    scene = plain_scene = g.value(
         "shading scene", shading.scene, s.geometry, s.objects, s.view, volume, s.lit_area, *lit.all, s.lights
     )
     bvh = object_bvh(g, s)
-    sent = beam_stages(g, s, lit, shading.tier, volume, bvh, casts=shading.has_caustics)
-    beams = g.stage("caustic ends", shading.end_beams, sent, s.own_measured)
+    traced_beams = beam_stages(g, s, lit, shading.tier, volume, bvh, casts=shading.has_caustics)
+    beams = g.stage("caustic ends", shading.end_beams, traced_beams, s.own_measured)
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     kept: list[Resource[Any]] = []
     if shading.reuses_light:
@@ -429,13 +429,14 @@ def shading_stages(
         )
     direct_mu = None
     if own.light_directly is None:
-        direct_mu = g.stage("direct light mu", shading.light_unchanged, plain, grid)
+        # For estimates, which try other lights: nothing of the last frame's light serves.
+        direct_mu = g.stage("direct light mu", shading.light_unchanged, plain_scene, grid)
     cones = own.trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     light = own.light_directly or shading.light_directly
     marches = own.light_directly is not None or shading.has_shadow_cones
-    joint = voxels if marches else g.value("shadow voxels", no_voxels, volume)
-    direct = g.stage("direct light", light, scene, grid, caustics, joint, bvh, *kept)
+    shadow_voxels = voxels if marches else g.value("shadow voxels", no_voxels, volume)
+    direct = g.stage("direct light", light, scene, grid, caustics, shadow_voxels, bvh, *kept)
     if own.refract is not None:
         traced = s.objects, scene, grid, direct, bvh, s.observation, marching
         cones = g.stage("refracted cones", own.refract, cones, *traced)

@@ -145,7 +145,7 @@ def surfel_scene(
         **albedo.bindings,
         "shadow_samples": SURFEL_SHADOW_SAMPLES,
         "bias_real": seen.scan.bias_m,
-        "bias_virtual": seen.scan.bias_m,
+        "bias_object": seen.scan.bias_m,
         "depth_tolerance": DEPTH_TOLERANCE if measured else -1.0,
         "picture_lod": math.log2(SURFEL_PIXELS),
     }

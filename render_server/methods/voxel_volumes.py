@@ -20,7 +20,7 @@ from deltalight.render_server.gpu.uniform_block import UniformBlock
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.cast_beams import casts_caustics
+from deltalight.render_server.methods.caustic_beams import casts_caustics
 from deltalight.render_server.methods.light_maps import LitScene
 from deltalight.render_server.methods.method import march_defines
 from deltalight.render_server.methods.volume_placement import Placements

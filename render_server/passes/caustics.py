@@ -74,10 +74,10 @@ class CausticBeams:
                     self._gpu, "caustic_beams", RAY_COUNT=RAYS, REFRACTED=1, PATHS=PATHS
                 )
             kernels.append((self._refracted_beams, 0.0, GREATEST_ALPHA))
-        self._empty_beams(len(lights.virtual_views) * (1 + PATHS if materials.transmits else 1))
+        self._empty_beams(len(lights.object_views) * (1 + PATHS if materials.transmits else 1))
         own: Bindings = {**scene, **objects.bindings, "bias_real": bias_m}
-        for view in range(len(lights.virtual_views)):
-            self._trace_beams(lights, lights.first_virtual_view + view, own, kernels)
+        for view in range(len(lights.object_views)):
+            self._trace_beams(lights, lights.first_object_view + view, own, kernels)
 
     def _empty_beams(self, views: int) -> None:
         """Allocates and clears the beams of that many views, each with one beam a ray."""

@@ -94,7 +94,7 @@ class ChangeRatio:
 
 @dataclass(frozen=True)
 class RelitLayers:
-    """The layers that a relighting method hands to composition.
+    """The values of a method's `Layers` (methods/surface_shading.py) in one frame, and the objects' coverage.
 
     `voxels`, `volume`, `lights` and `error` are for debug views.
     """
@@ -164,7 +164,7 @@ class Composite:
             cone_specular_rho=cones.specular_rho,
             change_ratio=layers.change.ratio,
             Texels=layers.change.texels,
-            has_virtual_lights=layers.lights.has_virtual_lights,
+            has_object_lamps=layers.lights.has_object_lamps,
             reflection=layers.reflection,
             has_reflection=layers.reflection is not None,
             distant_change=layers.change.distant,
@@ -306,7 +306,7 @@ class DebugViews:
         )
 
     def shadow_maps(self, code: moderngl.Texture, lights: LightBuffers) -> None:
-        """Shows the real maps on the left, the virtual maps on the right."""
+        """Shows the maps of the real scene on the left, those of the objects on the right."""
         self._kernel("rsm_view").run(code.size, lights.bindings, code_out=code)
 
     def _kernel(self, name: str, **defines: int) -> Kernel:

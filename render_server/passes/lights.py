@@ -37,7 +37,7 @@ GREATEST_IRRADIANCE = BRIGHTEST / 16  # of a map: what bounces and voxels add up
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
 MIRROR_MAP_MARGIN = 1.1  # of the extent that the map has to cover
 NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
-OF_OBJECT = (0.0,) * 7 + (-2.0,) + (0.0,) * 8
+OBJECT_LAMP = (0.0,) * 7 + (-2.0,) + (0.0,) * 8
 
 MapAxes = tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]
 
@@ -83,17 +83,17 @@ class _Rows:
 
 
 class LightBuffers:
-    """GPU buffers of the lights: their shadow maps of the real scene and the objects, and their records.
+    """GPU buffers of the lights: their records, and reflective shadow maps (RSM) of real scene and objects.
 
-    Lights that come with objects shine in the light with objects alone, unless the buffers are that light's own
-    (`is_joint`).
+    Lamps that come with objects shine in rho alone, because the picture was taken without them. With `is_joint`, the
+    buffers are those of rho alone, and their `real` maps show the objects too (methods/differential.py).
     """
 
     def __init__(
         self, gpu: GpuContext, tile_size: int, shadow_samples: int, *, is_joint: bool = False
     ) -> None:
         self._is_joint = is_joint
-        self._virtual_count = 0  # of lights that come with objects; they follow those of the scene
+        self._object_lamp_count = 0  # lamps that come with objects follow the lights of the scene
         self._gpu = gpu
         self.tile_size = tile_size
         self.shadow_samples = shadow_samples
@@ -101,13 +101,13 @@ class LightBuffers:
         self.mirrors: list[MirrorLight] = []  # the last of the lights
         self.mirror_visibility = gpu.ctx.texture_array((1, 1, 1), 2, dtype="f2")
         self.real_views: list[LightView] = []
-        self.virtual_views: list[LightView] = []
+        self.object_views: list[LightView] = []
         self.views_of_lights: list[tuple[range, range]] = []
         self._views_around_objects, self._views_of_objects = FittedViews(), FittedViews()
         # Records of the views as shaders read them: they change when these do.
-        self.real_records = self.virtual_records = b""
+        self.real_records = self.object_records = b""
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
-        self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
+        self.object_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self._light_rows, self._view_rows = _Rows(gpu, LIGHT_TEXELS), _Rows(gpu, VIEW_TEXELS)
         self._environment: moderngl.TextureArray | None = None
         self._environment_half_angle = 0.0
@@ -120,24 +120,24 @@ class LightBuffers:
             "light_rows": self._light_rows.texture,
             "light_view_rows": self._view_rows.texture,
             "Lighting": self._block,
-            "real_light_depth": self.real_atlas.depth,
-            "virtual_light_depth": self.virtual_atlas.depth,
-            "caster_distance": self.virtual_atlas.caster_distance,
-            "real_light_normal": self.real_atlas.normal,
-            "virtual_light_normal": self.virtual_atlas.normal,
-            "virtual_light_uv": self.virtual_atlas.uv,
+            "real_rsm_depth": self.real_atlas.depth,
+            "object_rsm_depth": self.object_atlas.depth,
+            "caster_distance": self.object_atlas.caster_distance,
+            "real_rsm_normal": self.real_atlas.normal,
+            "object_rsm_normal": self.object_atlas.normal,
+            "object_rsm_uv": self.object_atlas.uv,
             "mirror_visibility": self.mirror_visibility,
             "environment_map": self._environment,
             "shadow_samples": self.shadow_samples,
             "has_rectangles": any(isinstance(light, RectangleLight) for light in self.lights),
             "has_mirror_images": bool(self.mirrors),
-            "has_virtual_lights": self.has_virtual_lights,
+            "has_object_lamps": self.has_object_lamps,
         }
 
     @property
-    def has_virtual_lights(self) -> bool:
-        """Whether any light comes with an object."""
-        return self._virtual_count > 0
+    def has_object_lamps(self) -> bool:
+        """Whether any lamp comes with an object."""
+        return self._object_lamp_count > 0
 
     def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> moderngl.TextureArray:
         """Uploads the residual environment R (octahedral), averaged over cones of doubling half-angle."""
@@ -152,37 +152,37 @@ class LightBuffers:
         lights: list[Light],
         real_points: Float64[np.ndarray, "n 3"],
         receivers: Float64[np.ndarray, "k 3"],
-        virtual_points: Float64[np.ndarray, "m 3"],
+        object_points: Float64[np.ndarray, "m 3"],
         *,
         mirrors: Sequence[MirrorLight] = (),
-        virtual_lights: Sequence[Light] = (),
+        object_lamps: Sequence[Light] = (),
         blocking: Float64[np.ndarray, "b 3"] | None = None,
         groups: Sequence[Float64[np.ndarray, "g 3"]] = (),
     ) -> None:
-        """Fits the views of each light, those of the scene and those that come with objects.
+        """Fits the views of each light: to the real points that may receive the objects' shadow, and to the objects.
 
-        To the real points that may receive the objects' shadow, and to the virtual objects; `blocking`: points of all
-        objects, if those are some; `groups`: those of objects far apart. Views of mirror images are limited to the
-        front of their planes.
+        `mirrors` are mirror images of the lights, whose views are limited to the front of their planes;
+        `object_lamps` come with objects; `blocking` are points of all objects, if `object_points` are those of some;
+        `groups` are points of each group of objects far apart.
         """
-        self.mirrors, self._virtual_count = list(mirrors), len(virtual_lights)
-        lights = [*lights, *virtual_lights]
+        self.mirrors, self._object_lamp_count = list(mirrors), len(object_lamps)
+        lights = [*lights, *object_lamps]
         self._make_mirror_maps()
-        shown = np.concatenate([receivers, virtual_points]) if mirrors else receivers
+        shown = np.concatenate([receivers, object_points]) if mirrors else receivers
         axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
         real = self._views_around_objects.of(lights, receivers, real_points)
-        blocking = virtual_points if blocking is None else blocking
-        around_all = self._views_of_objects.of(lights, virtual_points, blocking)
-        virtual = views_of_groups(lights, groups, blocking, around_all)
+        blocking = object_points if blocking is None else blocking
+        around_all = self._views_of_objects.of(lights, object_points, blocking)
+        objects = views_of_groups(lights, groups, blocking, around_all)
         for mirror in mirrors:
             real.append(mirror_views(mirror, receivers, real_points, mirror.tolerance_m))
-            virtual.append(mirror_views(mirror, virtual_points, virtual_points))
+            objects.append(mirror_views(mirror, object_points, object_points))
         self.lights = [*lights, *(mirror.light for mirror in mirrors)]
         self.real_views = [view for views in real for view in views]
-        self.virtual_views = [view for views in virtual for view in views]
+        self.object_views = [view for views in objects for view in views]
         self.real_atlas = self._atlas_for(self.real_atlas, len(self.real_views))
-        self.virtual_atlas = self._atlas_for(self.virtual_atlas, len(self.virtual_views))
-        self._write_records(real, virtual, axes)
+        self.object_atlas = self._atlas_for(self.object_atlas, len(self.object_views))
+        self._write_records(real, objects, axes)
         self._write_block()
 
     def _make_mirror_maps(self) -> None:
@@ -204,29 +204,31 @@ class LightBuffers:
         return ShadowMapAtlas(self._gpu, max(tiles, 1), self.tile_size)
 
     def _write_records(
-        self, real: list[list[LightView]], virtual: list[list[LightView]], axes: Sequence[MapAxes]
+        self, real: list[list[LightView]], objects: list[list[LightView]], axes: Sequence[MapAxes]
     ) -> None:
         """Writes the records of all lights and views; the real views come first."""
         records = b""
         self.views_of_lights = []
-        first_real, first_virtual = 0, len(self.real_views)
+        first_real, first_object = 0, len(self.real_views)
         first_mirror = len(self.lights) - len(self.mirrors)
-        first_own = -self._virtual_count if not self._is_joint else 0
-        for index, (light, real_part, virtual_part) in enumerate(
-            zip(self.lights, real, virtual, strict=True), start=-first_mirror
+        first_lamp = -self._object_lamp_count if not self._is_joint else 0
+        for index, (light, real_part, object_part) in enumerate(
+            zip(self.lights, real, objects, strict=True), start=-first_mirror
         ):
-            ranges = (first_real, len(real_part), first_virtual, len(virtual_part))
+            ranges = (first_real, len(real_part), first_object, len(object_part))
             if index < 0:
-                records += _pack_light(light, ranges, tail=OF_OBJECT if index >= first_own else NOT_MIRRORED)
+                records += _pack_light(
+                    light, ranges, tail=OBJECT_LAMP if index >= first_lamp else NOT_MIRRORED
+                )
             else:
                 records += _pack_mirror(self.mirrors[index], index, axes[index], ranges)
             first_real += len(real_part)
-            first_virtual += len(virtual_part)
-            self.views_of_lights.append((range(ranges[0], first_real), range(ranges[2], first_virtual)))
+            first_object += len(object_part)
+            self.views_of_lights.append((range(ranges[0], first_real), range(ranges[2], first_object)))
         self.real_records = self._packed(self.real_views)
-        self.virtual_records = self._packed(self.virtual_views)
+        self.object_records = self._packed(self.object_views)
         self._light_rows.write(records)
-        self._view_rows.write(self.real_records + self.virtual_records)
+        self._view_rows.write(self.real_records + self.object_records)
 
     def _packed(self, views: list[LightView]) -> bytes:
         columns = tile_columns(len(views))
@@ -238,23 +240,23 @@ class LightBuffers:
         self._block.write(LightingBlock(len(self.lights), layers, self._environment_half_angle))
 
     @property
-    def real_views_of_objects(self) -> range:
-        """Numbers of the real views of lights that come with objects."""
-        first = len(self.lights) - len(self.mirrors) - self._virtual_count
-        own = self.views_of_lights[first : first + self._virtual_count]
+    def real_views_of_object_lamps(self) -> range:
+        """Numbers of the real views of lamps that come with objects."""
+        first = len(self.lights) - len(self.mirrors) - self._object_lamp_count
+        own = self.views_of_lights[first : first + self._object_lamp_count]
         return range(own[0][0].start, own[-1][0].stop) if own else range(0)
 
     @property
-    def first_virtual_view(self) -> int:
-        """Index of the first virtual view's record."""
+    def first_object_view(self) -> int:
+        """Index of the first record of a view of objects."""
         return len(self.real_views)
 
-    def virtual_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
-        """Largest texel of the virtual depth maps at `point`, m."""
-        return self._texel_m(self.virtual_views, point)
+    def object_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
+        """Largest texel of the objects' maps at `point`, m."""
+        return self._texel_m(self.object_views, point)
 
     def real_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
-        """Largest texel of the real depth maps at `point`, m."""
+        """Largest texel of the real scene's maps at `point`, m."""
         return self._texel_m(self.real_views, point)
 
     def _texel_m(self, views: list[LightView], point: Float64[np.ndarray, "3"]) -> float:
@@ -266,7 +268,7 @@ class LightBuffers:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for item in (self.real_atlas, self.virtual_atlas, self.mirror_visibility, self._block):
+        for item in (self.real_atlas, self.object_atlas, self.mirror_visibility, self._block):
             item.release()
         release_all(self._light_rows, self._view_rows)
         if self._environment is not None:

@@ -37,7 +37,9 @@ class LpvInjectMaps:
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
     ) -> None:
         """Adds the light that the real scene reflects as if there were no objects."""
-        views = [view for view in range(len(lights.real_views)) if view not in lights.real_views_of_objects]
+        views = [
+            view for view in range(len(lights.real_views)) if view not in lights.real_views_of_object_lamps
+        ]
         self._inject_views(self._real, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
     def add_change(
@@ -48,12 +50,12 @@ class LpvInjectMaps:
         Of lights that come with objects, adds what all of the real scene reflects.
         """
         own: dict[str, Binding] = {"Injected": sums, "real_albedo": real_albedo}
-        self._inject_views(self._real, lights.real_views_of_objects, lights, scene, **own)
-        self._inject_views(self._change, _virtual_views(lights), lights, scene, **own)
+        self._inject_views(self._real, lights.real_views_of_object_lamps, lights, scene, **own)
+        self._inject_views(self._change, _object_views(lights), lights, scene, **own)
 
     def add_direct(self, sums: moderngl.Buffer, lights: LightBuffers, scene: Bindings) -> None:
         """Adds the direct light that meets the objects, and subtracts what it lit before ([P2] 4.3.2)."""
-        self._inject_views(self._direct, _virtual_views(lights), lights, scene, Injected=sums)
+        self._inject_views(self._direct, _object_views(lights), lights, scene, Injected=sums)
 
     def _inject_views(
         self, kernel: Kernel, views: Iterable[int], lights: LightBuffers, scene: Bindings, **own: Binding
@@ -68,9 +70,9 @@ class LpvInjectMaps:
             kernel.release()
 
 
-def _virtual_views(lights: LightBuffers) -> range:
-    first = lights.first_virtual_view
-    return range(first, first + len(lights.virtual_views))
+def _object_views(lights: LightBuffers) -> range:
+    first = lights.first_object_view
+    return range(first, first + len(lights.object_views))
 
 
 class LpvInjectSurfaces:

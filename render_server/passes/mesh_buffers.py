@@ -234,9 +234,8 @@ class ObjectBvh:
         self._built: GpuMesh | None = None
         self._mesh: MeshBuffers | None = None
         self._bvh: Bvh | None = None
-        self._packed: Future[tuple[bytes, bytes]] | None = (
-            None  # of what was built last, until it is uploaded
-        )
+        # Of what was built last, until it is uploaded.
+        self._packed: Future[tuple[bytes, bytes]] | None = None
         self._is_traced = False  # since the triangles changed
         self._fresh_cost = 0.0
         self.centre = np.zeros(3)

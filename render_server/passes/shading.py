@@ -92,15 +92,16 @@ class DirectLight:
         grid: LowResGrid,
         scene: Bindings,
         *,
-        joint: moderngl.Texture3D | None = None,
+        shadow_voxels: moderngl.Texture3D | None = None,
         caustics: Caustics | None = None,
         objects: ObjectBvh | None = None,
     ) -> None:
-        """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho.
+        """Shades the pixels.
 
-        `objects`: what the rays of `ray_shadows` meet (shaders/common/ray_shadows.glsl).
+        `shadow_voxels`: what shadow cones march through; `caustics`: added to E_rho; `objects`: what the rays of
+        `ray_shadows` meet (shaders/common/ray_shadows.glsl).
         """
-        voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
+        voxels: dict[str, Binding] = {} if shadow_voxels is None else {"joint_mipmap": shadow_voxels}
         if not self._reuses:
             self.clear(scene)
         traced = {} if objects is None else objects.bindings

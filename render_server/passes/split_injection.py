@@ -73,10 +73,10 @@ class SplitInjection:
         virtual_sums: Bindings = {**virtual.bindings, **chosen, "Sums": virtual.delta_sums}
         both: Bindings = {"VirtualTouched": virtual.touched, "VirtualSums": virtual.delta_sums}
         threads = (map_threads(self._gpu, lights.tile_size),)
-        for real_views, virtual_views in lights.views_of_lights:
+        for real_views, object_views in lights.views_of_lights:
             for view in real_views:
                 self._real.run(threads, real_sums, scene, view_index=view)
-            for view in virtual_views:
+            for view in object_views:
                 self._virtual.run(threads, virtual_sums, scene, view_index=view)
             self._divide.run((self._threads,), real_sums, both)
 

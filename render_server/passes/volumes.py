@@ -13,9 +13,8 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding
 from deltalight.render_server.gpu.uniform_block import Block, Float, Int, Mat4, UniformBlock, Vec3
 
-SPARE_EDGE = (
-    0.125  # of a volume that stays while its objects move: the light around them changes that far at least
-)
+# Of a volume that stays while its objects move: the light around them changes that far at least.
+SPARE_EDGE = 0.125
 SNAP_VOXELS = 0.01
 # Of the edge: how far planes at whole voxels from the world's origin (a floor, sides of a box) lie in the next voxel.
 # On the border of two, rounding would decide between them, and otherwise for a surface than for the light on it.

@@ -25,9 +25,8 @@ DELTA_SUMS_PER_SLOT = 18
 SURFELS_HEADER_BYTES = 16  # their number, padded
 TOUCHED_HEADER_BYTES = 4
 LEAST_SURFELS = 1024
-LARGEST_ITEM_BYTES = (
-    96  # of what is kept a surfel or slot: SUMS_PER_SLOT, SURFEL_LIGHT_BYTES (voxel_light.py)
-)
+# Of what is kept for a surfel or a slot: SUMS_PER_SLOT integers, SURFEL_LIGHT_BYTES (voxel_light.py).
+LARGEST_ITEM_BYTES = 96
 LOWER_VOLUME, LOWER_SURFELS = "method.volume_size", "method.volume_size or method.triangle_budget"
 
 

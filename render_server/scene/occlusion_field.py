@@ -19,9 +19,8 @@ from deltalight.render_server.scene.bvh import RayCaster
 Vectors = Float32[np.ndarray, "m 3"]
 FINER = 4  # ratio of the numbers of directions of successive sets
 FINEST = 2  # sets beyond the first: from afar, few of all directions hit the object
-INSIDE = (
-    0.75  # fraction of directions that meet back faces from a point inside the object, or in a closed gap
-)
+# Fraction of directions that meet back faces from a point inside the object, or in a closed gap.
+INSIDE = 0.75
 CHUNK = 400_000  # rays traced at once: some 5 ms, after which another thread may run
 AIM = 1.02  # margin of the enclosing radius, so that the silhouette of an object that fills its sphere is hit too
 BLEND_CELLS = 2  # over which a shell blends into the next at its border; the object lies further inside

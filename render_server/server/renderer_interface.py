@@ -113,10 +113,10 @@ class Renderer(Protocol):
         taken: Sequence[CameraFrame],
         *,
         with_linear: bool = False,
-        whole: bool = False,
+        full_size: bool = False,
         others: Sequence[ShownView] = (),
     ) -> Sequence[Pending]:
-        """Starts the pictures of a room's frames that are to be shown, at full size if `whole`, also in `others`.
+        """Starts the pictures of a room's frames that are to be shown, at full size if `full_size`, also in `others`.
 
         They finish in the order of their starts.
         """

@@ -81,9 +81,9 @@ class SnapshotRenderer(Protocol):
         """Returns the frame at the composite's size."""
 
     def submit_cameras(
-        self, taken: Sequence[CameraFrame], *, with_linear: bool = False, whole: bool = False
+        self, taken: Sequence[CameraFrame], *, with_linear: bool = False, full_size: bool = False
     ) -> Sequence[StartedPicture]:
-        """Starts the composites that are to be shown, at full size if `whole`."""
+        """Starts the composites that are to be shown, at full size if `full_size`."""
 
 
 @dataclass
@@ -142,7 +142,7 @@ def _picture(
     if picture.view == CAMERA_VIEW:
         return renderer.sized(_shown(taken)).color
     renderer.set_scene(_variant(scene, picture.view, picture.method))
-    return _composite(renderer, taken, whole=True).color
+    return _composite(renderer, taken, full_size=True).color
 
 
 def _linear(
@@ -158,9 +158,9 @@ def _composite(
     taken: Sequence[CameraFrame],
     *,
     with_linear: bool = False,
-    whole: bool = False,
+    full_size: bool = False,
 ) -> RenderedPicture:
-    (started,) = renderer.submit_cameras(taken, with_linear=with_linear, whole=whole)
+    (started,) = renderer.submit_cameras(taken, with_linear=with_linear, full_size=full_size)
     return started.finish()
 
 

@@ -63,5 +63,5 @@ class AccompaniedCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """Captures time of the camera's frame, in ns since 1970 by this host's clock."""
+        """Capture time of the camera's frame, in ns since 1970 by this host's clock."""
         return self._camera.capture_ns

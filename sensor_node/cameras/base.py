@@ -86,7 +86,7 @@ class Camera(ABC):
     @property
     @abstractmethod
     def capture_ns(self) -> int:
-        """Captures time of the last returned frame, in ns since 1970 by this host's clock."""
+        """Capture time of the last returned frame, in ns since 1970 by this host's clock."""
 
     @abstractmethod
     def interrupt(self) -> None:

@@ -192,7 +192,7 @@ class LiveCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """Captures time of the last returned frame, in ns since 1970 by this host's current clock."""
+        """Capture time of the last returned frame, in ns since 1970 by this host's current clock."""
         return self.clock.now(self._capture_monotonic_ns)
 
     def interrupt(self) -> None:

@@ -88,7 +88,7 @@ class ReconnectingCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """Captures time of the last returned frame, in ns since 1970 by this host's clock."""
+        """Capture time of the last returned frame, in ns since 1970 by this host's clock."""
         return self._capture_ns
 
     @property

@@ -114,9 +114,8 @@ class RoomKeeper:
         for name in drained.rooms & self._rooms.keys():
             self._rooms[name].drain()
         self._lock = threading.Lock()
-        self._drains = (
-            threading.Lock()
-        )  # held over the database's answer, so that rooms are looked after meanwhile
+        # A lock of its own, held while the database answers, so that rooms are looked after meanwhile.
+        self._drains = threading.Lock()
 
     def poll(self) -> None:
         """Learns what happened, then places the rooms that wait."""

@@ -306,7 +306,7 @@ def test_rows_of_lights_come_and_go_and_are_never_a_power_of_two(gpu: GpuContext
     buffers.release()
 
 
-NO_SWITCH: Bindings = dict.fromkeys(("has_rectangles", "has_mirror_images", "has_virtual_lights"), False)
+NO_SWITCH: Bindings = dict.fromkeys(("has_rectangles", "has_mirror_images", "has_object_lamps"), False)
 COMPARED = """
 #include "common/soft_shadows.glsl"
 uniform float tile, edge;
@@ -317,8 +317,8 @@ for (int x = 0; x < int(edge); ++x) {
     float s = 2.0 * (float(x) + 0.5) / edge - 1.0;
     float error = 0.0;
     for (float side = -1.0; side <= 1.0; ++side) {
-        float lit = lit_fraction(real_light_depth, view, vec2(s + side * 1e-5, 0.0), 1.0);
-        error = max(error, abs(lit - texelFetch(real_light_depth, ivec2(int(tile) + x, 0), 0).r));
+        float lit = lit_fraction(real_rsm_depth, view, vec2(s + side * 1e-5, 0.0), 1.0);
+        error = max(error, abs(lit - texelFetch(real_rsm_depth, ivec2(int(tile) + x, 0), 0).r));
     }
     values[0] = max(values[0], error);
 }
@@ -335,7 +335,7 @@ def test_shadow_maps_compare_the_texels_whose_weights_they_use(
     kernel = make(COMPARED, NEXT_TO_CENTRES)
     for tile in range(5):
         out.write(bytes(4))
-        own: Bindings = {"real_light_depth": depth, "tile": float(tile * edge), "edge": float(edge)}
+        own: Bindings = {"real_rsm_depth": depth, "tile": float(tile * edge), "edge": float(edge)}
         kernel.run((1,), NO_SWITCH, own, Out=out)
         assert floats(out, 1)[0] < 0.02, tile
     depth.release()

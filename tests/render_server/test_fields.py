@@ -210,7 +210,7 @@ def test_distances_to_casters(gpu: GpuContext, stage: Stage) -> None:
     renderer = SceneRenderer(gpu, stage.document(objects, lamps, floor(), rsm_size=130))
     renderer.render(frame())
     assert renderer.graph is not None
-    atlas = renderer.graph["shadow maps objects"].virtual_atlas
+    atlas = renderer.graph["shadow maps objects"].object_atlas
     shows = np.frombuffer(atlas.depth.read(alignment=1), np.float32).reshape(atlas.size[::-1]) < 1
     squared, cells = array_of(atlas.caster_distance)[..., 0], atlas.tile_cells
     for tile in range(atlas.tiles):

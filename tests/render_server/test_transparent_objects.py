@@ -53,9 +53,8 @@ CLEAR: dict[str, Any] = {
 }
 RADIUS, ABOVE = 0.04, 0.2
 IRRADIANCE = 2.0
-STRONG = (
-    50.0  # irradiance beside which colours of the picture do not count: what objects change of light is grey
-)
+# Irradiance beside which colours of the picture do not count: what objects change of light is grey.
+STRONG = 50.0
 SHADINGS = ("auto", "image_based", "precomputed")
 
 

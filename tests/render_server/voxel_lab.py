@@ -110,7 +110,7 @@ class VoxelLab:
             **materials.bindings,
             "SEVERAL_VIEWS": False,
             "bias_real": 0.0,
-            "bias_virtual": 0.0,
+            "bias_object": 0.0,
             "has_caustics": False,
             "lens_distortion": False,
         }

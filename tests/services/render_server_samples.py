@@ -147,7 +147,7 @@ class InvertingRenderer:
         taken: Sequence[CameraFrame],
         *,
         with_linear: bool = False,
-        whole: bool = False,  # noqa: ARG002
+        full_size: bool = False,  # noqa: ARG002
         others: Sequence[ShownView] = (),
     ) -> list[Started]:
         self.rooms.append([(each.camera, each.frame.frame_id, each.is_shown) for each in taken])

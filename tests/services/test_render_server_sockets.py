@@ -287,14 +287,14 @@ class CompilingRenderer(InvertingRenderer):
         taken: Sequence[CameraFrame],
         *,
         with_linear: bool = False,
-        whole: bool = False,
+        full_size: bool = False,
         others: Sequence[ShownView] = (),
     ) -> list[Started]:
         for label in ("clear", "shade"):
             for watch in self.watchers:
                 watch(label, {})
             self.released.wait(PATIENCE_S)
-        return super().submit_cameras(taken, with_linear=with_linear, whole=whole, others=others)
+        return super().submit_cameras(taken, with_linear=with_linear, full_size=full_size, others=others)
 
 
 def test_how_far_a_first_picture_is_comes_before_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,10 +20,10 @@
 #include "common/sent_beams.glsl"
 
 #include "common/pixel_group.glsl"
-uniform sampler2D virtual_light_uv;
-uniform sampler2D virtual_light_normal;
-#pragma texels rgba32f virtual_light_uv
-#pragma texels rgba16f virtual_light_normal
+uniform sampler2D object_rsm_uv;
+uniform sampler2D object_rsm_normal;
+#pragma texels rgba32f object_rsm_uv
+#pragma texels rgba16f object_rsm_normal
 uniform int view_index;
 uniform int block_edge;        // texels
 uniform float least_alpha;     // for materials with lobes of at least this width,
@@ -48,9 +48,9 @@ Spot spot_at(LightView view, ivec2 texel) {
     Spot spot = Spot(false, vec3(0.0), vec3(0.0), vec3(0.0), -1);
     vec2 inside = vec2(texel) - view.tile.xy;
     if (any(lessThan(inside, vec2(0.0))) || any(greaterThanEqual(inside, view.tile.zz))) return spot;
-    float depth = first_depth(virtual_light_depth, view, texel);
+    float depth = first_depth(object_rsm_depth, view, texel);
     if (depth == NOTHING) return spot;
-    vec4 normal = texelFetch(virtual_light_normal, texel, 0);
+    vec4 normal = texelFetch(object_rsm_normal, texel, 0);
     vec2 s = texel_lateral(view, texel);
     spot.point = ray_point(view, s, depth);
     spot.seen_from = normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0));
@@ -65,7 +65,7 @@ Spot spot_at(LightView view, ivec2 texel) {
 
 #ifdef MATERIAL_MAPS
 bool is_wanted(ivec2 texel, int material) {
-    vec4 uv = texelFetch(virtual_light_uv, texel, 0);
+    vec4 uv = texelFetch(object_rsm_uv, texel, 0);
     Material m = material_of(material, uv.xy, unpack_color(uv.z), 0.0);
     float alpha = m.roughness * m.roughness;
     return alpha >= least_alpha && alpha < greatest_alpha && has_interface(m.f0);
@@ -80,17 +80,17 @@ bool is_wanted(ivec2 texel, int material) {
 #endif
 
 // Of a mirror's ray from this texel to the next block along `axis`.
-Drift drift_along(LightView view, ivec2 texel, ivec2 axis, Spot here, float side) {
+RayDifferential mirrored_differential(LightView view, ivec2 texel, ivec2 axis, Spot here, float side) {
     int neighbour_texels = max(block_edge / 2, 1);
     vec3 own = reflect(here.seen_from, here.normal);
     for (int sign = 1; sign >= -1; sign -= 2) {
         Spot other = spot_at(view, texel + sign * neighbour_texels * axis);
         if (!other.present || other.material != here.material || dot(other.normal, here.normal) < ALIKE) continue;
         float blocks = float(sign * block_edge) / float(neighbour_texels) * RAYS_APART;
-        return Drift(blocks * (other.point - here.point), blocks * (reflect(other.seen_from, other.normal) - own));
+        return RayDifferential(blocks * (other.point - here.point), blocks * (reflect(other.seen_from, other.normal) - own));
     }
     vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * RAYS_APART;
-    return Drift(across, vec3(0.0));   // alone in its block: treated as flat
+    return RayDifferential(across, vec3(0.0));   // alone in its block: treated as flat
 }
 
 // Fraction of a lobe's ray that is not lost between microfacets (Heitz 2014), for visible normals.
@@ -101,7 +101,7 @@ float unmasked(float n_dot_v, float n_dot_l, float alpha) {
 }
 
 // `hit`: where it ends.
-void send(vec3 from, vec3 direction, MeshHit hit, vec3 flux, float spread, Drift x, Drift y) {
+void send(vec3 from, vec3 direction, MeshHit hit, vec3 flux, float spread, RayDifferential x, RayDifferential y) {
     SentBeam beam = SentBeam(vec4(from, hit.triangle < 0 ? 1e30 : hit.distance), vec4(direction, spread), vec4(flux, 0.0),
         vec4(x.start, 0.0), vec4(x.turn, 0.0), vec4(y.start, 0.0), vec4(y.turn, 0.0));
     uint at = atomicAdd(sent_count, 1u);
@@ -189,26 +189,26 @@ Passage along_ways(LightView view, vec2 s, LampPart part, uint ways) {
     return way;
 }
 
-// Drift of a path from this texel to the next block along `axis`.
-Drift drift_through(LightView view, ivec2 texel, ivec2 axis, LampPart part, Passage here, float side) {
+// Of a path from this texel to the next block along `axis`.
+RayDifferential refracted_differential(LightView view, ivec2 texel, ivec2 axis, LampPart part, Passage here, float side) {
     int neighbour_texels = max(block_edge / 2, 1);
     for (int sign = 1; sign >= -1; sign -= 2) {
         Passage other = along_ways(view, texel_lateral(view, texel + sign * neighbour_texels * axis), part, here.ways);
         if (other.ways != here.ways) continue;
         float blocks = float(sign * block_edge) / float(neighbour_texels) * part.ray_spacing;
-        return Drift(blocks * (other.from - here.from), blocks * (other.direction - here.direction));
+        return RayDifferential(blocks * (other.from - here.from), blocks * (other.direction - here.direction));
     }
     vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * part.ray_spacing;
-    return Drift(across, vec3(0.0));
+    return RayDifferential(across, vec3(0.0));
 }
 
 void leave_objects(LightView view, ivec2 texel, float side, LampPart part, Passage way, MeshHit hit, vec3 flux, float radius) {
-    Drift x, y;
+    RayDifferential x, y;
     int axis = 0;
     do {   // in a loop, because drivers compile each call of a long function anew
-        Drift drift = drift_through(view, texel, ivec2(1 - axis, axis), part, way, side);
-        if (axis == 0) x = drift;
-        else y = drift;
+        RayDifferential differential = refracted_differential(view, texel, ivec2(1 - axis, axis), part, way, side);
+        if (axis == 0) x = differential;
+        else y = differential;
     } while (++axis < 2);
     send(way.from, way.direction, hit, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * LAMP_FRACTION * radius)), x, y);
 }
@@ -270,7 +270,7 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
     vec3 flux = fraction * texel_light(light, view, texel_lateral(view, texel));
     if (flux == vec3(0.0)) return;
     flux *= within_range(light, spot.point) * real_visibilities(light, spot.point, spot.normal, bias_real).y;
-    vec4 uv = texelFetch(virtual_light_uv, texel, 0);
+    vec4 uv = texelFetch(object_rsm_uv, texel, 0);
     Material m = material_of(spot.material, uv.xy, unpack_color(uv.z), 0.0);
     float alpha = max(m.roughness * m.roughness, LEAST_ALPHA);
     vec3 v = -spot.seen_from, h = spot.normal;
@@ -288,7 +288,8 @@ void cast_ray(Light light, LightView view, ivec2 block, int j) {
 #endif
     float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // half a disc's radius
     float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
-    Drift x = drift_along(view, texel, ivec2(1, 0), spot, side), y = drift_along(view, texel, ivec2(0, 1), spot, side);
+    RayDifferential x = mirrored_differential(view, texel, ivec2(1, 0), spot, side);
+    RayDifferential y = mirrored_differential(view, texel, ivec2(0, 1), spot, side);
     vec3 from = spot.point + normal_offset * spot.normal;
     send(from, direction, closest_hit(Ray(from, direction)), flux, spread, x, y);
 }

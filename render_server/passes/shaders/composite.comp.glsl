@@ -38,7 +38,7 @@ uniform sampler2D edge_correction;    // common/edge_sides.glsl
 uniform float exposure_scale;
 #include "common/camera.glsl"
 #pragma switch bool additive
-#pragma switch bool has_virtual_lights
+#pragma switch bool has_object_lamps
 uniform bool relights_real;      // method `none` shows objects and keeps the real scene
 #pragma switch bool filmic   // ACES tone curve on the whole picture instead of the camera's response
 #pragma switch bool specular_surfaces
@@ -138,7 +138,7 @@ vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b, out vec3 ratio) {
     // of these than the greatest albedo.
     vec3 gained = max(c.delta + c.distant * c.e_mu, vec3(0.0));
     ratio += c.distant;
-    if (has_virtual_lights) ratio = min(ratio, 1.0 + ALBEDO_RANGE.y / PI * gained / max(b, vec3(1e-6)));
+    if (has_object_lamps) ratio = min(ratio, 1.0 + ALBEDO_RANGE.y / PI * gained / max(b, vec3(1e-6)));
     ratio = max(ratio, vec3(0.0));
     if (additive) {
         vec3 albedo = clamp(PI * b / max(c.e_mu, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);

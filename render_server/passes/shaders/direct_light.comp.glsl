@@ -49,17 +49,17 @@ void light(ivec2 pixel, ivec2 size) {
         int i = 0;
         if (!known && light_count > 0) do {
             vec3 l; float radius;
-            vec3 across = light_at(listed_light(i), position.xyz, normal.xyz, l, radius);
+            vec3 e_perp = light_at(listed_light(i), position.xyz, normal.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
             if (cosine <= 0.0) continue;
             vec2 seen = light_visibility(listed_light(i), position.xyz, normal.xyz, bias);
-            e_mu += across * cosine * seen.x;
+            e_mu += e_perp * cosine * seen.x;
             vec3 arrives = arriving(listed_light(i), position.xyz, seen, beam_alpha);
-            e_rho += across * cosine * arrives;
-            unshadowed += is_virtual(listed_light(i)) ? 0.0 : dot(across, vec3(1.0 / 3.0)) * cosine;
+            e_rho += e_perp * cosine * arrives;
+            unshadowed += is_object_lamp(listed_light(i)) ? 0.0 : dot(e_perp, vec3(1.0 / 3.0)) * cosine;
             if (specular_surfaces && normal.w >= 0.0) {
                 SurfaceEntry e = surfaces[int(normal.w)];
-                vec3 lobe = across * specular_times_cosine(normal.xyz, v, l, e.f0.rgb, e.surface.x, vec2(radius, 0.0));
+                vec3 lobe = e_perp * specular_times_cosine(normal.xyz, v, l, e.f0.rgb, e.surface.x, vec2(radius, 0.0));
                 s_mu += lobe * seen.x;
                 s_rho += lobe * arrives;
             }

@@ -43,10 +43,10 @@ vec3 direct_irradiance(SurfacePoint s) {
     int i = 0;
     if (light_count > 0) do {
         vec3 l; float radius;
-        vec3 across = light_at(listed_light(i), s.position, s.normal, l, radius);
+        vec3 e_perp = light_at(listed_light(i), s.position, s.normal, l, radius);
         float cosine = dot(s.normal, l);
         if (cosine <= 0.0) continue;
-        sum += across * cosine * real_visibility(listed_light(i), s.position, s.normal, bias);
+        sum += e_perp * cosine * real_visibility(listed_light(i), s.position, s.normal, bias);
     } while (++i < light_count);
     return sum;
 }

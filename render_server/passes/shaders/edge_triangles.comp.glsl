@@ -64,7 +64,7 @@ bool meets(vec2 middle, float reach, Projected p) {
     return all(lessThanEqual(distances, reach * l));
 }
 
-// The next of the texels or tiles from `first` to `last`, row by row. (Two loops would execute the body for no lane, each once more.)
+// The next of the texels or tiles from `first` to `last`, row by row. (Of two nested loops, each would execute its body once more, with all lanes masked.)
 ivec2 next_in(ivec2 at, ivec2 first, ivec2 last) { return at.x < last.x ? ivec2(at.x + 1, at.y) : ivec2(first.x, at.y + 1); }
 
 #ifdef FIND_THIN

@@ -25,12 +25,12 @@ void main() {
         after += ambient * texelFetch(unoccluded, texel, 0).rgb;
         for (int i = 0; i < light_count; ++i) {
             vec3 l; float radius;
-            vec3 across = light_at(listed_light(i), s.position, s.normal, l, radius);
+            vec3 e_perp = light_at(listed_light(i), s.position, s.normal, l, radius);
             float cosine = dot(s.normal, l);
             if (cosine <= 0.0) continue;
             vec2 seen = visibility(listed_light(i), s.position, s.normal, bias, bias);
-            before += across * cosine * seen.x;
-            after += across * cosine * seen.y;
+            before += e_perp * cosine * seen.x;
+            after += e_perp * cosine * seen.y;
         }
     }
     imageStore(changes, texel, vec4(after / before, 1.0));

@@ -39,7 +39,7 @@
 
 layout(local_size_x = 64) in;
 uniform float bias_real;      // m
-uniform float bias_virtual;   // m
+uniform float bias_object;   // m
 uniform bool keep_light;      // in SurfelLights, for later sums
 uniform bool has_caustics;    // beams carry the lights' reflections in smooth virtual surfaces
 const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no surface reflects more than it receives
@@ -107,7 +107,7 @@ const float LIFT = 0.0;
 // Without the objects, whose maps may be those of an earlier frame; a solution's own maps hold all of its geometry.
 vec2 light_fraction(Light light, vec3 p, vec3 n) { return vec2(real_visibility(light, p, n, bias_real)); }
 #else
-vec2 light_fraction(Light light, vec3 p, vec3 n) { return visibility(light, p, n, bias_real, bias_virtual); }
+vec2 light_fraction(Light light, vec3 p, vec3 n) { return visibility(light, p, n, bias_real, bias_object); }
 #endif
 
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
@@ -116,12 +116,12 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     int i = 0;
     if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
         vec3 to_light; float radius;
-        vec3 across = light_at(listed_light(i), p, n, to_light, radius);
+        vec3 e_perp = light_at(listed_light(i), p, n, to_light, radius);
         float cosine = dot(n, to_light);
         if (cosine <= 0.0) continue;
         vec2 v = light_fraction(listed_light(i), p, n);
-        mu += across * cosine * v.x;
-        rho += across * cosine * arriving(listed_light(i), p, v, 0.0);
+        mu += e_perp * cosine * v.x;
+        rho += e_perp * cosine * arriving(listed_light(i), p, v, 0.0);
     } while (++i < light_count);
     if (keep_light) {
 #ifndef REAL_RHO

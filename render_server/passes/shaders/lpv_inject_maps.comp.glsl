@@ -17,11 +17,11 @@
 
 layout(local_size_x = 64) in;
 uniform sampler2D real_albedo;
-uniform sampler2D real_light_normal;
-uniform sampler2D virtual_light_uv;
-uniform sampler2D virtual_light_normal;
-#pragma texels rgba16f real_albedo real_light_normal virtual_light_normal
-#pragma texels rgba32f virtual_light_uv
+uniform sampler2D real_rsm_normal;
+uniform sampler2D object_rsm_uv;
+uniform sampler2D object_rsm_normal;
+#pragma texels rgba16f real_albedo real_rsm_normal object_rsm_normal
+#pragma texels rgba32f object_rsm_uv
 uniform int view_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 uniform bool has_caustics; // beams carry the lights' reflections in smooth virtual surfaces
@@ -31,14 +31,14 @@ vec3 lit_side(vec3 n, vec3 to_light) { return dot(n, to_light) < 0.0 ? -n : n; }
 
 #ifdef REAL
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
-    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+    vec3 n = normalize(texelFetch(real_rsm_normal, texel, 0).xyz);
     vec3 reflected = texel_light(light, view, s) * within_range(light, p) * texelFetch(real_albedo, texel, 0).rgb;
     inject_patch(lit_patch(view, s, p, n), lit_side(n, direction_to_light(light, p)), reflected);
 }
 #else
 vec3 virtual_albedo(ivec2 texel) {
-    vec4 uv = texelFetch(virtual_light_uv, texel, 0);
-    Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z), 0.0);
+    vec4 uv = texelFetch(object_rsm_uv, texel, 0);
+    Material m = material_of(int(texelFetch(object_rsm_normal, texel, 0).w), uv.xy, unpack_color(uv.z), 0.0);
     bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // beams carry these
     vec3 lobe = in_beams ? vec3(0.0) : mean_specular_reflectance(m.f0, m.roughness);
     vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + lobe;
@@ -56,9 +56,9 @@ void inject_along(Patch lit, vec3 to_light, vec3 flux) {
 
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
     vec3 arriving = texel_light(light, view, s) * within_range(light, p);
-    Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
+    Hit real = first_hit(real_rsm_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;   // the real scene is in front of the object
-    vec3 to_light = direction_to_light(light, p), n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
+    vec3 to_light = direction_to_light(light, p), n = normalize(texelFetch(object_rsm_normal, texel, 0).xyz);
     Patch lit = lit_patch(view, s, p, n);
 #ifdef DIRECT
     inject_along(lit, to_light, arriving);
@@ -66,7 +66,7 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
     inject_patch(lit, lit_side(n, to_light), arriving * virtual_albedo(texel));
 #endif
     if (!real.present) return;
-    vec3 real_normal = normalize(texelFetch(real_light_normal, real.texel, 0).xyz);
+    vec3 real_normal = normalize(texelFetch(real_rsm_normal, real.texel, 0).xyz);
     Patch shadowed = lit_patch(view, s, hit_point(real, real_normal), real_normal);
 #ifdef DIRECT
     inject_along(shadowed, to_light, -arriving);
@@ -78,9 +78,9 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
 
 float depth_at(LightView view, ivec2 texel) {
 #ifdef REAL
-    return first_depth(real_light_depth, view, texel);
+    return first_depth(real_rsm_depth, view, texel);
 #else
-    return first_depth(virtual_light_depth, view, texel);
+    return first_depth(object_rsm_depth, view, texel);
 #endif
 }
 

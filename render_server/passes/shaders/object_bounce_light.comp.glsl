@@ -20,10 +20,10 @@ vec3 from_lamps(int k) {
         vec3 eighth = vec3(i & 1, (i >> 1) & 1, (i >> 2) & 1) - 0.5;
         vec3 p = object_position + world_from_object * (object_scale * (field_centre + eighth * object_half)), l;
         float radius;
-        vec3 across = light_at(listed_light(i / 8), p, l, radius);
+        vec3 e_perp = light_at(listed_light(i / 8), p, l, radius);
         float b[HARMONICS];
         harmonics(turn_to_object(l), b);
-        sum += across * (b[k] * visibility(listed_light(i / 8), p, l, 0.0, 0.0).x / 8.0);
+        sum += e_perp * (b[k] * visibility(listed_light(i / 8), p, l, 0.0, 0.0).x / 8.0);
     }
     return sum;
 }

@@ -8,8 +8,8 @@
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D albedo_out;
-uniform sampler2D real_light_normal;
-#pragma texels rgba16f real_light_normal
+uniform sampler2D real_rsm_normal;
+#pragma texels rgba16f real_rsm_normal
 uniform int view_index;
 uniform int filled_volume;
 uniform float bias_real;   // m
@@ -19,15 +19,15 @@ const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 // Irradiance of a light that nothing blocks.
 vec3 unblocked(Light light, vec3 p, vec3 n) {
     vec3 to_light; float radius;
-    vec3 across = light_at(light, p, n, to_light, radius);
-    return across * max(dot(n, to_light), 0.0);
+    vec3 e_perp = light_at(light, p, n, to_light, radius);
+    return e_perp * max(dot(n, to_light), 0.0);
 }
 
 // Real direct and ambient light. The map's own light reaches its texels by definition, so its shadows are not looked for.
 vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
     int own = light_of_view(view_index);
-    vec3 of_own = is_virtual(listed_light(own)) ? vec3(0.0) : unblocked(listed_light(own), p, n);   // the picture lacks these
+    vec3 of_own = is_object_lamp(listed_light(own)) ? vec3(0.0) : unblocked(listed_light(own), p, n);   // the picture lacks these
     int j = 0;
     if (light_count > 1) do {
         if (j == own) e += of_own;   // sums in the lights' order
@@ -46,15 +46,15 @@ bool reaches_volume(vec3 p, float around) {
 }
 
 bool is_wanted(LightView view, ivec2 texel) {
-    float depth = first_depth(real_light_depth, view, texel);
+    float depth = first_depth(real_rsm_depth, view, texel);
     vec2 s = texel_lateral(view, texel);
     return depth != NOTHING && reaches_volume(ray_point(view, s, depth), hit_spread(view, s, depth));
 }
 
 vec3 albedo_at(LightView view, ivec2 texel) {
-    vec3 p = ray_point(view, texel_lateral(view, texel), first_depth(real_light_depth, view, texel));
+    vec3 p = ray_point(view, texel_lateral(view, texel), first_depth(real_rsm_depth, view, texel));
     if (!camera_sees(p)) return unseen_albedo(p);
-    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+    vec3 n = normalize(texelFetch(real_rsm_normal, texel, 0).xyz);
     vec3 to_light; float radius;
     light_at(listed_light(light_of_view(view_index)), p, to_light, radius);
     if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it

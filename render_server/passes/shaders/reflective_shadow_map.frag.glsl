@@ -22,7 +22,7 @@ bool is_left_out() {
     vec2 place = place_on(e.maps[BASE_COLOR], uv) * float(textureSize(color_maps, 0).x);
     float level = log2(max(max(length(dFdx(place)), length(dFdy(place))), 1.0));
     float opacity = opacity_of_vertices(clear) * e.alpha.y * map_level(color_maps, e.maps[BASE_COLOR], uv, level).a;
-    return is_cut_out(int(material), fraction_there(e, opacity), even_noise(gl_FragCoord.xy + APART * material));
+    return is_cut_out(int(material), fraction_there(e, opacity), interleaved_gradient_noise(gl_FragCoord.xy + APART * material));
 }
 #endif
 

@@ -1,10 +1,10 @@
 // The reflective shadow maps: what the lights see of the real scene (left) and of the objects (right), as normals.
 #include "common/pixel_group.glsl"
 layout(rgba8ui) writeonly uniform uimage2D code_out;
-uniform sampler2D real_light_normal;
-uniform sampler2D virtual_light_normal;
-uniform sampler2D real_light_depth;
-uniform sampler2D virtual_light_depth;
+uniform sampler2D real_rsm_normal;
+uniform sampler2D object_rsm_normal;
+uniform sampler2D real_rsm_depth;
+uniform sampler2D object_rsm_depth;
 
 // Nearest texel of a map fitted into a box of `size` pixels.
 uvec4 shown(sampler2D normal, sampler2D depth, vec2 at, vec2 size) {
@@ -23,7 +23,7 @@ void main() {
     vec2 half_size = vec2(0.5 * float(size.x), float(size.y));
     vec2 at = vec2(pixel) + 0.5;
     bool left = at.x < half_size.x;
-    uvec4 code = left ? shown(real_light_normal, real_light_depth, at, half_size)
-                      : shown(virtual_light_normal, virtual_light_depth, at - vec2(half_size.x, 0.0), half_size);
+    uvec4 code = left ? shown(real_rsm_normal, real_rsm_depth, at, half_size)
+                      : shown(object_rsm_normal, object_rsm_depth, at - vec2(half_size.x, 0.0), half_size);
     imageStore(code_out, pixel, code);
 }

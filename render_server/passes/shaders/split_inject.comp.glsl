@@ -6,7 +6,7 @@
 #define GRID_ACCESS readonly
 #include "common/voxel_store.glsl"
 #include "common/light_rays.glsl"
-#include "common/even_noise.glsl"
+#include "common/interleaved_gradient_noise.glsl"
 #ifdef VIRTUAL
 #include "common/materials.glsl"
 #ifdef EXTENDED
@@ -20,11 +20,11 @@
 layout(local_size_x = 64) in;
 layout(std430) buffer Sums { int sums[]; };   // per slot of the set that is walked (split_sums.glsl)
 uniform sampler2D real_albedo;
-uniform sampler2D real_light_normal;
-uniform sampler2D virtual_light_uv;
-uniform sampler2D virtual_light_normal;
-#pragma texels rgba16f real_albedo real_light_normal virtual_light_normal
-#pragma texels rgba32f virtual_light_uv
+uniform sampler2D real_rsm_normal;
+uniform sampler2D object_rsm_uv;
+uniform sampler2D object_rsm_normal;
+#pragma texels rgba16f real_albedo real_rsm_normal object_rsm_normal
+#pragma texels rgba32f object_rsm_uv
 uniform int view_index;
 uniform int filled_volume;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
@@ -56,7 +56,7 @@ float even = -1.0;           // 0..1: what is added before rounding down, anothe
 
 void choose_rounding(LightView view, ivec2 texel, float depth) {
     float across = voxel_edge / texel_side(view, depth);
-    even = across * across > MANY ? even_noise(vec2(texel)) : -1.0;
+    even = across * across > MANY ? interleaved_gradient_noise(vec2(texel)) : -1.0;
 }
 
 int rounded(float amount) { return even < 0.0 ? fixed_point(amount) : int(floor(amount * FIXED_POINT + even)); }
@@ -112,8 +112,8 @@ void accumulate_gain(int slot, vec3 flux, float area) {
 
 #ifdef VIRTUAL
 vec3 virtual_albedo(ivec2 texel) {
-    vec4 uv = texelFetch(virtual_light_uv, texel, 0);
-    Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z), 0.0);
+    vec4 uv = texelFetch(object_rsm_uv, texel, 0);
+    Material m = material_of(int(texelFetch(object_rsm_normal, texel, 0).w), uv.xy, unpack_color(uv.z), 0.0);
     vec3 albedo = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
 #ifdef EXTENDED
     albedo = mean_coated_reflectance(m, albedo);
@@ -121,40 +121,40 @@ vec3 virtual_albedo(ivec2 texel) {
     return albedo;
 }
 
-bool is_wanted(LightView view, ivec2 texel) { return first_depth(virtual_light_depth, view, texel) != NOTHING; }
+bool is_wanted(LightView view, ivec2 texel) { return first_depth(object_rsm_depth, view, texel) != NOTHING; }
 
 void split(Light light, LightView view, ivec2 texel) {
     vec2 s = texel_lateral(view, texel);
-    float depth = first_depth(virtual_light_depth, view, texel);
+    float depth = first_depth(object_rsm_depth, view, texel);
     vec3 p = ray_point(view, s, depth);
     choose_rounding(view, texel, depth);
-    Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
+    Hit real = first_hit(real_rsm_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;
     int slot = slot_near(volume_coordinate(p));
     if (slot < 0) return;
     vec3 flux = texel_light(light, view, s) * within_range(light, p) * virtual_albedo(texel);
-    vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
+    vec3 n = normalize(texelFetch(object_rsm_normal, texel, 0).xyz);
     accumulate(slot, false, flux, lit_area(light, view, s, p, n));
 }
 #else
 bool is_wanted(LightView view, ivec2 texel) {
-    float depth = first_depth(real_light_depth, view, texel);
+    float depth = first_depth(real_rsm_depth, view, texel);
     return depth != NOTHING && inside_volume(volume_coordinate(ray_point(view, texel_lateral(view, texel), depth)));
 }
 
 void split(Light light, LightView view, ivec2 texel) {
     vec2 s = texel_lateral(view, texel);
-    float depth = first_depth(real_light_depth, view, texel);
+    float depth = first_depth(real_rsm_depth, view, texel);
     vec3 p = ray_point(view, s, depth);
     choose_rounding(view, texel, depth);
     int slot = slot_near(volume_coordinate(p));
     if (slot < 0) return;
-    Hit object = first_hit(virtual_light_depth, light.views.z, light.views.w, p);
+    Hit object = first_hit(object_rsm_depth, light.views.z, light.views.w, p);
     bool shadowed = object.present && object.depth <= object.ray_depth + bias_real;
     vec3 flux = texel_light(light, view, s) * within_range(light, p) * texelFetch(real_albedo, texel, 0).rgb;
-    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+    vec3 n = normalize(texelFetch(real_rsm_normal, texel, 0).xyz);
     float area = lit_area(light, view, s, p, n);
-    if (is_virtual(light)) {
+    if (is_object_lamp(light)) {
         if (shadowed) flux = vec3(0.0);
         accumulate_gain(slot, flux, area);
     } else {

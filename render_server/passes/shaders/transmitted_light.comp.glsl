@@ -38,10 +38,10 @@ vec3 lamps_along(vec3 from, vec3 d, float spread) {
         Light light = listed_light(i);
         if (is_image(light)) continue;   // the picture shows the real one
         vec3 l; float radius;
-        vec3 across = unmirrored_light_at(light, from, vec3(0.0), l, radius);
+        vec3 e_perp = unmirrored_light_at(light, from, vec3(0.0), l, radius);
         radius = max(radius, NARROWEST);
         float sine = sin(radius);
-        sum += across * (covered_by_disc(d, l, radius, spread) / (PI * sine * sine));
+        sum += e_perp * (covered_by_disc(d, l, radius, spread) / (PI * sine * sine));
     }
     return sum;
 }

@@ -29,14 +29,14 @@ float meets_real(vec3 from, vec3 direction, float limit) {
 
 // The footprint's variance has a fraction of the distance to the next beams along both axes, and `round`, each beam's
 // own standard deviation in all directions.
-void set_footprint(inout Beam beam, Drift x, Drift y, float round) {
+void set_footprint(inout Beam beam, RayDifferential x, RayDifferential y, float round) {
     mat3 basis = basis_around(beam.direction.xyz);
     vec2 a = OVERLAP * ((x.start + beam.from.w * x.turn) * basis).xy;
     vec2 b = OVERLAP * ((y.start + beam.from.w * y.turn) * basis).xy;
     float xx = a.x * a.x + b.x * b.x + round * round, xy = a.x * a.y + b.x * b.y;
     float yy = a.y * a.y + b.y * b.y + round * round;
     float det = max(xx * yy - xy * xy, 1e-20);
-    beam.across = vec4(vec3(yy, -xy, xx) / det, 1.0 / (2.0 * PI * sqrt(det) * FOOTPRINT_FRACTION));
+    beam.inverse_variance = vec4(vec3(yy, -xy, xx) / det, 1.0 / (2.0 * PI * sqrt(det) * FOOTPRINT_FRACTION));
     float half_sum = 0.5 * (xx + yy);
     beam.direction.w = FOOTPRINT_CUT * sqrt(half_sum + sqrt(max(half_sum * half_sum - det, 0.0)));
 }
@@ -48,7 +48,7 @@ bool ends(SentBeam sent, out Beam beam) {
     if (beam.from.w > reach) return false;
     beam.direction = vec4(sent.direction.xyz, 0.0);
     beam.flux = vec4(sent.flux.rgb, real < object ? 0.0 : 1.0);
-    Drift x = Drift(sent.start_x.xyz, sent.turn_x.xyz), y = Drift(sent.start_y.xyz, sent.turn_y.xyz);
+    RayDifferential x = RayDifferential(sent.start_x.xyz, sent.turn_x.xyz), y = RayDifferential(sent.start_y.xyz, sent.turn_y.xyz);
     set_footprint(beam, x, y, sent.direction.w * beam.from.w);
     return true;
 }

@@ -53,8 +53,8 @@ ivec3 caustic_part(Beam beam, mat3 basis, vec3 p, vec3 normal) {
     bool behind = away.z <= 0.0 && beam.flux.a > 0.0;
     if (abs(away.z - beam.from.w) > LONGEST * beam.direction.w || behind) return ivec3(0);
     float cosine = -dot(normal, beam.direction.xyz);
-    float x2 = beam.across.x * away.x * away.x + 2.0 * beam.across.y * away.x * away.y + beam.across.z * away.y * away.y;
+    float x2 = beam.inverse_variance.x * away.x * away.x + 2.0 * beam.inverse_variance.y * away.x * away.y + beam.inverse_variance.z * away.y * away.y;
     if (cosine <= 0.0 || x2 > FOOTPRINT_CUT * FOOTPRINT_CUT) return ivec3(0);
-    vec3 irradiance = beam.flux.rgb * (cosine * beam.across.w * exp(-0.5 * x2));
+    vec3 irradiance = beam.flux.rgb * (cosine * beam.inverse_variance.w * exp(-0.5 * x2));
     return ivec3(round(irradiance * CAUSTIC_STEPS));
 }

@@ -3,8 +3,8 @@ struct Beam {
     vec4 from;        // world m; w: distance to the surface that it hits, m
     vec4 direction;   // unit length; w: radius of the footprint across the direction, m
     vec4 flux;        // rgb; w: 0 it hits a real surface, 1 an object
-    vec4 across;      // inverse of the footprint's variance in basis_around(direction): xx, xy, yy (1/m^2);
-                      // w: density on the axis (1/m^2)
+    vec4 inverse_variance;   // of the footprint, in basis_around(direction): xx, xy, yy (1/m^2);
+                             // w: density on the axis (1/m^2)
 };
 const int BEAMS_A_ROW = 256;   // of images, four texels a beam: software renderers load buffers lane by lane
 
@@ -22,7 +22,7 @@ uint append_beam(Beam beam) {
     imageStore(beam_texels, at, beam.from);
     imageStore(beam_texels, at + ivec2(1, 0), beam.direction);
     imageStore(beam_texels, at + ivec2(2, 0), beam.flux);
-    imageStore(beam_texels, at + ivec2(3, 0), beam.across);
+    imageStore(beam_texels, at + ivec2(3, 0), beam.inverse_variance);
     return i;
 }
 #else

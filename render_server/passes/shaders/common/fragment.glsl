@@ -55,7 +55,7 @@ vec2 place_on_texture(Fragment f, vec3 n, float roughness) {
 // `place`: of the raster's texel. `blend_sample` 0..1: samples of one pixel show different parts of what is blended.
 bool is_left_out(Fragment f, vec2 place, float blend_sample) {
     float layer = 2.0 * float(f.material) + float(f.is_back);
-    float even = fract(even_noise(place + APART * layer) + blend_sample);
+    float even = fract(interleaved_gradient_noise(place + APART * layer) + blend_sample);
     return is_cut_out(f.material, fragment_opacity(f), even);
 }
 #endif

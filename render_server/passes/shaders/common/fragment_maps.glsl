@@ -62,26 +62,26 @@ void map_axes(Fragment f, vec4 s, out vec3 rightwards, out vec3 upwards) {
 
 // Directions of a normal map's x and y on the front: of the file's tangent, else of the triangle's texture coordinates, turned into
 // the plane across n; the map's y points against v (glTF 2.0, sections 3.7.2.1, 3.9.3). Zero where coordinates tell none.
-void tangent_frame(Fragment f, MapEntry m, vec3 n, float side, out vec3 tangent, out vec3 across) {
+void tangent_frame(Fragment f, MapEntry m, vec3 n, float side, out vec3 tangent, out vec3 bitangent) {
     vec3 upwards;
     bool is_given = f.tangent.xyz != vec3(0.0);
     map_axes(f, slopes_of(f, m), tangent, upwards);
     tangent = is_given ? f.tangent.xyz : tangent - n * dot(n, tangent);
     if (tangent == vec3(0.0)) return;
     tangent = normalize(tangent);
-    across = cross(n, tangent);
-    bool turns = is_given ? side * f.tangent.w < 0.0 : dot(across, upwards) < 0.0;
-    if (turns) across = -across;
+    bitangent = cross(n, tangent);
+    bool turns = is_given ? side * f.tangent.w < 0.0 : dot(bitangent, upwards) < 0.0;
+    if (turns) bitangent = -bitangent;
 }
 
 // The normal `n` with a normal map's tilt, towards the viewer `v` at least. Of a surface seen from behind, all of it is reversed.
 vec3 bent_normal(Fragment f, MapEntry m, vec3 n, vec3 v) {
-    vec3 tangent = vec3(0.0), across = vec3(0.0);
+    vec3 tangent = vec3(0.0), bitangent = vec3(0.0);
     float side = materials[f.material].flags.x > 0.5 && dot(n, f.normal) < 0.0 ? -1.0 : 1.0;
-    tangent_frame(f, m, n, side, tangent, across);
+    tangent_frame(f, m, n, side, tangent, bitangent);
     if (!has_map(m) || tangent == vec3(0.0)) return n;
     vec3 tilt = map_here(data_maps, f, m).rgb * 2.0 - 1.0;
-    vec3 bent = side * m.sampling.w * (tilt.x * tangent + tilt.y * across) + tilt.z * n;
+    vec3 bent = side * m.sampling.w * (tilt.x * tangent + tilt.y * bitangent) + tilt.z * n;
     bent = normalize(dot(bent, bent) == 0.0 ? n : bent);
     return normalize(bent + max(1e-2 - dot(bent, v), 0.0) * v);
 }

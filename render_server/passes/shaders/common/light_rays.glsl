@@ -70,7 +70,7 @@ float lit_area(Light light, LightView view, vec2 s, vec3 p, vec3 n) {
 
 struct Hit { bool present; ivec2 texel; LightView view; vec2 s; float depth; float ray_depth; };
 
-// The first surface that the light sees along its ray through p: in the real map views.xy, in the virtual map
+// The first surface that the light sees along its ray through p: in the real map views.xy, in that of the objects
 // views.zw. `ray_depth` is the depth of p itself.
 Hit first_hit(sampler2D map, int first, int count, vec3 p) {
     Hit hit;

@@ -9,12 +9,12 @@ struct Light {
     vec4 axis_u;   // xyz: half an edge in m (rectangle) or direction of travel on the axis (spot, punctual)
     vec4 axis_v;   // xyz: half the other edge in m (rectangle); x: 1 / range^2, 1/m^2 (punctual)
     vec4 plane;    // of a mirror image: the plane (world) in front of which it shines
-    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; -1: no image, -2: of an object. color.w: distance, m, up to
+    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; -1: no image, -2: lamp of an object. color.w: distance, m, up to
                    // which points belong to the plane; shape.w: roughness; axis_u.w: entry of the surface table;
                    // axis_v.w: the light that it is an image of
     vec4 map_u;    // of a mirror image: its map's coordinates of a world point are dot(xyz, p) + w
     vec4 map_v;
-    ivec4 views;   // first view and count in the real atlas, first and count in the virtual atlas
+    ivec4 views;   // first view and count in the real scene's atlas, first and count in the objects' atlas
 };
 // A row each, the bits of floats and integers: an image, because software renderers load buffers lane by lane, number by number.
 layout(rgba32ui) readonly uniform uimage2D light_rows;
@@ -30,16 +30,16 @@ const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0, PUNCTU
 // Of the scene's lights. llvmpipe executes what one kind needs for every light, so that a scene without it does without.
 #pragma switch bool has_rectangles
 #pragma switch bool has_mirror_images
-#pragma switch bool has_virtual_lights
+#pragma switch bool has_object_lamps
 
 bool is_rectangle(Light light) { return has_rectangles && light.place.w == RECTANGLE; }
 
 bool is_image(Light light) { return has_mirror_images && light.mirror.w >= 0.0; }
 
-// Whether a light comes with an object: it shines with the objects alone, and the picture was taken without it.
-bool is_virtual(Light light) { return has_virtual_lights && light.mirror.w < -1.5; }
+// Whether it comes with an object: then it shines in rho alone, because the picture was taken without it.
+bool is_object_lamp(Light light) { return has_object_lamps && light.mirror.w < -1.5; }
 
-bool is_punctual(Light light) { return has_virtual_lights && light.place.w == PUNCTUAL; }
+bool is_punctual(Light light) { return has_object_lamps && light.place.w == PUNCTUAL; }
 
 const float GREATEST_IRRADIANCE = 256.0;   // by a light of an object: half floats and fixed-point sums hold that of several
 
@@ -93,18 +93,18 @@ vec3 rectangle_vector(Light light, int edges, vec3 p, vec3 n) {
     return before ? -sum : vec3(0.0);   // seen from the front, the corners run clockwise
 }
 
-// Irradiance across the beam at p of a surface with normal n, and the direction towards the light: the irradiance is
-// across * dot(n, to_light). A rectangle is one beam along its vector irradiance; its angular radius is that of the
+// E_perp, the irradiance at p across the beam, and the direction towards the light: a surface with normal n receives
+// e_perp * dot(n, to_light). A rectangle is one beam along its vector irradiance; its angular radius is that of the
 // disc with the same irradiance. Without a normal (0) no horizon clips it.
 vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
     vec3 d = light.place.xyz - p;
     float distance2 = max(dot(d, d), 1e-8);
     if (has_rectangles) {
         vec3 vector = rectangle_vector(light, is_rectangle(light) ? 5 : 0, p, n);
-        float across = length(vector);
-        to_light = across > 1e-12 ? vector / across : d * inversesqrt(distance2);
-        angular_radius = asin(min(sqrt(across / PI), 1.0));
-        if (is_rectangle(light)) return light.color.rgb * across;
+        float e_perp = length(vector);   // for a radiance of 1
+        to_light = e_perp > 1e-12 ? vector / e_perp : d * inversesqrt(distance2);
+        angular_radius = asin(min(sqrt(e_perp / PI), 1.0));
+        if (is_rectangle(light)) return light.color.rgb * e_perp;
     }
     if (light.place.w == DIRECTIONAL) {
         to_light = -light.place.xyz;
@@ -113,6 +113,6 @@ vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out flo
     }
     to_light = d * inversesqrt(distance2);
     angular_radius = asin(min(light.shape.x * inversesqrt(distance2), 1.0));
-    vec3 across = light.color.rgb / distance2 * spot_fraction(light, -to_light);
-    return has_virtual_lights ? across * within_range(light, p) : across;
+    vec3 e_perp = light.color.rgb / distance2 * spot_fraction(light, -to_light);
+    return has_object_lamps ? e_perp * within_range(light, p) : e_perp;
 }

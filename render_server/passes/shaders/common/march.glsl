@@ -185,7 +185,7 @@ bool may_be_far(vec3 q, int level) {
 }
 
 // Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together. Loops test at
-// their end, because software renderers run the body of those that test at their beginning once more, for no lane.
+// their end, because software renderers run the body of those that test at their beginning once more, with all lanes masked.
 
 #ifdef ENDS_NEAR
 float near_end = ENDLESS;   // voxels: distance at which marches through the volume end

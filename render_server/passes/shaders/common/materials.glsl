@@ -1,6 +1,6 @@
 // Materials of meshes. MATERIAL_MAPS: some have maps or alpha (scene/materials.py): two arrays of textures with mip levels.
 // EXTENDED: a coat or a sheen lies over some (common/coating.glsl), or maps tell what their dielectric part reflects and lets through.
-#include "common/even_noise.glsl"
+#include "common/interleaved_gradient_noise.glsl"
 #pragma switch EXTENDED
 #ifndef MATERIAL_MAPS
 #pragma switch MATERIAL_MAPS

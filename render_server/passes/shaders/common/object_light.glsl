@@ -9,7 +9,7 @@
 
 uniform float noise_sigma;      // m at 1 m
 uniform float beam_alpha;       // of the roughest transparent objects through which beams bring light; 0: none do
-uniform float normal_offset;    // m: against self-shadowing by the virtual depth map
+uniform float normal_offset;    // m: against self-shadowing by the objects' map
 
 // BRDF times cosine; `spread` as in specular_times_cosine.
 vec3 response_times_cosine(vec3 n, vec3 v, vec3 l, float cosine, Material m, vec2 spread) {
@@ -34,13 +34,13 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, float turn
     int i = 0;
     if (light_count > 0) do {   // a loop that tests at its end: lights.glsl
         vec3 l; float radius;
-        vec3 across = light_at(listed_light(i), p, n, l, radius);
+        vec3 e_perp = light_at(listed_light(i), p, n, l, radius);
         float cosine = dot(n, l);
         if (cosine <= 0.0) continue;
         vec3 lifted = p + normal_offset * n;
         vec2 fraction = visibility(listed_light(i), lifted, n, 3.0 * noise_sigma * depth * depth, 0.0);
         vec3 seen = arriving(listed_light(i), lifted, fraction, beam_alpha);
-        sum += across * seen * response_times_cosine(n, v, l, cosine, m, vec2(radius, turn));
+        sum += e_perp * seen * response_times_cosine(n, v, l, cosine, m, vec2(radius, turn));
     } while (++i < light_count);
     return sum;
 }

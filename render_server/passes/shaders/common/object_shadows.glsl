@@ -1,7 +1,7 @@
 // Whether the virtual objects may stand between a point, or a sphere, and a light.
 #include "common/soft_shadows.glsl"
 
-uniform sampler2D caster_distance;   // of virtual_light_depth: squared, in cells of CASTER_CELL x CASTER_CELL texels
+uniform sampler2D caster_distance;   // of object_rsm_depth: squared, in cells of CASTER_CELL x CASTER_CELL texels
 #pragma texels r32f caster_distance
 
 const float COMPARED_TEXELS = 2.0;   // beyond a sample's own place, by bilinear comparison and rounding

@@ -57,7 +57,7 @@ bool is_open_at(int at, vec2 place) {
         clear += weights[k] * fract(vertices[rows[k] + 11]);
     }
     int material = material_of_triangle(at);
-    return is_cut_out(material, opacity_of(material, uv, opacity_of_vertices(clear), 0.0), even_noise(PLACES * place));
+    return is_cut_out(material, opacity_of(material, uv, opacity_of_vertices(clear), 0.0), interleaved_gradient_noise(PLACES * place));
 }
 #endif
 

@@ -30,7 +30,7 @@ ShadowCone shadow_cone(Light light, vec3 p, vec3 n) {
 
 // Whether any shadow cone from p meets the objects.
 bool object_meets_cone(vec3 p, vec3 n) {
-    if (has_virtual_lights) return true;   // they reach all
+    if (has_object_lamps) return true;   // they reach all
     for (int chosen = 0; chosen < volume_count; ++chosen) {
         work_in_volume(chosen);
         for (int i = 0; i < light_count; ++i) {
@@ -64,7 +64,7 @@ bool own_object_meets_cone_of_sphere(vec3 p, float radius) {
 // Whether object_meets_cone may hold of a point within `radius` (m) of p, whatever its normal; of images and rectangles,
 // only the points tell. Cones of positions start and end SHADOW_START beside the segment from a point to the light.
 bool object_meets_cone_of_sphere(vec3 p, float radius) {
-    if (has_rectangles || has_mirror_images || has_virtual_lights) return true;
+    if (has_rectangles || has_mirror_images || has_object_lamps) return true;
     bool meets = false;
     for (int chosen = 0; chosen < volume_count; ++chosen) {
         work_in_volume(chosen);

@@ -4,8 +4,8 @@
 #include "common/light_shapes.glsl"
 #include "common/light_views.glsl"
 
-uniform sampler2D real_light_depth;
-uniform sampler2D virtual_light_depth;
+uniform sampler2D real_rsm_depth;
+uniform sampler2D object_rsm_depth;
 uniform int shadow_samples;
 
 const float WIDE_TEXELS = 6.0;   // penumbrae wider than this get more samples
@@ -93,7 +93,7 @@ vec2 light_sample(LightExtent k, int j, int count) {
 
 // Every loop over a light's samples appears twice, once for discs and once for squares, with no iterations for the
 // other kind: llvmpipe leaves a loop early, but executes both sides of a branch. Loops test at their end, because it runs
-// the body of those that test at their beginning once more, for no lane.
+// the body of those that test at their beginning once more, with all lanes masked.
 
 struct Blocking { float sum; float hits; float deepest; };   // depths
 
@@ -215,9 +215,9 @@ void add_samples(
     if (count > 0) do {
         vec2 offset = light_sample(k, j, count);
         float w = sample_weight(light, k, p, n, offset);
-        float v = real.present ? sample_visibility(real_light_depth, real, offset) : 1.0;
+        float v = real.present ? sample_visibility(real_rsm_depth, real, offset) : 1.0;
         sum.xz += w * vec2(v, 1.0);
-        if (object.present && v > 0.0) v *= sample_visibility(virtual_light_depth, object, offset);
+        if (object.present && v > 0.0) v *= sample_visibility(object_rsm_depth, object, offset);
         sum.y += w * v;
     } while (++j < count);
 }

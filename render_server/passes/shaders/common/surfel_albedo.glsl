@@ -15,9 +15,9 @@ vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
     if (!camera_sees(p, n)) return unseen_albedo(p);
     for (int i = 0; i < light_count; ++i) {
         vec3 to_light; float radius;
-        vec3 across = light_at(listed_light(i), p, n, to_light, radius);
+        vec3 e_perp = light_at(listed_light(i), p, n, to_light, radius);
         float cosine = dot(n, to_light);
-        if (cosine > 0.0) e += across * cosine * real_visibility(listed_light(i), p, n, bias_real);
+        if (cosine > 0.0) e += e_perp * cosine * real_visibility(listed_light(i), p, n, bias_real);
     }
     return clamp(PI * measured_radiance(p) / max(e, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
 }

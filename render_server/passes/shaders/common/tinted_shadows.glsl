@@ -8,8 +8,8 @@
 #endif
 #ifdef TINTED_SHADOWS
 layout(std430) readonly buffer Transmittances { vec4 transmittances[]; };   // of materials: rgb; alpha
-uniform sampler2D virtual_light_normal;   // w: material
-#pragma texels rgba16f virtual_light_normal
+uniform sampler2D object_rsm_normal;   // w: material
+#pragma texels rgba16f object_rsm_normal
 
 // Sum of what the objects' first surfaces around a receiver let through, and how many block it. What beams carry counts as blocked.
 vec4 transmittance_sum(Light light, LightView view, vec3 p, float beam_alpha) {
@@ -20,8 +20,8 @@ vec4 transmittance_sum(Light light, LightView view, vec3 p, float beam_alpha) {
     for (int j = 0; j < shadow_samples; ++j) {
         vec2 offset = lateral_shift(k, drift(view, v.z, view.range.x), light_sample(k, j, shadow_samples));
         vec2 t = tile_texel(view, s + offset);
-        if (t.x < 0.0 || first_depth(virtual_light_depth, view, ivec2(t)) >= v.z) continue;
-        vec4 through = transmittances[int(texelFetch(virtual_light_normal, ivec2(t), 0).w)];
+        if (t.x < 0.0 || first_depth(object_rsm_depth, view, ivec2(t)) >= v.z) continue;
+        vec4 through = transmittances[int(texelFetch(object_rsm_normal, ivec2(t), 0).w)];
         sum += vec4(through.a < beam_alpha ? vec3(0.0) : through.rgb, 1.0);
     }
     return sum;

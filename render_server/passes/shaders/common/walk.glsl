@@ -10,9 +10,9 @@ uint spread(uint group, uint count) {
     return run > 0u && group < run * CORES ? group % run * CORES + group / run : group;
 }
 
-// A list that all threads, 64 a workgroup, walk together: for (uint i = first_item(); i < count; i += items_apart()).
+// A grid-stride loop: all threads, 64 a workgroup, walk a list together: for (uint i = first_item(); i < count; i += items_apart()).
 // Where a step is costly the loop tests at its end, do .. while: software renderers run the step of a loop that tests at
-// its beginning once more, for no lane.
+// its beginning once more, with all lanes masked.
 uint first_item() { return spread(gl_WorkGroupID.x, gl_NumWorkGroups.x) * 64u + gl_LocalInvocationID.x; }
 
 // Place of a workgroup over a picture.

@@ -1,4 +1,7 @@
-"""Stages of the beams that smooth objects cast, the same for all views (docs/method.md 4.10)."""
+"""The stage that traces caustics: beams of light off and through smooth objects (docs/method.md 4.10).
+
+They are traced once for all views, up to the objects that they meet; each view ends them at its own real surfaces.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +12,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, bounced_later
+from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, lagging_behind_objects
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeams
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.mesh_buffers import ObjectBvh
@@ -22,15 +25,15 @@ def casts_caustics(objects: GeometryState) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class SentBeams:
-    """Beams that objects cast, and how far they reach (m)."""
+class TracedBeams:
+    """Beams up to the objects that they meet, and how far from an object they are followed (m)."""
 
     beams: CausticBeams
     reach_m: float
 
 
-class CastBeams:
-    """Beams that smooth objects cast, for all views."""
+class BeamStages:
+    """Traces the beams that smooth objects cast, for all views."""
 
     def __init__(self, gpu: GpuContext, lights: LightBuffers, tier: QualityTier) -> None:
         self._lights = lights
@@ -44,17 +47,17 @@ class CastBeams:
         volume: PlacedVolume,
         _lights: LightSet,
         *_maps: object,
-    ) -> SentBeams | None:
+    ) -> TracedBeams | None:
         """Traces the beams that smooth objects cast; None if none is smooth enough."""
         if not casts_caustics(objects):
             return None
         low, high = objects.bounds
-        offset = SELF_SHADOW_TEXELS * self._lights.virtual_texel_m((low + high) / 2)
+        offset = SELF_SHADOW_TEXELS * self._lights.object_texel_m((low + high) / 2)
         materials = objects.materials
         scene = {**seen.bindings, **materials.bindings, **self._lights.bindings, "normal_offset": offset}
         self._beams.trace(self._lights, bvh, materials, scene, bias_m=seen.scan.bias_m)
         reach = max(each.size * each.voxel_edge for each in volume.placements)
-        return SentBeams(self._beams, reach)
+        return TracedBeams(self._beams, reach)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -74,10 +77,10 @@ def beam_stages(
     bvh: Resource[ObjectBvh],
     *,
     casts: bool,
-) -> Resource[SentBeams | None]:
+) -> Resource[TracedBeams | None]:
     """Declares the beams that smooth objects cast; none of a method that `casts` none."""
-    trace: Callable[..., SentBeams | None] = no_beams
+    trace: Callable[..., TracedBeams | None] = no_beams
     if casts:
-        trace = g.shared("caustic beams", lambda: CastBeams(g.gpu, lit.buffers, tier)).trace
-    with bounced_later(g, s, lit, tier, bvh):
+        trace = g.shared("caustic beams", lambda: BeamStages(g.gpu, lit.buffers, tier)).trace
+    with lagging_behind_objects(g, s, lit, tier, bvh):
         return g.stage("caustic beams", trace, s.objects, bvh, s.measured, volume, s.lights, *lit.all)
