@@ -191,11 +191,10 @@ class LightHistory:
         found: dict[str, Binding] = {
             "has_history": knows_bounced,
             "keeps_unblocked": knows_unblocked and not knows_direct,
-            # Of later frames (`Kernel`); what they know besides has the size and format of this frame's.
-            "has_history_later": light is not None,
+            "has_history_later": light is not None,  # so that their programs are compiled ahead (`Kernel`)
             "keeps_unblocked_later": light is not None,
-            "last_position": scene["real_surface_position"] if positions is None else positions,
             "last_camera_from_world": matrix,
+            "last_position": positions,
             "last_real_texels": self._real_texels[1],
             "last_object_texels": self._object_texels[1],
             "stale_texels": self._stale,
