@@ -97,6 +97,7 @@ class LiveScene:
         self._waits = waits
         self._unobserved = False  # the real scene moved while its lights were provisional
         self._accumulated: tuple[ViewFrame, ...] = ()  # last frames already accumulated
+        self.is_at_rest = False  # everything in the newest frame
         self._budget = self._new_budget(scene)
         self._plan = self._planned(scene)
         self._waits = True  # from now on; otherwise a picture that is shown already would change twice
@@ -173,7 +174,7 @@ class LiveScene:
         if plan.scene.lights != old.scene.lights:
             self.lighting = plan.lighting
             self._accumulated = ()
-        self._plan = plan
+        self._plan, self.is_at_rest = plan, False
 
     def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""
@@ -212,6 +213,7 @@ class LiveScene:
         if self._plan.method.document.quality != self._budget.level.quality:
             self._apply(self._planned(self._plan.scene))
         frames, first = tuple(each.frame for each in taken), taken[0].frame
+        self.is_at_rest = False
         again, self._accumulated = _same_objects(frames, self._accumulated), ()
         if self._real is not None and not again:
             self._real.expect(taken)
@@ -236,7 +238,8 @@ class LiveScene:
         self._accumulated = frames
         changed |= self._note_change(objects, first, moved=False)
         relit = self._relit(taken, level, changed=changed)
-        best = self._refined(self._real, taken, objects, surfaces) if self._is_at_rest(first) else []
+        self.is_at_rest = self._has_come_to_rest(first)
+        best = self._refined(self._real, taken, objects, surfaces) if self.is_at_rest else []
         if not best:
             self._refined_ns = None
             return relit
@@ -268,7 +271,7 @@ class LiveScene:
     def _estimate_lights(self, real: RealGeometry, frame: ViewFrame, *, moved: bool) -> None:
         """Estimates light, and the albedo of surfaces that may go out of view, with the first camera's graph."""
         graph = self._graphs.newest[0]
-        graph.set_lights(self.lighting.estimate(graph, moved=moved, is_at_rest=self._is_at_rest(frame)))
+        graph.set_lights(self.lighting.estimate(graph, moved=moved, is_at_rest=self._has_come_to_rest(frame)))
         self._unobserved |= moved
         is_due = self._unobserved and not self.lighting.is_provisional
         self._unobserved &= not is_due
@@ -286,7 +289,7 @@ class LiveScene:
             self._changing, self._changed_ns = changing, frame.timestamp_ns
         return changed
 
-    def _is_at_rest(self, frame: ViewFrame) -> bool:
+    def _has_come_to_rest(self, frame: ViewFrame) -> bool:
         assert self._real is not None
         return self._real.is_settled and frame.timestamp_ns - self._changed_ns >= REST_NS
 

@@ -153,6 +153,11 @@ class SceneRenderer:
         if self._out_of_memory is not None:
             self._out_of_memory = self._out_of_memory[0], 0.0
 
+    def compile_ahead(self) -> None:
+        """Compiles a program that the next motion will run, if there is one and everything is at rest."""
+        if self._live.is_at_rest:
+            self._gpu.foreseen.compile_next()
+
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
         self._cameras, self._newest = {}, ()

@@ -16,6 +16,7 @@ import moderngl
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.buffer_images import TextureCalls
+from deltalight.render_server.gpu.foreseen import ForeseenPrograms
 from deltalight.render_server.gpu.lost_context import check_reset, reporting, reset_status
 
 SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
@@ -119,6 +120,7 @@ class GpuContext:
     """Told of every program that a kernel asks for, when it first runs: its label and the text of each stage."""
 
     programs: SharedPrograms = field(default_factory=SharedPrograms)
+    foreseen: ForeseenPrograms = field(default_factory=ForeseenPrograms)
     reset_status: Callable[[], int] = lambda: 0
     """Asks the driver whether the context was lost (lost_context.py); 0 = it was not."""
     most_images: int = NEEDED["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]

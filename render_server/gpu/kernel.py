@@ -6,7 +6,7 @@ needs.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
@@ -316,7 +316,11 @@ class Shader(ABC):
 
     def _chosen(self, known: Bindings) -> Program:
         on = self._switched_on(known) if self._switches else ()
-        return self._programs.get(on) or self._with(on)
+        return self._programs.get(on) or self._first_chosen(on, known)
+
+    def _first_chosen(self, on: tuple[str, ...], _known: Bindings) -> Program:
+        """Returns the program with these switches on, which these bindings are the first to choose."""
+        return self._with(on)
 
     def _switched_on(self, known: Bindings) -> tuple[str, ...]:
         try:
@@ -355,10 +359,14 @@ class Kernel(Shader):
 
     The one place where work is dispatched, so that the memory barrier is never forgotten: a missing barrier does not
     show on a software renderer.
+
+    Where a binding `NAME_later` is true, later frames turn the switch NAME on: the program with it is compiled ahead
+    (gpu/foreseen.py).
     """
 
     def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
         super().__init__(gpu, name, defines)
+        self._later: Bindings = {}  # switches to be turned on, until the program with them is compiled
 
     def _text(self, defines: Mapping[str, float | str]) -> str:
         source = shader_source(SHADERS / f"{self._name}.comp.glsl", {**self._gpu.defines, **defines})
@@ -372,6 +380,35 @@ class Kernel(Shader):
             return Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))
 
         return self._shared(source, link=link)
+
+    def _first_chosen(self, on: tuple[str, ...], known: Bindings) -> Program:
+        off = set(self._switches).difference(on)
+        self._later = {name: True for name in off if known.get(f"{name}_later")}
+        self._gpu.foreseen.forget(self)
+        return self._with(on)
+
+    def foresee(self, *shared: Bindings, **own: Binding) -> None:
+        """Has the program that these bindings choose compiled ahead, unless it is compiled already."""
+        known = merged(own, shared)
+        if self._switched_on(known) not in self._programs:
+            self._gpu.foreseen.add(self, known)
+
+    def compile_ahead(self, known: Bindings) -> None:
+        """Compiles the program for a run that binds the like of `known`, and turns on what is to be on later.
+
+        It runs without workgroups, because some drivers compile for what is bound, and no sooner than that. What
+        fails here is told when it fails again in a run.
+        """
+        known, self._later = {**known, **self._later}, {}
+        with suppress(ShaderError, BindingError):
+            program = self._chosen(known)
+            program.bind({}, known)
+            program.compute.run_indirect(self._gpu.empty_buffer)
+
+    def release(self) -> None:
+        """Leaves the programs to other kernels of the same source."""
+        self._gpu.foreseen.forget(self)
+        super().release()
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
         """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
@@ -388,6 +425,8 @@ class Kernel(Shader):
         self._gpu.settle_draws()
         program.compute.run(*groups)
         self._gpu.ctx.memory_barrier()
+        if self._later:
+            self._gpu.foreseen.add(self, known)
         if self._gpu.watchers:
             program.report(groups, partial(program.written, known))
 
@@ -400,6 +439,8 @@ class Kernel(Shader):
         self._gpu.settle_draws()
         program.compute.run_indirect(groups)
         self._gpu.ctx.memory_barrier()
+        if self._later:
+            self._gpu.foreseen.add(self, known)
         if self._gpu.watchers:
             program.report((), partial(program.written, known))
 

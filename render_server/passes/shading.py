@@ -107,9 +107,12 @@ class DirectLight:
         traced = {} if objects is None else objects.bindings
         shared = voxels, _caustics_on(grid, caustics), traced, scene
         self._shade(grid, self.bindings, *shared)
-        if self._spared is not None and scene["keeps_unblocked"]:
+        if self._spared is not None:
             listed: Bindings = {**self.bindings, **grid.bindings, "Texels": self.spared}
-            self._spared.run((list_threads(self._gpu, math.prod(self._size)),), listed, *shared)
+            if scene["keeps_unblocked"]:
+                self._spared.run((list_threads(self._gpu, math.prod(self._size)),), listed, *shared)
+            elif scene["keeps_unblocked_later"]:
+                self._spared.foresee(listed, *shared, keeps_unblocked=True)
 
     def clear(self, scene: Bindings) -> None:
         """Sets all light to zero."""
@@ -189,6 +192,8 @@ class LightHistory:
         found: dict[str, Binding] = {
             "has_history": knows_bounced,
             "keeps_unblocked": knows_unblocked and not knows_direct,
+            "has_history_later": light is not None,  # so that their programs are compiled ahead (`Kernel`)
+            "keeps_unblocked_later": light is not None,
             "last_camera_from_world": matrix,
             "last_position": positions,
             "last_real_texels": self._real_texels[1],

@@ -371,6 +371,7 @@ def _loop(session: RenderSession, source: FrameReceiver, sender: Sender, command
             _offer_stats(session, sender)
             stats_due_s = time.monotonic() + STATS_INTERVAL_S
         commands.serve(session.execute)
+        session.compile_ahead()  # last, for it may take a second
 
 
 def _offer_stats(session: RenderSession, sender: Sender) -> None:

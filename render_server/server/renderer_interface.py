@@ -130,6 +130,9 @@ class Renderer(Protocol):
     def room(self) -> Room:
         """Returns the real scene as the newest picture shows it."""
 
+    def compile_ahead(self) -> None:
+        """Compiles a program that the next motion will run, if there is one and everything is at rest."""
+
     def forget_frames(self) -> None:
         """Forgets what earlier frames showed."""
 

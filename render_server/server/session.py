@@ -176,6 +176,11 @@ class RenderSession:
                 raise
         return None
 
+    def compile_ahead(self) -> None:
+        """Prepares the renderer for the next motion, a program at a time, unless a picture is to be finished."""
+        if not (self.has_picture or self.is_waiting):
+            self._renderer.compile_ahead()
+
     def cameras(self, *, if_changed: bool = False) -> CamerasMessage | None:
         """Returns the room's cameras; None where there are and were none.
 

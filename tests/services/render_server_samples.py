@@ -141,6 +141,7 @@ class InvertingRenderer:
         self.rooms: list[list[tuple[str, int, bool]]] = []  # camera, frame, and whether it was to be shown
         self.ignored: str | None = None
         self.unfinished: list[int] = []
+        self.compiled_ahead = 0
 
     def submit_cameras(
         self,
@@ -182,6 +183,10 @@ class InvertingRenderer:
 
     def room(self) -> RoomMesh:
         raise DeltalightError("No surface of the room is known yet; ask again when depth shows some.")
+
+    def compile_ahead(self) -> None:
+        assert not self.unfinished, "pictures come first"
+        self.compiled_ahead += 1
 
     def forget_frames(self) -> None:
         self.sources_begun += 1

@@ -312,6 +312,15 @@ def test_how_far_a_first_picture_is_comes_before_it(monkeypatch: pytest.MonkeyPa
         receiver.close()
 
 
+def test_a_server_compiles_ahead_between_pictures() -> None:
+    with serving(immediate=False) as (server, renderer, node_port):
+        node = Node(ports.endpoint(node_port))
+        before = server.first(lambda message: message.status == "ok"), renderer.compiled_ahead
+        server.first(lambda message: message.frame_id > before[0].frame_id)
+        assert renderer.compiled_ahead > before[1]
+        node.close()
+
+
 def test_frames_go_on_after_a_snapshot_and_commands_wait_for_it(tmp_path: Path) -> None:
     with serving(immediate=False) as (server, _, node_port):
         node = Node(ports.endpoint(node_port))

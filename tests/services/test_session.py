@@ -345,6 +345,17 @@ def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
     assert not session.is_waiting
 
 
+def test_programs_are_compiled_ahead_when_no_picture_waits_to_be_finished(
+    session: RenderSession, renderer: InvertingRenderer
+) -> None:
+    renderer.immediate = False
+    feed(session, 0)
+    for expected in (0, 1):  # the picture is started, and finished
+        session.step()
+        session.compile_ahead()
+        assert renderer.compiled_ahead == expected
+
+
 def test_pick_asks_the_renderer(session: RenderSession, renderer: InvertingRenderer) -> None:
     with pytest.raises(DeltalightError, match="Nothing has been rendered yet"):
         session.execute(request("pick", x=3, y=4))
