@@ -56,10 +56,11 @@ class BufferImage:
 
     def bind(self, unit: int, buffer: moderngl.Buffer) -> None:
         """Binds the data of `buffer` to an image unit."""
-        if self._shown() is not buffer or self._size != buffer.size:
+        size = buffer.size
+        if self._shown() is not buffer or self._size != size:
             self._calls.glBindTexture(TEXTURE_BUFFER, self._name)
             self._calls.glTexBuffer(TEXTURE_BUFFER, self._format, buffer.glo)
-            self._shown, self._size = ref(buffer), buffer.size
+            self._shown, self._size = ref(buffer), size
         self._calls.glBindImageTexture(unit, self._name, 0, 0, 0, READ_WRITE, self._format)
 
     def release(self) -> None:
