@@ -78,7 +78,8 @@ class Program:
             self._adopt(name, program[name])
         self._assign()
         self._shown = {
-            slot.name: BufferImage(gpu.texture_calls, *declared.formats[slot.name]) for slot in self._arrays
+            slot.name: BufferImage(gpu.texture_calls, slot.place, *declared.formats[slot.name])
+            for slot in self._arrays
         }
         binders: Sequence[tuple[list[Slot], Callable[[Slot, Any], Callable[[], None]]]] = (
             (self._samplers, self._sampler_call),
@@ -194,7 +195,7 @@ class Program:
             )
 
     def _array_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
-        return partial(self._shown[slot.name].bind, slot.place, self._buffer(slot, value))
+        return partial(self._shown[slot.name].bind, self._buffer(slot, value))
 
     def _storage_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
         mglo: Any = self._buffer(slot, value).mglo
