@@ -291,10 +291,9 @@ class VirtualObjects:
         """Returns the document's material, if it gives one; the same object for the same document."""
         if item.material is None:
             return None
-        given = self._given.get(item.material)
-        if given is None:
-            given = self._given[item.material] = given_material(item.material)
-        return given
+        if item.material not in self._given:
+            self._given[item.material] = given_material(item.material)
+        return self._given[item.material]
 
     def _merged(self, meshes: Sequence[TriangleMesh]) -> GpuMesh:
         """Merges the meshes of all objects."""

@@ -102,7 +102,7 @@ class MeshBuffers:
             if len(self._corner_texels) != rows * CORNERS_ROW:
                 self._corner_texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
             texels = self._corner_texels[: len(self.triangles)]
-            # Unless it may raise in between, NumPy gathers right into them.
+            # In its default mode, "raise", NumPy would gather into a copy first.
             padded(self._written.vertices[:, :3]).take(self.triangles, axis=0, out=texels, mode="clip")
             size = 3 * CORNERS_ROW, rows
             self._corners = rewritten(self._gpu, self._corners, size, "f4", self._corner_texels)
