@@ -119,6 +119,21 @@ class _PlacedMeshes:
         return is_same and np.array_equal(own.world_from_asset[:3, :3], item.world_from_asset[:3, :3])
 
 
+@dataclass(frozen=True, eq=False)
+class _ObjectInWorld:
+    """All that follows from an object's `document` and the `board`, and from its pose if it plays a clip.
+
+    `extent` encloses it at all times; `lamps` are the lights that come with it (world, camera units).
+    """
+
+    document: SceneObject
+    board: BoardSpec | None
+    described: PlacedObject
+    placed: _PlacedMeshes
+    extent: ObjectExtent
+    lamps: list[Light]
+
+
 class VirtualObjects:
     """Loads assets once; moves them with the document and their clips."""
 
@@ -131,9 +146,8 @@ class VirtualObjects:
         self._shown: tuple[SceneObject, ...] = ()
         self._board: BoardSpec | None = None
         self._moving: dict[str, AnimatedObject] = {}
-        self._standing: dict[str, _PlacedMeshes] = {}
+        self._standing: dict[str, _ObjectInWorld] = {}
         self._kept_merged: tuple[Sequence[TriangleMesh], GpuMesh | None] = (), None
-        self._resting_lamps: dict[str, tuple[SceneObject, BoardSpec | None, list[Light]]] = {}
         self.state: GeometryState | None = None
 
     def load(self, objects: Sequence[SceneObject]) -> None:
@@ -200,7 +214,6 @@ class VirtualObjects:
             self._moving = {name: moving for name, moving in animated.items() if moving is not None}
             names = {item.id for item in shown}
             self._standing = {name: kept for name, kept in self._standing.items() if name in names}
-            self._resting_lamps = {name: kept for name, kept in self._resting_lamps.items() if name in names}
             self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
         moved = [moving.advance_to(capture_ns) for moving in self._moving.values()]
         if is_new or any(moved):
@@ -209,11 +222,10 @@ class VirtualObjects:
 
     def _build(self) -> GeometryState | None:
         """Merges and uploads the triangles; returns None if all are degenerate."""
-        objects = [self._described(item) for item in self._shown]
-        each = [self._placed(item) for item in objects]
-        merged = self._merged([mesh for placed in each for mesh in placed.meshes])
-        swept = [self._swept(item, placed.points) for item, placed in zip(objects, each, strict=True)]
-        low, high = short_axis.bounds(np.concatenate(swept))
+        each = [self._in_world(item) for item in self._shown]
+        merged = self._merged([mesh for item in each for mesh in item.placed.meshes])
+        lasting = np.concatenate([item.extent.points for item in each])
+        low, high = short_axis.bounds(lasting)
         if not (low < high).any():
             return None
         self._buffers.write(merged)
@@ -221,20 +233,27 @@ class VirtualObjects:
         self._buffers.cutouts = materials.bindings
         return GeometryState(
             DrawnMesh(self._buffers, merged),
-            np.concatenate([placed.points for placed in each]),
+            np.concatenate([item.placed.points for item in each]),
             materials,
-            objects=tuple(objects),
-            lamps=tuple(
-                lamp
-                for item, placed in zip(self._shown, objects, strict=True)
-                for lamp in self._lamps(item, placed.world_from_asset)
-            ),
-            swept_points=np.concatenate(swept) if any(item.moves for item in objects) else None,
-            extents=tuple(
-                ObjectExtent(lasting, np.array(short_axis.bounds(self._upright(item, placed))))
-                for item, placed, lasting in zip(self._shown, objects, swept, strict=True)
-            ),
+            objects=tuple(item.described for item in each),
+            lamps=tuple(lamp for item in each for lamp in item.lamps),
+            swept_points=lasting if any(item.described.moves for item in each) else None,
+            extents=tuple(item.extent for item in each),
         )
+
+    def _in_world(self, item: SceneObject) -> _ObjectInWorld:
+        """Returns an object in the world: as it was before if it neither was moved nor plays a clip."""
+        before, wanted = self._standing.get(item.id), (item, self._board)
+        if before is not None and item.id not in self._moving and (before.document, before.board) == wanted:
+            return before
+        described = self._described(item)
+        placed = _PlacedMeshes.of(described, None if before is None else before.placed)
+        upright = np.array(short_axis.bounds(self._upright(item, described)))
+        extent = ObjectExtent(self._swept(described, placed.points), upright)
+        lamps = self._lamps(item, described.world_from_asset)
+        found = _ObjectInWorld(item, self._board, described, placed, extent, lamps)
+        self._standing[item.id] = found
+        return found
 
     def _material_table(self, merged: GpuMesh) -> MaterialTable:
         """Returns the table on the GPU, rebuilt only if the materials changed."""
@@ -261,15 +280,12 @@ class VirtualObjects:
 
     def _lamps(self, item: SceneObject, world_from_asset: Float64[np.ndarray, "4 4"]) -> list[Light]:
         """Returns the lights that come with an object, as bright as the document wants them; none if they are off."""
+        if not item.lamps:
+            return []
         moving = self._moving.get(item.id)
-        kept = self._resting_lamps.get(item.id)
-        if moving is None and kept is not None and kept[:2] == (item, self._board):
-            return kept[2]
         shining = (self._assets[item.asset] if moving is None else moving).lamps(world_from_asset)
         factor = np.full(3, item.lamps, np.float32)
-        lamps = [lamp.scaled(factor) for lamp in shining] if item.lamps else []
-        self._resting_lamps[item.id] = item, self._board, lamps
-        return lamps
+        return [lamp.scaled(factor) for lamp in shining]
 
     def _given_material(self, item: SceneObject) -> Material | None:
         """Returns the document's material, if it gives one; the same object for the same document."""
@@ -278,11 +294,6 @@ class VirtualObjects:
         if item.material not in self._given:
             self._given[item.material] = given_material(item.material)
         return self._given[item.material]
-
-    def _placed(self, item: PlacedObject) -> _PlacedMeshes:
-        """Returns an object's meshes in the world: those of before unless it moved."""
-        self._standing[item.id] = placed = _PlacedMeshes.of(item, self._standing.get(item.id))
-        return placed
 
     def _merged(self, meshes: Sequence[TriangleMesh]) -> GpuMesh:
         """Merges the meshes of all objects."""

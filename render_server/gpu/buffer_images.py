@@ -2,7 +2,7 @@
 
 import ctypes
 from collections.abc import Callable, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final
 from weakref import ref
 
@@ -41,10 +41,10 @@ class TextureCalls:
 
 
 class BufferImage:
-    """A texture that shows a storage buffer's data as texels of a format, and is attached to what is bound."""
+    """A texture that shows a storage buffer's data as texels of a format at an image unit."""
 
-    def __init__(self, calls: TextureCalls, texels: str) -> None:
-        self._calls, self._format = calls, FORMATS[texels]
+    def __init__(self, calls: TextureCalls, unit: int, texels: str) -> None:
+        self._calls, self._unit, self._format = calls, unit, FORMATS[texels]
         self._shown: Callable[[], moderngl.Buffer | None] = lambda: None
         self._size = 0
 
@@ -54,13 +54,23 @@ class BufferImage:
         self._calls.glGenTextures(1, ctypes.byref(name))
         return name.value
 
-    def bind(self, unit: int, buffer: moderngl.Buffer) -> None:
-        """Binds the data of `buffer` to an image unit."""
-        if self._shown() is not buffer or self._size != buffer.size:
+    @cached_property
+    def _attach(self) -> Callable[[], None]:
+        """Attaches the texture to the unit; arguments are converted once, for that takes longer than the call."""
+        level, layered, layer = 0, 0, 0
+        values = self._unit, self._name, level, layered, layer, READ_WRITE, self._format
+        kinds = _ARGUMENTS["glBindImageTexture"]
+        given = [kind(value) for kind, value in zip(kinds, values, strict=True)]
+        return partial(self._calls.glBindImageTexture, *given)
+
+    def bind(self, buffer: moderngl.Buffer) -> None:
+        """Binds the data of `buffer` to the unit."""
+        size = buffer.size
+        if self._shown() is not buffer or self._size != size:
             self._calls.glBindTexture(TEXTURE_BUFFER, self._name)
             self._calls.glTexBuffer(TEXTURE_BUFFER, self._format, buffer.glo)
-            self._shown, self._size = ref(buffer), buffer.size
-        self._calls.glBindImageTexture(unit, self._name, 0, 0, 0, READ_WRITE, self._format)
+            self._shown, self._size = ref(buffer), size
+        self._attach()
 
     def release(self) -> None:
         """Frees the texture."""

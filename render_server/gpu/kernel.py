@@ -78,11 +78,13 @@ class Program:
             self._adopt(name, program[name])
         self._assign()
         self._shown = {
-            slot.name: BufferImage(gpu.texture_calls, *declared.formats[slot.name]) for slot in self._arrays
+            slot.name: BufferImage(gpu.texture_calls, slot.place, *declared.formats[slot.name])
+            for slot in self._arrays
         }
         binders: Sequence[tuple[list[Slot], Callable[[Slot, Any], Callable[[], None]]]] = (
             (self._samplers, self._sampler_call),
             (self._images, self._image_call),
+            (self._arrays, self._array_call),
             (self._storage, self._storage_call),
             (self._blocks, self._block_call),
         )
@@ -127,8 +129,6 @@ class Program:
             raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
         try:
             resources, values = self._resources(known), self._values(known)
-            for slot in self._arrays:
-                self._shown[slot.name].bind(slot.place, self._buffer(slot, known[slot.name]))
         except KeyError:
             slots = self._samplers, self._images, self._storage, self._blocks, self._arrays, self._uniforms
             require_given({slot.name for each in slots for slot in each}, known, self.label)
@@ -193,6 +193,9 @@ class Program:
                 f"Kernel {self.label}: `{slot.name}` is declared {' or '.join(sorted(wanted))}, "
                 f"but the texture is {found}."
             )
+
+    def _array_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
+        return partial(self._shown[slot.name].bind, self._buffer(slot, value))
 
     def _storage_call(self, slot: Slot, value: Binding) -> Callable[[], None]:
         mglo: Any = self._buffer(slot, value).mglo

@@ -16,7 +16,7 @@ from deltalight.render_server.scene.bvh import Bvh, build_bvh
 from deltalight.render_server.scene.material_tables import coating_table, map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
 from deltalight.render_server.scene.threads import submit
-from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
+from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh, padded
 
 # Of the vertices of meshes that have either, in a buffer of their own.
 PLACEMENT_LAYOUT, PLACEMENT_ATTRIBUTES = "2f 4f", ("in_second_uv", "in_tangent")
@@ -101,7 +101,9 @@ class MeshBuffers:
             rows = texture_rows(-(-len(self.triangles) // CORNERS_ROW))
             if len(self._corner_texels) != rows * CORNERS_ROW:
                 self._corner_texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
-            self._corner_texels[: len(self.triangles), :, :3] = self._written.corners
+            texels = self._corner_texels[: len(self.triangles)]
+            # In its default mode, "raise", NumPy would gather into a copy first.
+            padded(self._written.vertices[:, :3]).take(self.triangles, axis=0, out=texels, mode="clip")
             size = 3 * CORNERS_ROW, rows
             self._corners = rewritten(self._gpu, self._corners, size, "f4", self._corner_texels)
             self._shows_corners = True

@@ -331,16 +331,18 @@ def _depth_range(
     local: Float64[np.ndarray, "n 3"], blocking: Float64[np.ndarray, "m 3"], half: float
 ) -> tuple[float, float]:
     """Returns a near plane in front of all that can block within the view, a far plane behind the receivers."""
-    inside = local[:, 2][_tangents(local) <= half]
-    return _range_around(inside, blocking, half, float(local[:, 2].max()))
+    inside = _depths_within(local, half), _depths_within(blocking, half)
+    return _range_around(inside, float(local[:, 2].max()))
 
 
-def _range_around(
-    inside: Float64[np.ndarray, " n"], blocking: Float64[np.ndarray, "m 3"], half: float, farthest: float
-) -> tuple[float, float]:
-    """Returns `_depth_range` of the depths of the receivers `inside` the view; `farthest`: of them all."""
-    blocking_depths = blocking[:, 2][_tangents(blocking) <= half]
-    nearest = min(float(depths.min(initial=farthest)) for depths in (blocking_depths, inside))
+def _depths_within(local: Float64[np.ndarray, "n 3"], half: float) -> Float64[np.ndarray, " k"]:
+    """Returns the depths of the points inside a view."""
+    return local[:, 2][_tangents(local) <= half]
+
+
+def _range_around(depths: Sequence[Float64[np.ndarray, " n"]], farthest: float) -> tuple[float, float]:
+    """Returns `_depth_range` of the depths of what lies inside the view; `farthest`: of all receivers."""
+    nearest = min(float(each.min(initial=farthest)) for each in depths)
     near = max(nearest * NEAR_MARGIN, NEAREST_M)
     return near, max(farthest * FAR_MARGIN, near + NEAREST_M)
 
@@ -359,10 +361,10 @@ def _perspective_view(
     half = float(_tangents(local).max()) * 1.01 + 1e-4
     if half > WIDEST_SINGLE_TANGENT:
         return None
-    # All of them are inside, and need not be looked at again if they are the occluders, too.
-    depths = local[:, 2]
-    others = occluders[:0] if occluders is receivers else (occluders - position) @ rotation.T
-    near, far = _range_around(depths, others, half, float(depths.max()))
+    depths = [local[:, 2]]  # all of them are inside
+    if occluders is not receivers:
+        depths.append(_depths_within((occluders - position) @ rotation.T, half))
+    near, far = _range_around(depths, float(local[:, 2].max()))
     return LightView(_matrix(rotation, position), half, near, far, False)
 
 

@@ -154,7 +154,8 @@ def test_what_moved_or_changed_is_as_if_it_had_been_loaded_there(gpu: GpuContext
             assert state is not None
             mesh = state.drawn.mesh
             buffer = vertices_of(state.buffers)[: mesh.vertices.nbytes]
-            made.append((buffer, mesh.vertices, mesh.triangles, mesh.material_table, state.points))
+            extent = state.extent.points, state.extent.upright
+            made.append((buffer, mesh.vertices, mesh.triangles, mesh.material_table, state.points, *extent))
         for one, expected in zip(*made, strict=True):
             np.testing.assert_array_equal(one, expected)
         fresh.release()
@@ -265,6 +266,8 @@ def test_several_objects_move_each_on_its_own(gpu: GpuContext, stage: Stage) -> 
     assert before is not None
     assert after is not None
     assert [item.id for item in after.objects if item.moves] == ["slow", "fast", "turning"]
+    placed_again = [one is not other for one, other in zip(after.extents, before.extents, strict=True)]
+    assert placed_again == [True, True, False, False, True]
     steps = np.split(np.abs(after.corners - before.corners)[..., :3].max(axis=(1, 2)), range(12, 60, 12))
     assert [step.max() for step in steps] == pytest.approx([0.06, 0.12, 0, 0, 0.0229], abs=1e-3)
     assert after is not before
