@@ -54,7 +54,12 @@ BOX_TOP_M = np.array([-0.06, 0.18, 0.134])  # of the green box, on the cardboard
 JPEG_QUALITY = 75  # keeps most below 100 kB
 
 
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")  # the first has no windows
+BROWSERS = (
+    "chromium-headless-shell",
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+)  # the first has no windows
 CHROMIUM = next(filter(None, map(shutil.which, BROWSERS)), None)
 USES_BROWSER = pytest.mark.skipif(
     CHROMIUM is None or not (DASHBOARD / "index.html").is_file(),
