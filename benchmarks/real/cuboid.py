@@ -51,8 +51,12 @@ class Cuboid:
         centre = (self.x_m, self.y_m, half[2])
         origin, along = (origins - centre) @ self._turned, directions @ self._turned
         slope = np.where(np.abs(along) < 1e-9, 1e-9, along)
-        first, second = (-half - origin) / slope, (half - origin) / slope
-        return np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
+        enter, leave = np.array(-np.inf), np.array(np.inf)
+        for axis, reach in enumerate(half):  # NumPy takes ten times as long to reduce so short an axis
+            first, second = ((side - origin[..., axis]) / slope[..., axis] for side in (-reach, reach))
+            enter = np.maximum(enter, np.minimum(first, second))
+            leave = np.minimum(leave, np.maximum(first, second))
+        return enter, leave
 
 
 def outline(cuboid: Cuboid, plane: Plane) -> Mask:

@@ -54,7 +54,9 @@ BOX_TOP_M = np.array([-0.06, 0.18, 0.134])  # of the green box, on the cardboard
 JPEG_QUALITY = 75  # keeps most below 100 kB
 
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+# The first has no windows, which take half of the processor time.
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next(filter(None, map(shutil.which, BROWSERS)), None)
 USES_BROWSER = pytest.mark.skipif(
     CHROMIUM is None or not (DASHBOARD / "index.html").is_file(),
     reason="no Chromium is installed, or the dashboard is not built; `./run test --all` sees to both",
