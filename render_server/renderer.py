@@ -156,7 +156,7 @@ class SceneRenderer:
     def compile_ahead(self) -> None:
         """Compiles a program that the next motion will run, if there is one and everything is at rest."""
         if self._live.is_at_rest:
-            self._gpu.foreseen.compile_next()
+            self._gpu.precompile_queue.compile_next()
 
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""

@@ -16,8 +16,8 @@ import moderngl
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.buffer_images import TextureCalls
-from deltalight.render_server.gpu.foreseen import ForeseenPrograms
 from deltalight.render_server.gpu.lost_context import check_reset, reporting, reset_status
+from deltalight.render_server.gpu.precompile_queue import PrecompileQueue
 
 SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
 THREADS = Path("/proc/self/task")
@@ -120,7 +120,7 @@ class GpuContext:
     """Told of every program that a kernel asks for, when it first runs: its label and the text of each stage."""
 
     programs: SharedPrograms = field(default_factory=SharedPrograms)
-    foreseen: ForeseenPrograms = field(default_factory=ForeseenPrograms)
+    precompile_queue: PrecompileQueue = field(default_factory=PrecompileQueue)
     reset_status: Callable[[], int] = lambda: 0
     """Asks the driver whether the context was lost (lost_context.py); 0 = it was not."""
     most_images: int = NEEDED["GL_MAX_COMPUTE_IMAGE_UNIFORMS"]

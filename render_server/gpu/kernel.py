@@ -364,7 +364,7 @@ class Kernel(Shader):
     show on a software renderer.
 
     Where a binding `NAME_later` is true, later frames turn the switch NAME on: the program with it is compiled ahead
-    (gpu/foreseen.py).
+    (gpu/precompile_queue.py).
     """
 
     def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
@@ -387,14 +387,14 @@ class Kernel(Shader):
     def _first_chosen(self, on: tuple[str, ...], known: Bindings) -> Program:
         off = set(self._switches).difference(on)
         self._later = {name: True for name in off if known.get(f"{name}_later")}
-        self._gpu.foreseen.forget(self)
+        self._gpu.precompile_queue.forget(self)
         return self._with(on)
 
-    def foresee(self, *shared: Bindings, **own: Binding) -> None:
+    def compile_later(self, *shared: Bindings, **own: Binding) -> None:
         """Has the program that these bindings choose compiled ahead, unless it is compiled already."""
         known = merged(own, shared)
         if self._switched_on(known) not in self._programs:
-            self._gpu.foreseen.add(self, known)
+            self._gpu.precompile_queue.add(self, known)
 
     def compile_ahead(self, known: Bindings) -> None:
         """Compiles the program for a run that binds the like of `known`, and turns on what is to be on later.
@@ -410,7 +410,7 @@ class Kernel(Shader):
 
     def release(self) -> None:
         """Leaves the programs to other kernels of the same source."""
-        self._gpu.foreseen.forget(self)
+        self._gpu.precompile_queue.forget(self)
         super().release()
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
@@ -429,7 +429,7 @@ class Kernel(Shader):
         program.compute.run(*groups)
         self._gpu.ctx.memory_barrier()
         if self._later:
-            self._gpu.foreseen.add(self, known)
+            self._gpu.precompile_queue.add(self, known)
         if self._gpu.watchers:
             program.report(groups, partial(program.written, known))
 
@@ -443,7 +443,7 @@ class Kernel(Shader):
         program.compute.run_indirect(groups)
         self._gpu.ctx.memory_barrier()
         if self._later:
-            self._gpu.foreseen.add(self, known)
+            self._gpu.precompile_queue.add(self, known)
         if self._gpu.watchers:
             program.report((), partial(program.written, known))
 

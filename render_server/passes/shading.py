@@ -112,7 +112,7 @@ class DirectLight:
             if scene["keeps_unblocked"]:
                 self._spared.run((list_threads(self._gpu, math.prod(self._size)),), listed, *shared)
             elif scene["keeps_unblocked_later"]:
-                self._spared.foresee(listed, *shared, keeps_unblocked=True)
+                self._spared.compile_later(listed, *shared, keeps_unblocked=True)
 
     def clear(self, scene: Bindings) -> None:
         """Sets all light to zero."""

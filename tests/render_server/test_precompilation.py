@@ -11,8 +11,8 @@ import pytest
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server import live_scene
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.foreseen import ForeseenPrograms
 from deltalight.render_server.gpu.kernel import Bindings, Dispatch, Program, watched
+from deltalight.render_server.gpu.precompile_queue import PrecompileQueue
 from deltalight.render_server.gpu.textures import texture_2d
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import METHODS
@@ -30,13 +30,13 @@ LATER = {"bright": False, "bright_later": True}
 
 @pytest.fixture
 def compiled(gpu: GpuContext) -> Iterator[list[str]]:
-    """Labels of programs that kernels asked for, in order; nothing was foreseen before."""
+    """Labels of programs that kernels asked for, in order; nothing is to be compiled ahead before."""
     found: list[str] = []
 
     def watch(label: str, _sources: object) -> None:
         found.append(label)
 
-    gpu.foreseen._waiting.clear()
+    gpu.precompile_queue._waiting.clear()
     gpu.compile_watchers.append(watch)
     yield found
     gpu.compile_watchers.remove(watch)
@@ -50,11 +50,11 @@ def test_a_switch_that_is_turned_on_later_is_compiled_when_asked_and_not_in_its_
     assert compiled == ["tiny"]
     dispatches: list[Dispatch] = []
     with watched(gpu, dispatches.append):
-        gpu.foreseen.compile_next()
+        gpu.precompile_queue.compile_next()
     assert compiled == ["tiny", "tiny bright"]
     assert dispatches == []
     assert floats(out, 1) == [1], "nothing ran"
-    gpu.foreseen.compile_next()
+    gpu.precompile_queue.compile_next()
     kernel.run((1,), LATER, Out=out, seen=texture, bright=True)
     assert floats(out, 1) == [3]
     assert compiled == ["tiny", "tiny bright"]
@@ -65,7 +65,7 @@ def test_nothing_is_compiled_for_a_switch_that_nobody_turns_on(
 ) -> None:
     for number, later in enumerate(({}, {"bright_later": False})):
         make(BRIGHT, BRIGHTENS, NUMBER=number).run((1,), later, Out=out, seen=texture, bright=False)
-        gpu.foreseen.compile_next()
+        gpu.precompile_queue.compile_next()
     assert compiled == ["tiny NUMBER=0", "tiny NUMBER"]
 
 
@@ -77,7 +77,7 @@ def test_a_program_that_ran_before_it_was_compiled_ahead_is_not_asked_for_again(
         each.run((1,), LATER, Out=out, seen=texture)
     kernel.run((1,), LATER, Out=out, seen=texture, bright=True)
     del compiled[:]
-    gpu.foreseen.compile_next()
+    gpu.precompile_queue.compile_next()
     assert compiled == ["tiny OTHER bright"], "the first turn is not wasted"
 
 
@@ -97,7 +97,7 @@ def test_it_is_compiled_for_what_was_bound_last(
         bound.append((program.label, known["seen"]))
 
     monkeypatch.setattr(Program, "bind", noted)
-    gpu.foreseen.compile_next()
+    gpu.precompile_queue.compile_next()
     assert bound == [("tiny bright", late)]
     late.release()
 
@@ -108,17 +108,17 @@ def test_a_program_is_linked_even_if_what_was_bound_is_released(
     kernel, seen = make(BRIGHT, BRIGHTENS), texture_2d(gpu, (4, 4), 4, "f2")
     kernel.run((1,), LATER, Out=out, seen=seen)
     seen.release()
-    gpu.foreseen.compile_next()
+    gpu.precompile_queue.compile_next()
     assert compiled == ["tiny", "tiny bright"]
 
 
-def test_a_kernel_that_never_ran_may_foresee_its_program(
+def test_the_program_of_a_kernel_that_never_ran_may_be_compiled_ahead(
     gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer, texture: moderngl.Texture, compiled: list[str]
 ) -> None:
     kernel = make(BRIGHT, BRIGHTENS)
     for expected in (["tiny bright"], []):
-        kernel.foresee({"bright": False}, bright=True, Out=out, seen=texture)
-        gpu.foreseen.compile_next()
+        kernel.compile_later({"bright": False}, bright=True, Out=out, seen=texture)
+        gpu.precompile_queue.compile_next()
         assert compiled == expected
         del compiled[:]
 
@@ -129,7 +129,7 @@ def test_a_kernel_that_is_released_is_forgotten(
     kernel = make(BRIGHT, BRIGHTENS)
     kernel.run((1,), LATER, Out=out, seen=texture)
     kernel.release()
-    gpu.foreseen.compile_next()
+    gpu.precompile_queue.compile_next()
     assert compiled == ["tiny"]
 
 
@@ -138,7 +138,7 @@ def test_what_the_driver_refuses_is_told_by_the_run_alone(
 ) -> None:
     kernel = make("#pragma switch BRIGHT\n", "values[0] = 1.0;\n#ifdef BRIGHT\nbrighten();\n#endif\n")
     kernel.run((1,), {"BRIGHT": False, "BRIGHT_later": True}, Out=out)
-    gpu.foreseen.compile_next()
+    gpu.precompile_queue.compile_next()
     kernel.run((1,), Out=out, BRIGHT=False)
     assert floats(out, 1) == [1]
 
@@ -147,7 +147,7 @@ class Viewer:
     """Frames of one scene as a live server renders them, which compiles ahead after each if it `prepares`."""
 
     def __init__(self, gpu: GpuContext, scene: SceneDocument, *, prepares: bool) -> None:
-        own = replace(gpu, foreseen=ForeseenPrograms())
+        own = replace(gpu, precompile_queue=PrecompileQueue())
         self.renderer = SceneRenderer(own, scene, waits=False)
         self.prepares, self._scene, self._count = prepares, scene, 0
 

@@ -8,29 +8,29 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 
-class ForeseeingKernel(Protocol):
+class PrecompilableKernel(Protocol):
     """A kernel with a program to compile ahead (`kernel.Kernel`)."""
 
     def compile_ahead(self, known: Mapping[str, Any]) -> None:
         """Compiles the program that the like of these bindings will run."""
 
 
-class ForeseenPrograms:
-    """Programs that were not compiled yet: one for each kernel that foresees one, with bindings to compile it for."""
+class PrecompileQueue:
+    """Programs to compile ahead: at most one of each kernel, with bindings to compile it for."""
 
     def __init__(self) -> None:
-        self._waiting: dict[ForeseeingKernel, Mapping[str, Any]] = {}
+        self._waiting: dict[PrecompilableKernel, Mapping[str, Any]] = {}
 
-    def add(self, kernel: ForeseeingKernel, known: Mapping[str, Any]) -> None:
+    def add(self, kernel: PrecompilableKernel, known: Mapping[str, Any]) -> None:
         """Adds a kernel's program; newer bindings replace those before, which may have been released since."""
         self._waiting[kernel] = known
 
-    def forget(self, kernel: ForeseeingKernel) -> None:
+    def forget(self, kernel: PrecompilableKernel) -> None:
         """Leaves out the program of a kernel."""
         self._waiting.pop(kernel, None)
 
     def compile_next(self) -> None:
-        """Compiles the program that was foreseen first, if there is one."""
+        """Compiles the program that was added first, if there is one."""
         if self._waiting:
             kernel = next(iter(self._waiting))
             kernel.compile_ahead(self._waiting.pop(kernel))
