@@ -7,9 +7,11 @@ from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, commo
 
 LIST_HEADER_BYTES = 4  # of shaders/common/work_list.glsl: the number of items
 GROUPS_BYTES = 12
+GROUP = 64  # threads of a workgroup that walks a list
 SOFTWARE_WALKERS = 1024
 # Mesa's software renderer silently ends all loops of a thread after 65535 iterations in total; tracing the
-# cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
+# cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene). Rays through the
+# triangles of transparent objects take thousands each, so a thread traces one, or those of a single pixel.
 SOFTWARE_DIVISOR = 12
 SOFTWARE_GROUP_ITEMS = 256  # of a workgroup of 64 threads: below SOFTWARE_DIVISOR each
 LIST_WALKERS = 16384

@@ -94,7 +94,8 @@ class ExactCones:
         if objects.materials.transmits:
             seen.image.build_levels()
             lit = {**scene, **marching, "direct_mu": direct.light.mu, "direct_rho": direct.light.rho}
-            return self._real.refract(fields, grid, self._voxels.rho, bvh, lit)
+            rho = self._voxels.rho
+            return self._real.refract(fields, grid, rho, bvh, lit, cone_count=self._cone_count)
         return fields
 
     def trace_objects(

@@ -8,7 +8,7 @@ import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, list_threads
+from deltalight.render_server.gpu.list_groups import GROUP, LIST_HEADER_BYTES, ListGroups, list_threads
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.passes.mesh_buffers import ObjectBvh
 from deltalight.render_server.passes.voxels import VoxelMipmap
@@ -241,14 +241,21 @@ class TraceRealCones:
         return {"traced_mu": kept.mu, "traced_rho": kept.rho, "Texels": kept.stale_texels}
 
     def refract(
-        self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, objects: ObjectBvh, scene: Bindings
+        self,
+        fields: ConeFields,
+        grid: LowResGrid,
+        rho: VoxelMipmap,
+        objects: ObjectBvh,
+        scene: Bindings,
+        *,
+        cone_count: int,
     ) -> ConeFields:
         """Returns `fields` with the cones that `run` traced bent where they meet transparent objects.
 
         `scene` has the direct light; the picture needs its mip levels (`CameraImage.build_levels`).
         """
         if self._refract is None:
-            self._refract = RefractCones(self._gpu, grid.size, self._defines)
+            self._refract = RefractCones(self._gpu, grid.size, self._defines, cone_count)
         lit = {**scene, **self._traced(fields, grid)}
         return self._refract.run(fields, grid, rho, objects, lit)
 
@@ -264,8 +271,10 @@ def _specular(fields: ConeFields) -> dict[str, Binding]:
 class RefractCones:
     """Bends cones at real surfaces that meet transparent objects (docs/method.md 4.11), in a field of its own."""
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
-        self._gpu = gpu
+    def __init__(
+        self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], cone_count: int
+    ) -> None:
+        self._groups = ListGroups(gpu, GROUP // cone_count)
         self._change, self._rho = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._target = gpu.ctx.framebuffer([self._change])
         self._refract = Kernel(gpu, "refract_cones", REAL=1, **defines)
@@ -275,10 +284,12 @@ class RefractCones:
         self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, objects: ObjectBvh, lit: Bindings
     ) -> ConeFields:
         """Returns the fields with another E_rho; `lit` has the scene, what the cones traced, and the list of them."""
+        texels = lit["Texels"]
+        assert isinstance(texels, moderngl.Buffer)
         self._target.use()
         self._target.clear()
-        self._refract.run(
-            (list_threads(self._gpu, grid.texel_count),),
+        self._refract.run_counted(
+            self._groups.count(texels),
             grid.bindings,
             objects.bindings,
             lit,
@@ -297,7 +308,7 @@ class RefractCones:
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self._target)
-        release_all(self._change, self._rho, self._refract, self._filter)
+        release_all(self._change, self._rho, self._refract, self._filter, self._groups)
 
 
 class TraceVirtualCones:

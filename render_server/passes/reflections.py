@@ -7,7 +7,7 @@ import moderngl
 from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import LIST_HEADER_BYTES, ListGroups, ListWalk
+from deltalight.render_server.gpu.list_groups import GROUP, LIST_HEADER_BYTES, ListGroups, ListWalk
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, reuse_define
@@ -19,7 +19,6 @@ from deltalight.render_server.passes.shading import DirectLight
 RAY_COUNT = 16
 # Of surfaces; rougher ones use cones. These span many voxels there, and so few rays would show as grain.
 RAY_ROUGHNESS = 0.3
-GROUP = 64  # invocations of a workgroup: one per texel of a list, or per ray
 
 # A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: the wider cones serve.
 ROUGHEST = GREATEST_ALPHA**0.5
@@ -280,11 +279,10 @@ class TransmittedLight:
         march: Mapping[str, float | str] | None,
         tier: QualityTier,
     ) -> None:
-        self._grid = grid
-        self._walk = ListWalk(gpu, grid.picture_size[0] * grid.picture_size[1])
+        self._grid, rays = grid, tier.reflection_cones
+        self._ray_groups = ListGroups(gpu, GROUP // rays)
         self.radiance = texture_2d(gpu, grid.picture_size, 4, "f2")
         voxels = {} if march is None else {"VOXELS": 1, **march}
-        rays = tier.reflection_cones
         self._kernel = Kernel(gpu, "transmitted_light", RAY_COUNT=rays, MEDIAN_DISC=MEDIAN_DISC, **voxels)
 
     def run(
@@ -296,9 +294,8 @@ class TransmittedLight:
         scene: Bindings,
     ) -> None:
         """Fills `radiance`; `reflected` is the objects' own. The picture needs its mip levels."""
-        self._walk.run(
-            self._kernel,
-            self._grid.shown_pixels,
+        self._kernel.run_counted(
+            self._ray_groups.count(self._grid.shown_pixels),
             objects.bindings,
             scene,
             ShownPixels=self._grid.shown_pixels,
@@ -314,4 +311,4 @@ class TransmittedLight:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.radiance, self._kernel, self._walk)
+        release_all(self.radiance, self._kernel, self._ray_groups)

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
-from deltalight.render_server.gpu.list_groups import ListWalk, list_threads
+from deltalight.render_server.gpu.list_groups import GROUP, ListGroups, ListWalk, list_threads
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
@@ -71,6 +71,7 @@ class DirectLight:
         self._reuses = reuses
         self.texels = gpu.ctx.buffer(reserve=4)
         self.spared = gpu.ctx.buffer(reserve=4) if self._spared is not None else None
+        self._pixel_groups: ListGroups | None = None  # made when rays are traced in software
 
     @property
     def has_shadow_cones(self) -> bool:
@@ -106,7 +107,7 @@ class DirectLight:
             self.clear(scene)
         traced = {} if objects is None else objects.bindings
         shared = voxels, _caustics_on(grid, caustics), traced, scene
-        self._shade(grid, self.bindings, *shared)
+        self._shade(grid, self.bindings, *shared, traces_rays=bool(traced))
         if self._spared is not None:
             listed: Bindings = {**self.bindings, **grid.bindings, "Texels": self.spared}
             if scene["keeps_unblocked"]:
@@ -120,15 +121,28 @@ class DirectLight:
         if scene["specular_surfaces"]:
             self.lobes.clear()
 
-    def _shade(self, grid: LowResGrid, targets: Bindings, *scene: Bindings) -> None:
-        """Shades the texels of the list."""
+    def _shade(
+        self, grid: LowResGrid, targets: Bindings, *scene: Bindings, traces_rays: bool = False
+    ) -> None:
+        """Shades the texels of the list; with `traces_rays`, in software by a thread per pixel (SOFTWARE_DIVISOR)."""
         texels = self.texels if self._reuses else grid.reached_texels
         listed: Bindings = {**targets, **grid.bindings, "Texels": texels}
-        self._kernel.run((list_threads(self._gpu, math.prod(self._size)),), listed, *scene, NOTHING_KEPT)
+        if traces_rays and self._gpu.is_software:
+            groups = self._groups_of_pixels(grid.scale).count(texels)
+            self._kernel.run_counted(groups, listed, *scene, NOTHING_KEPT)
+        else:
+            threads = list_threads(self._gpu, math.prod(self._size))
+            self._kernel.run((threads,), listed, *scene, NOTHING_KEPT)
+
+    def _groups_of_pixels(self, scale: int) -> ListGroups:
+        if self._pixel_groups is None:
+            self._pixel_groups = ListGroups(self._gpu, GROUP // scale**2, in_rows=False)
+        return self._pixel_groups
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.light, self.lobes, self._kernel, self._spared, self.texels, self.spared)
+        kernels = self._kernel, self._spared, self._pixel_groups
+        release_all(self.light, self.lobes, *kernels, self.texels, self.spared)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 // Cones of real surfaces whose axes meet a transparent body (docs/method.md 4.11): it bends and divides them, so that their light comes
 // from where they leave it. Corrects E_rho of trace_cones, in which they go straight on, by what the picture, voxels and environment show
-// there. Once direct light is known, because the nearest such places lie in the body's own shadow.
+// there. Once direct light is known, because the nearest such places lie in the body's own shadow. One invocation per cone, because Mesa's
+// software renderer silently ends all loops of a thread after 65535 iterations.
 #define ENDS_NEAR
 #define VOXELS
 #include "common/brdf.glsl"
@@ -17,6 +18,7 @@ const float LEAST_WEIGHT = 0.02;     // of a path that goes on
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D cone_change;   // rgb change of E_rho, before its filter
 #include "common/camera.glsl"
+shared vec3 of_cone[64];
 
 const int MOST_SURFACES = 8;   // that the paths of one cone meet
 
@@ -85,33 +87,38 @@ vec3 bent_radiance(vec3 q, Ray ray, MeshHit hit, float ratio) {
     return radiance;
 }
 
-// What the bent ones of a surface's cones change.
-vec3 change_of_cones(SurfacePoint s, ConeSet set) {
-    float ratio = set.width * cone_ratio(), half_angle = atan(0.5 * cone_ratio());
-    mat3 basis = basis_around(s.normal);
-    vec3 start = start_of_rays(s), q = volume_coordinate(s.position), change = vec3(0.0);
-    int k = 0;
-    do {
-        vec3 d = basis * cone_direction(k, set);
-        Ray ray = Ray(start, d);
-        MeshHit hit = closest_hit(ray);
-        if (!bends(hit) || leaves_body(hit, d)) continue;
-        March straight = march(q, d, ratio, true);
-        change += bent_radiance(q, ray, hit, ratio) - straight.c_rho - straight.t_rho * environment(d, half_angle);
-    } while (++k < cone_count);
-    return change * PI / float(cone_count);
+// What bending changes of the radiance that cone k of a surface brings.
+vec3 change_of_cone(SurfacePoint s, int k, ConeSet set) {
+    float ratio = set.width * cone_ratio();
+    vec3 d = basis_around(s.normal) * cone_direction(k, set);
+    Ray ray = Ray(start_of_rays(s), d);
+    MeshHit hit = closest_hit(ray);
+    if (!bends(hit) || leaves_body(hit, d)) return vec3(0.0);
+    vec3 q = volume_coordinate(s.position);
+    March straight = march(q, d, ratio, true);
+    return bent_radiance(q, ray, hit, ratio) - straight.c_rho - straight.t_rho * environment(d, atan(0.5 * cone_ratio()));
 }
 
-void refract_cones(ivec2 texel) {
+vec3 refracted_cone(ivec2 texel, int k) {
     SurfacePoint s = surface_point(texel);
     enter_volume(s.position);
-    if (!inside_volume(volume_coordinate(s.position))) return;
-    imageStore(cone_change, texel, vec4(change_of_cones(s, cones_of(texel)), 0.0));
+    bool is_inside = inside_volume(volume_coordinate(s.position));
+    return is_inside ? change_of_cone(s, k, cones_of(texel)) : vec3(0.0);
 }
 
 // The texels that low_res_grid listed.
 void main() {
-    uint i = first_item();
-    if (i < listed_count()) do refract_cones(texel_of_index(texels[i], low_resolution_size.x));
-    while ((i += items_apart()) < listed_count());
+    int inside = int(gl_LocalInvocationIndex), place = quotient(inside, cone_count), k = inside - place * cone_count;
+    int texels_a_group = quotient(64, cone_count);
+    uint group = spread(counted_group(), gl_NumWorkGroups.x * gl_NumWorkGroups.y);
+    uint i = group * uint(texels_a_group) + uint(place);
+    bool listed = place < texels_a_group && i < listed_count();
+    ivec2 texel = listed ? texel_of_index(texels[i], low_resolution_size.x) : ivec2(0);
+    of_cone[inside] = listed ? refracted_cone(texel, k) : vec3(0.0);
+    memoryBarrierShared();
+    barrier();
+    if (k != 0 || !listed) return;
+    vec3 change = vec3(0.0);
+    for (int j = inside; j < inside + cone_count; ++j) change += of_cone[j];
+    imageStore(cone_change, texel, vec4(change * PI / float(cone_count), 0.0));
 }

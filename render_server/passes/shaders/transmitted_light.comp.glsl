@@ -1,5 +1,6 @@
 // What transparent objects show of what is behind them (docs/method.md 4.11): rays from the camera through their surfaces, which
-// refract and reflect them, and on into the picture, voxels or environment. Added to what the objects' surfaces reflect.
+// refract and reflect them, and on into the picture, voxels or environment. Added to what the objects' surfaces reflect. One invocation
+// per ray, because Mesa's software renderer silently ends all loops of a thread after 65535 iterations.
 #include "common/brdf.glsl"
 #include "common/lighting.glsl"
 #include "common/light_shapes.glsl"
@@ -16,6 +17,8 @@ layout(local_size_x = 64) in;
 layout(rgba16f) readonly uniform image2D reflected_radiance;   // of the objects
 layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform float pixel_size;      // m at 1 m depth
+shared vec4 first_normals[64]; // of the transparent surface that each ray meets first; w: 1 if there is one
+shared vec3 of_ray[64];        // radiance along its paths
 #include "common/camera.glsl"
 
 const float NOWHERE = 1e30;        // distance of what a ray does not meet
@@ -110,39 +113,53 @@ float spread_behind(Interface first, float turned) {
     return bent * length(vec2(sqrt(2.0) * MEDIAN_DISC * alpha, 2.0 * turned)) + pixel_size;
 }
 
-// Radiance through the transparent surface of a pixel, by rays spread evenly over it.
-vec3 transmitted(ivec2 pixel) {
-    MeshHit hits[RAY_COUNT];
-    vec3 normals[RAY_COUNT];
-    for (int j = 0; j < RAY_COUNT; ++j) {
-        Ray ray = camera_ray(pixel, place_within(j));
-        hits[j] = closest_hit(ray);
-        if (hits[j].triangle < 0) continue;
-        if (!is_transparent(material_of_triangle(hits[j].triangle))) { hits[j].triangle = -1; continue; }
-        normals[j] = interface_at(hits[j], ray, 0.0).normal;
-    }
+// The first surface that a ray meets, if it is transparent.
+MeshHit first_hit(Ray ray) {
+    MeshHit hit = closest_hit(ray);
+    if (hit.triangle >= 0 && !is_transparent(material_of_triangle(hit.triangle))) hit.triangle = -1;
+    return hit;
+}
+
+bool shows_transparent(ivec2 pixel) {
+    return is_transparent(int(texelFetch(virtual_raster_normal, raster_texel(pixel), 0).w));
+}
+
+// Greatest difference of the normals that this ray and the others of its pixel, from invocation `first` on, meet.
+float turn_between(uint inside, uint first) {
+    float turned = 0.0;
+    for (uint k = first; k < first + uint(RAY_COUNT); ++k)
+        if (first_normals[k].w > 0.0) turned = max(turned, distance(first_normals[inside].xyz, first_normals[k].xyz));
+    return turned;
+}
+
+vec3 mean_of_rays(uint first) {
     vec3 sum = vec3(0.0);
     float count = 0.0;
-    for (int j = 0; j < RAY_COUNT; ++j) {
-        if (hits[j].triangle < 0) continue;
-        float turned = 0.0;
-        for (int k = 0; k < RAY_COUNT; ++k)
-            if (hits[k].triangle >= 0) turned = max(turned, distance(normals[j], normals[k]));
-        Ray ray = camera_ray(pixel, place_within(j));
-        sum += trace_paths(ray, hits[j], spread_behind(interface_at(hits[j], ray, 0.0), turned));
+    for (uint k = first; k < first + uint(RAY_COUNT); ++k) {
+        if (first_normals[k].w == 0.0) continue;
+        sum += of_ray[k];
         count += 1.0;
     }
     return sum / max(count, 1.0);
 }
 
-void shade(ivec2 pixel) {
-    vec4 own = imageLoad(reflected_radiance, pixel);
-    int shown = int(texelFetch(virtual_raster_normal, raster_texel(pixel), 0).w);
-    if (is_transparent(shown)) own.rgb += transmitted(pixel);
-    imageStore(radiance_out, pixel, own);
-}
-
 void main() {
-    uint i = first_item();
-    if (i < pixels_shown()) do shade(shown_pixel(i)); while ((i += items_apart()) < pixels_shown());
+    uint inside = gl_LocalInvocationIndex, j = inside % uint(RAY_COUNT), first = inside - j;
+    uint group = spread(counted_group(), gl_NumWorkGroups.x * gl_NumWorkGroups.y);
+    uint i = group * (64u / uint(RAY_COUNT)) + inside / uint(RAY_COUNT);
+    bool listed = i < pixels_shown();
+    ivec2 pixel = listed ? shown_pixel(i) : ivec2(0);
+    Ray ray = camera_ray(pixel, place_within(int(j)));
+    MeshHit hit = MeshHit(NOWHERE, -1, vec2(0.0));
+    if (listed && shows_transparent(pixel)) hit = first_hit(ray);
+    bool enters = hit.triangle >= 0;
+    first_normals[inside] = enters ? vec4(interface_at(hit, ray, 0.0).normal, 1.0) : vec4(0.0);
+    memoryBarrierShared();
+    barrier();
+    if (enters) of_ray[inside] = trace_paths(ray, hit, spread_behind(interface_at(hit, ray, 0.0), turn_between(inside, first)));
+    memoryBarrierShared();
+    barrier();
+    if (j != 0u || !listed) return;
+    vec4 own = imageLoad(reflected_radiance, pixel);
+    imageStore(radiance_out, pixel, vec4(own.rgb + mean_of_rays(first), own.a));
 }

@@ -1,4 +1,4 @@
-// The workgroups that walk a list whose length only the GPU knows, `per_group` items each, in rows (common/work_list.glsl).
+// The workgroups that walk a list whose length only the GPU knows, `per_group` items each, in rows (common/walk.glsl).
 #include "common/work_list.glsl"
 layout(std430) writeonly buffer Groups { uint groups[3]; };
 uniform uint per_group;

@@ -23,3 +23,7 @@ uvec2 spread_place() {
 }
 
 uint items_apart() { return gl_NumWorkGroups.x * 64u; }
+
+const uint GROUPS_IN_ROW = 256u;   // of workgroups that count_groups counted: OpenGL guarantees at most 65535
+
+uint counted_group() { return gl_WorkGroupID.y * GROUPS_IN_ROW + gl_WorkGroupID.x; }

@@ -12,10 +12,6 @@ void append_texel(ivec2 texel, int grid_width) {
 layout(std430) readonly buffer Texels { uint texel_count; uint texels[]; };
 
 uint listed_count() { return min(texel_count, uint(texels.length())); }
-
-const uint GROUPS_IN_ROW = 256u;   // of workgroups that count_groups counted: OpenGL guarantees at most 65535
-
-uint counted_group() { return gl_WorkGroupID.y * GROUPS_IN_ROW + gl_WorkGroupID.x; }
 #endif
 
 ivec2 texel_of_index(uint index, int grid_width) {
