@@ -1,6 +1,7 @@
 """The lights of one scene document across frames: tracked, and completed by estimates from the picture."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -8,6 +9,7 @@ from jaxtyping import Float32, UInt8
 from deltalight.protocol import scene_lights as documents
 from deltalight.protocol.frames import ViewFrame
 from deltalight.render_server.debug_view import draw_lights
+from deltalight.render_server.estimation.parallax import EnvironmentParallax, find_parallax
 from deltalight.render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
 from deltalight.render_server.estimation.registration import RegistrationAverage, register_lights
 from deltalight.render_server.estimation.samples import BackoffSchedule, bounced_light, sample_light
@@ -71,6 +73,7 @@ class LightEstimator:
         self._average, self._schedule = RegistrationAverage(), BackoffSchedule()
         self._factor: Rgb | None = None
         self._ground: Rgb | None = None
+        self._parallax: EnvironmentParallax | None = None
         self._walls: ExtrapolatedPlanes | None = None
         self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
 
@@ -94,6 +97,8 @@ class LightEstimator:
         """Applies the estimates to the source's lights."""
         assert self._raw is not None
         lights = self._raw.registered(self._factor)
+        if self._parallax is not None:
+            lights = replace(lights, environment=self._parallax.applied(lights.environment))
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
         if self._walls is not None:
@@ -131,6 +136,9 @@ class LightEstimator:
                 self._ground = ground_radiance(graph)
             if self._wants_unseen and self._is_complete:
                 self._find_unseen(graph, self._raw.registered(self._factor))
+        if self._raw.environment_origin is not None:
+            size = len(self._raw.environment)
+            self._parallax = find_parallax(graph, self._raw.environment_origin, size)
         return self._apply()
 
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:

@@ -25,7 +25,8 @@ class LightSet:
     is the fraction of each of its texels that shows the real ground, because nothing else is known to be there.
     `registration` is the factor R G B that `lights` and `environment` still lack, ones where it is to be estimated
     from the picture. `identities` number the lights where they are tracked over time. `whole` is the map that the
-    lights were cut out of, where it is given.
+    lights were cut out of, where it is given. `environment_origin` is where the environment was measured (world, m);
+    None where that is unknown.
     """
 
     lights: tuple[Light, ...]
@@ -34,6 +35,7 @@ class LightSet:
     registration: Float32[np.ndarray, "3"]
     identities: tuple[int, ...] = ()
     whole: Float32[np.ndarray, "n n 3"] | None = None
+    environment_origin: Float64[np.ndarray, "3"] | None = None
 
     def registered(self, factor: Float32[np.ndarray, "3"] | None = None) -> "LightSet":
         """Returns the set with the registration (or another factor) multiplied in."""

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -201,7 +202,7 @@ class FisheyeSource:
 
     def _lights(self, sky: SkyLights) -> LightSet:
         position, distance_m = sky.world_from_fisheye[:3, 3], self._distance_m
-        return light_set(
+        found = light_set(
             self._document,
             tuple(
                 _distant(light) if distance_m is None else _near(light, position, distance_m)
@@ -211,6 +212,7 @@ class FisheyeSource:
             (1 - sky.seen) * (1 - above_horizon(len(sky.residual))),
             tuple(light.identity for light in sky.lights),
         )
+        return replace(found, environment_origin=position)
 
 
 def _cut_here(sent: LightCut, wanted: LightCut) -> str:
