@@ -127,7 +127,7 @@ class LightEstimator:
         due = self._wants_registration and (moved or not self._is_complete)
         if due and self._schedule.is_due(graph.inputs.frame.timestamp_ns):
             self._register(graph, self._raw)
-        elif self._is_complete:
+        elif self._is_complete and not self._fisheye_moved():
             return self.lights
         if not self._is_complete:
             self.is_provisional, self._postpones = self._postpones, False
@@ -140,6 +140,12 @@ class LightEstimator:
             size = len(self._raw.environment)
             self._parallax = find_parallax(graph, self._raw.environment_origin, size)
         return self._apply()
+
+    def _fisheye_moved(self) -> bool:
+        """Whether the environment was measured elsewhere than the parallax was found for."""
+        assert self._raw is not None
+        origin = self._raw.environment_origin
+        return origin is not None and not (self._parallax is not None and self._parallax.holds_for(origin))
 
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Draws the lights (view `lights`), once there are any."""

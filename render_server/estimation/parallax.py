@@ -15,6 +15,7 @@ from deltalight.render_server.estimation.samples import seen_surface
 from deltalight.render_server.frame_graph import FrameGraph
 
 MOST_POINTS = 60_000  # some 50 in each texel that the camera sees
+STILL_M = 0.01  # more than the pose by a board trembles
 SAME_DISTANCE = 0.1  # relative: what is so much farther than what the fish-eye sees there is hidden from it
 
 
@@ -22,10 +23,11 @@ SAME_DISTANCE = 0.1  # relative: what is so much farther than what the fish-eye 
 class EnvironmentParallax:
     """Where the map of a fish-eye camera shows what lies in the directions of a map as seen from the objects.
 
-    `coordinates` are those of `sample_at`. `is_shown`: whether the map shows the same there; what moved leaves
-    directions of which nothing is known.
+    `fisheye` is the camera's place (world, m). `coordinates` are those of `sample_at`. `is_shown`: whether the map
+    shows the same there; what moved leaves directions of which nothing is known.
     """
 
+    fisheye: Float64[np.ndarray, "3"]
     coordinates: Float32[np.ndarray, "n n 2"]
     is_shown: Bool[np.ndarray, "n n 1"]
 
@@ -49,7 +51,11 @@ class EnvironmentParallax:
         column, row = np.moveaxis(_texels(towards, size), -1, 0)
         met = from_fisheye[row, column]
         is_shown = np.where(is_near, away <= (1 + SAME_DISTANCE) * met, np.isinf(met))
-        return cls(texel_coordinates(towards, size), is_shown[..., None])
+        return cls(fisheye, texel_coordinates(towards, size), is_shown[..., None])
+
+    def holds_for(self, fisheye: Float64[np.ndarray, "3"]) -> bool:
+        """Whether a fish-eye camera is still where it was."""
+        return bool(np.linalg.norm(fisheye - self.fisheye) <= STILL_M)
 
     def applied(self, radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "n n 3"]:
         """Returns a map of the fish-eye as seen from the objects; unknown directions hold what is beside them."""
@@ -57,15 +63,11 @@ class EnvironmentParallax:
         return WorldSky(sample_at(radiance, self.coordinates) * seen, seen).filled()
 
 
-def find_parallax(
-    graph: FrameGraph, fisheye: Float64[np.ndarray, "3"], size: int
-) -> EnvironmentParallax | None:
-    """Returns the parallax between a fish-eye camera and the middle of the objects; None without real surfaces."""
+def find_parallax(graph: FrameGraph, fisheye: Float64[np.ndarray, "3"], size: int) -> EnvironmentParallax:
+    """Returns the parallax between a fish-eye camera (world, m) and the middle of the objects."""
     position = seen_surface(graph).position
     points = position[position[:, 3] > 0, :3].astype(np.float64)
-    if not len(points):
-        return None
-    some = points[:: -(-len(points) // MOST_POINTS)]
+    some = points[:: 1 + len(points) // MOST_POINTS]
     low, high = graph.inputs.objects.bounds
     return EnvironmentParallax.between(fisheye, (low + high) / 2, some, size)
 

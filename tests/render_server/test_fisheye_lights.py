@@ -369,6 +369,18 @@ def test_fisheye_light_is_registered_on_paper_and_moves_without_registering_agai
 
 
 @pytest.mark.usefixtures("clean_gl")
+def test_the_parallax_follows_a_fisheye_that_moves(gpu: GpuContext, tmp_path: Path) -> None:
+    view = paper_under_a_lamp(1.5)
+    renderer = SceneRenderer(gpu, document(Stage(tmp_path, COARSE), documents.Lights(mode="fisheye")))
+    for second, place in enumerate(((0.0, 0.0, 0.05), (0.2, 0.0, 0.05))):
+        renderer.render(replace(view, radiance_map=seen(place=place), timestamp_ns=second * SECOND))
+        parallax = renderer._live.lighting._parallax
+        assert parallax is not None
+        assert parallax.fisheye.tolist() == [*place]
+    renderer.release()
+
+
+@pytest.mark.usefixtures("clean_gl")
 def test_lamp_that_appears_lights_the_scene_from_then_on(gpu: GpuContext, tmp_path: Path) -> None:
     renderer = SceneRenderer(gpu, document(Stage(tmp_path, COARSE), tracked(surroundings="none")))
     dark = renderer.render(frame())

@@ -53,6 +53,12 @@ def test_without_parallax_the_map_stays_as_it_is() -> None:
         np.testing.assert_allclose(same.applied(seen), seen, atol=0.03)
 
 
+def test_it_holds_while_the_fisheye_trembles_and_not_once_it_has_moved() -> None:
+    parallax = EnvironmentParallax.between(FISHEYE, OBJECTS, sheet(BOOK, 0.1), SIZE)
+    assert parallax.holds_for(FISHEYE + [0.002, 0.0, -0.002])
+    assert not parallax.holds_for(FISHEYE + [0.0, 0.02, 0.0])
+
+
 def test_what_a_nearer_thing_hides_from_the_fisheye_does_not_get_its_colour() -> None:
     """The wall behind the book, which the objects see beside it, is as the wall around it."""
     wall = sheet(np.array([-0.4, 0.8, 0.5]), 0.6)
