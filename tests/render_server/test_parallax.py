@@ -55,8 +55,8 @@ def test_without_parallax_the_map_stays_as_it_is() -> None:
 
 def test_it_holds_while_the_fisheye_trembles_and_not_once_it_has_moved() -> None:
     parallax = EnvironmentParallax.between(FISHEYE, OBJECTS, sheet(BOOK, 0.1), SIZE)
-    assert parallax.holds_for(FISHEYE + [0.002, 0.0, -0.002])
-    assert not parallax.holds_for(FISHEYE + [0.0, 0.02, 0.0])
+    assert parallax.holds_for(FISHEYE + np.array([0.002, 0.0, -0.002]))
+    assert not parallax.holds_for(FISHEYE + np.array([0.0, 0.02, 0.0]))
 
 
 def test_what_a_nearer_thing_hides_from_the_fisheye_does_not_get_its_colour() -> None:
