@@ -137,7 +137,8 @@ _POOR_FIT = (
 )
 _NO_PATCH = (
     "No white paper of the marker board was usable, so the lights' scale comes from the brightest real "
-    "surface, taken to have albedo 0.95: show the board's paper unclipped, or set lights.registration."
+    "surface, taken to have albedo 0.95, and their colour is not matched to the picture: if objects are too bright, "
+    "too dark or tinted, show the board's paper unclipped, or set lights.registration."
 )
 _NOTHING_SEEN = (
     "No lit real surface was usable to scale the lights, so they are used as given: "
