@@ -12,7 +12,12 @@ from deltalight.render_server.debug_view import draw_lights
 from deltalight.render_server.estimation.parallax import EnvironmentParallax, find_parallax
 from deltalight.render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
 from deltalight.render_server.estimation.registration import RegistrationAverage, register_lights
-from deltalight.render_server.estimation.samples import BackoffSchedule, bounced_light, sample_light
+from deltalight.render_server.estimation.samples import (
+    BackoffSchedule,
+    LightSamples,
+    bounced_light,
+    sample_light,
+)
 from deltalight.render_server.estimation.unseen_environment import (
     find_extrapolated_planes,
     find_unseen_light,
@@ -54,7 +59,7 @@ class LightEstimator:
         given = settings.mode in ("manual", "tracked") and not self._wants_registration
         self._wants_unseen = given and settings.surroundings == "auto"
         self._wants_ground = self._wants_unseen or settings.mode == "fisheye"
-        self._postpones = self._wants_unseen and not waits
+        self._postpones = self._wants_ground and not waits
         self.is_provisional = False  # of the newest lights: the search was postponed
         self._raw: LightSet | None = None
         self._reset()
@@ -102,7 +107,9 @@ class LightEstimator:
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
         if self._walls is not None:
-            lights = lights.with_surfaces(self._walls.radiance, self._walls.probability)
+            # Where a wall ends, the fish-eye camera shows; of what is below its horizon it shows nothing.
+            hidden = 1 if self._wants_unseen else lights.ground_fraction
+            lights = lights.with_surfaces(self._walls.radiance, hidden * self._walls.probability)
         if self._sky is not None:
             lights = lights.with_sky(*self._sky)
         self.lights = lights
@@ -124,7 +131,7 @@ class LightEstimator:
         shines = bool(self._raw.lights) or bool(self._raw.environment.any())
         if self._has_tracked_lamps and not shines:
             return self.lights
-        due = self._wants_registration and (moved or not self._is_complete)
+        due = self._wants_registration and (moved or self._factor is None)
         if due and self._schedule.is_due(graph.inputs.frame.timestamp_ns):
             self._register(graph, self._raw)
         elif self._is_complete and not self._fisheye_moved():
@@ -134,7 +141,7 @@ class LightEstimator:
             self._is_complete = not self.is_provisional
             if self._wants_ground and self._ground is None:
                 self._ground = ground_radiance(graph)
-            if self._wants_unseen and self._is_complete:
+            if self._wants_ground and self._is_complete:
                 self._find_unseen(graph, self._raw.registered(self._factor))
         if self._raw.environment_origin is not None:
             size = len(self._raw.environment)
@@ -168,7 +175,14 @@ class LightEstimator:
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
         known = sample_light(graph, lights, bounced_light(graph, lights))
-        walls = self._walls = find_extrapolated_planes(graph, lights, known)
+        self._walls = find_extrapolated_planes(graph, lights, known)
+        if self._wants_unseen:
+            self._find_sky(graph, lights, known, self._walls)
+
+    def _find_sky(
+        self, graph: FrameGraph, lights: LightSet, known: LightSamples, walls: ExtrapolatedPlanes
+    ) -> None:
+        """Estimates the light that comes past the walls. `known` are samples under `lights`."""
         shape = unseen_light_shape(graph, len(lights.environment)) * (1 - walls.probability)
         lights = lights.with_surfaces(walls.radiance, walls.probability)
         found = find_unseen_light(graph, lights, shape, known)

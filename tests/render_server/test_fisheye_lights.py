@@ -380,6 +380,42 @@ def test_the_parallax_follows_a_fisheye_that_moves(gpu: GpuContext, tmp_path: Pa
     renderer.release()
 
 
+DARK, BRIGHT, EVEN_SKY = 60, 140, 0.3
+
+
+def sheet_on_a_dark_table() -> ViewFrame:
+    """A dark table with a bright sheet below the object, under an even sky, which is all that the fish-eye sees."""
+    view = frame(radiance_map=seen(value=EVEN_SKY))
+    assert view.pose is not None
+    matrix = view.pose.world_from_camera
+    rays = np.dstack([view.camera.rays(), np.ones(view.color.shape[:2])]) @ matrix[:3, :3].T
+    points = matrix[:3, 3] - rays * (matrix[2, 3] / rays[..., 2:])
+    is_sheet = np.linalg.norm(points - (-0.2, 0.15, 0), axis=-1) < 0.12
+    color = np.repeat(np.where(is_sheet, BRIGHT, DARK)[..., None], 3, axis=-1).astype(np.uint8)
+    return replace(view, color=color)
+
+
+@pytest.mark.usefixtures("clean_gl")
+def test_below_the_horizon_the_table_goes_on_and_not_the_paper_beside_the_objects(
+    gpu: GpuContext, tmp_path: Path
+) -> None:
+    """A server's second picture shows it: the first does not wait for the search."""
+    view = sheet_on_a_dark_table()
+    lights = documents.Lights(mode="fisheye", registration=(1.0, 1.0, 1.0))
+    scene = document(Stage(tmp_path, COARSE), lights)
+    waiting, server = SceneRenderer(gpu, scene), SceneRenderer(gpu, scene, waits=False)
+    later = replace(view, frame_id=1, timestamp_ns=SECOND)
+    pictures = waiting.render(view), server.render(view), server.render(later)
+    below = [2 * np.array(each.lights[-1]["mean_radiance"]) - EVEN_SKY for each in pictures]
+    table = decode_lut(None)[DARK, 0]
+    assert below[0] == pytest.approx([table] * 3, rel=0.2)
+    assert below[1].min() > 2 * table
+    assert pictures[2].lights == pictures[0].lights
+    assert np.array_equal(pictures[2].color, pictures[0].color)
+    waiting.release()
+    server.release()
+
+
 @pytest.mark.usefixtures("clean_gl")
 def test_lamp_that_appears_lights_the_scene_from_then_on(gpu: GpuContext, tmp_path: Path) -> None:
     renderer = SceneRenderer(gpu, document(Stage(tmp_path, COARSE), tracked(surroundings="none")))

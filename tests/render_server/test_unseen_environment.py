@@ -10,7 +10,7 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
-from deltalight.render_server.frame_graph import Fields, FrameGraph
+from deltalight.render_server.frame_graph import EvaluatedLight, FrameGraph
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Dispatch
 from deltalight.render_server.lights.lights import LightSet
@@ -188,7 +188,7 @@ def test_the_search_lights_no_objects(
     evaluate, ran = FrameGraph.evaluate, list[Dispatch]()
     found, expected = list[np.ndarray](), list[np.ndarray]()
 
-    def watched(graph: FrameGraph, lights: LightSet) -> Fields:
+    def watched(graph: FrameGraph, lights: LightSet) -> EvaluatedLight:
         gpu.watchers.append(ran.append)
         fields = evaluate(graph, lights)
         gpu.watchers.pop()
