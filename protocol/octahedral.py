@@ -10,7 +10,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, Int64
 
 SUPERSAMPLING = 2  # samples along each edge of a texel
 SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
@@ -44,6 +44,11 @@ def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray,
     uv /= 2
     uv += 0.5
     return uv
+
+
+def octahedral_texels(direction: Float[np.ndarray, "*shape 3"], size: int) -> Int64[np.ndarray, "*shape 2"]:
+    """Returns column and row of the texels of a size x size map in which directions of any length lie."""
+    return np.minimum((octahedral_uv(direction) * size).astype(np.int64), size - 1)
 
 
 @cache

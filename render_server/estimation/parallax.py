@@ -7,10 +7,10 @@ them itself where they are. Of what the camera's depth shows, both directions ar
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64
 
 from deltalight.protocol.hemisphere_map import WorldSky
-from deltalight.protocol.octahedral import octahedral_grid, octahedral_uv, sample_at, texel_coordinates
+from deltalight.protocol.octahedral import octahedral_grid, octahedral_texels, sample_at, texel_coordinates
 from deltalight.render_server.estimation.samples import seen_surface
 from deltalight.render_server.frame_graph import FrameGraph
 
@@ -48,7 +48,7 @@ class EnvironmentParallax:
         towards, is_near = octahedral_grid(size).copy(), np.isfinite(from_objects)
         towards[is_near] = objects + from_objects[is_near, None] * towards[is_near] - fisheye
         away = np.where(is_near, np.linalg.norm(towards, axis=-1), np.inf)
-        column, row = np.moveaxis(_texels(towards, size), -1, 0)
+        column, row = np.moveaxis(octahedral_texels(towards, size), -1, 0)
         met = from_fisheye[row, column]
         is_shown = np.where(is_near, away <= (1 + SAME_DISTANCE) * met, np.isinf(met))
         return cls(fisheye, texel_coordinates(towards, size), is_shown[..., None])
@@ -72,14 +72,9 @@ def find_parallax(graph: FrameGraph, fisheye: Float64[np.ndarray, "3"], size: in
     return EnvironmentParallax.between(fisheye, (low + high) / 2, some, size)
 
 
-def _texels(directions: Float64[np.ndarray, "*n 3"], size: int) -> Int64[np.ndarray, "*n 2"]:
-    """Returns column and row of the texels in which directions lie."""
-    return np.minimum((octahedral_uv(directions) * size).astype(np.int64), size - 1)
-
-
 def _nearest(away: Float64[np.ndarray, "k 3"], size: int) -> Float64[np.ndarray, "n n"]:
     """Returns the distance of the nearest point in each texel; infinite where there is none."""
-    column, row = _texels(away, size).T
+    column, row = octahedral_texels(away, size).T
     found = np.full((size, size), np.inf)
     np.minimum.at(found, (row, column), np.linalg.norm(away, axis=-1))
     return found

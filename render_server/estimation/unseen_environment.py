@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int64
 
 from deltalight.protocol import short_axis
 from deltalight.protocol.frames import LUMINANCE
-from deltalight.protocol.octahedral import octahedral_uv
+from deltalight.protocol.octahedral import octahedral_texels
 from deltalight.render_server.estimation.plane_extrapolation import (
     ExtrapolatedPlanes,
     PointCloud,
@@ -125,6 +125,6 @@ class SkyPixels:
         surface, (low, high) = SeenSurface.of(seen), objects.bounds
         direction = surface.position[:, :3].astype(np.float64) - (low + high) / 2
         pixel = np.flatnonzero((surface.position[:, 3] > 0) & (direction[:, 2] > 0))
-        texel = np.minimum((octahedral_uv(direction[pixel]) * size).astype(int), size - 1)
-        flat = texel[:, 1] * size + texel[:, 0]
+        column, row = octahedral_texels(direction[pixel], size).T
+        flat = row * size + column
         return cls(pixel, flat, np.bincount(flat, minlength=size * size))
