@@ -427,11 +427,7 @@ class Kernel(Shader):
         groups = -(-x // width) or 1, -(-y // height) or 1, -(-z // depth) or 1
         self._gpu.settle_draws()
         program.compute.run(*groups)
-        self._gpu.ctx.memory_barrier()
-        if self._later:
-            self._gpu.precompile_queue.add(self, known)
-        if self._gpu.watchers:
-            program.report(groups, partial(program.written, known))
+        self._end(program, known, groups)
 
     def run_counted(self, groups: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
         """Runs as many workgroups (x, y, z; three uint32) as `groups` holds on the GPU, perhaps none; else as `run`.
@@ -441,11 +437,15 @@ class Kernel(Shader):
         program, known = self._bound(own, shared)
         self._gpu.settle_draws()
         program.compute.run_indirect(groups)
+        self._end(program, known, ())
+
+    def _end(self, program: Program, known: Bindings, groups: tuple[int, ...]) -> None:
+        """Ends a run of so many workgroups, () where only the GPU knows: later work sees its writes."""
         self._gpu.ctx.memory_barrier()
         if self._later:
             self._gpu.precompile_queue.add(self, known)
         if self._gpu.watchers:
-            program.report((), partial(program.written, known))
+            program.report(groups, partial(program.written, known))
 
 
 def require_given(names: Set[str], known: Bindings, label: str) -> None:
