@@ -12,8 +12,9 @@ from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.voxelize import Chosen, VoxelizedMesh
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS
+from deltalight.render_server.scene.gpu_mesh import GpuMesh
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 Corners = Float32[np.ndarray, "m 3 3"]
 

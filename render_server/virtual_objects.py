@@ -21,11 +21,12 @@ from deltalight.render_server.scene.gltf_animation import Clip
 from deltalight.render_server.scene.gltf_lamps import MOST_LAMPS
 from deltalight.render_server.scene.gltf_meshes import GltfAsset
 from deltalight.render_server.scene.gltf_posing import Pose
+from deltalight.render_server.scene.gpu_mesh import GpuMesh, merged_again
 from deltalight.render_server.scene.material_file import read_material
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import Asset, load_asset
-from deltalight.render_server.scene.moved_meshes import TurnedMesh, merged_again, turned
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of
+from deltalight.render_server.scene.moved_meshes import TurnedMesh, turned
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, bounds_of
 
 MARKER_FRAME = "marker:"
 CORNER_PICKS = np.array(
@@ -147,7 +148,7 @@ class VirtualObjects:
         self._board: BoardSpec | None = None
         self._moving: dict[str, AnimatedObject] = {}
         self._standing: dict[str, _ObjectInWorld] = {}
-        self._kept_merged: tuple[Sequence[TriangleMesh], GpuMesh | None] = (), None
+        self._kept_merged: tuple[Sequence[Sequence[TriangleMesh]], GpuMesh | None] = (), None
         self.state: GeometryState | None = None
 
     def load(self, objects: Sequence[SceneObject]) -> None:
@@ -223,7 +224,7 @@ class VirtualObjects:
     def _build(self) -> GeometryState | None:
         """Merges and uploads the triangles; returns None if all are degenerate."""
         each = [self._in_world(item) for item in self._shown]
-        merged = self._merged([mesh for item in each for mesh in item.placed.meshes])
+        merged = self._merged([item.placed.meshes for item in each])
         lasting = np.concatenate([item.extent.points for item in each])
         low, high = short_axis.bounds(lasting)
         if not (low < high).any():
@@ -295,10 +296,10 @@ class VirtualObjects:
             self._given[item.material] = given_material(item.material)
         return self._given[item.material]
 
-    def _merged(self, meshes: Sequence[TriangleMesh]) -> GpuMesh:
-        """Merges the meshes of all objects."""
+    def _merged(self, objects: Sequence[Sequence[TriangleMesh]]) -> GpuMesh:
+        """Merges the meshes of all objects, each object's into a part."""
         before, merged = self._kept_merged
-        self._kept_merged = meshes, merged_again(merged, before, meshes)
+        self._kept_merged = objects, merged_again(merged, before, objects)
         return self._kept_merged[1]
 
     def _swept(self, item: PlacedObject, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:
