@@ -59,6 +59,11 @@ class ObjectExtent:
         return short_axis.bounds(self.points)
 
     @cached_property
+    def middle(self) -> Float64[np.ndarray, "3"]:
+        """Middle of `upright`, m."""
+        return np.asarray(self.upright.mean(axis=0))
+
+    @cached_property
     def extended_parts(self) -> Sequence["ObjectExtent"]:
         """Those of several parts that are no mere points; none if there is one."""
         return [each for each in self.parts if each.volume_edge > 0] if len(self.parts) > 1 else ()

@@ -48,6 +48,10 @@ class AnimatedObject:
         """Returns the asset's lights in the current pose, in the world."""
         return () if self._pose is None else self.asset.lamps(self._pose, world_from_asset)
 
+    def plays(self, asset: GltfAsset, clip: Clip, animation: Animation) -> bool:
+        """Whether that is what it plays."""
+        return asset is self.asset and clip is self._clip and animation == self.animation
+
     @property
     def is_still(self) -> bool:
         """Whether its pose never changes."""
@@ -196,11 +200,14 @@ class VirtualObjects:
         return [asset.left_out for asset in loaded if asset.left_out is not None]
 
     def _animated(self, item: SceneObject) -> AnimatedObject | None:
-        """Returns the object animated by its clip; None if it plays none."""
+        """Returns the object animated by its clip: as before if it plays the same; None if it plays none."""
         asset = self._assets[item.asset].animated
         clip = clip_of(item, asset)
         if asset is None or clip is None or item.playing is None:
             return None
+        before = self._moving.get(item.id)
+        if before is not None and before.plays(asset, clip, item.playing):
+            return before
         return AnimatedObject(asset, clip, item.playing)
 
     def update(
@@ -215,7 +222,8 @@ class VirtualObjects:
             self._moving = {name: moving for name, moving in animated.items() if moving is not None}
             names = {item.id for item in shown}
             self._standing = {name: kept for name, kept in self._standing.items() if name in names}
-            self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
+            used = _materials(shown)
+            self._given = {each: made for each, made in self._given.items() if each in used}
         moved = [moving.advance_to(capture_ns) for moving in self._moving.values()]
         if is_new or any(moved):
             self.state = self._build() if shown else None

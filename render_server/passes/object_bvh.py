@@ -25,6 +25,7 @@ class BvhTextures:
     def __init__(self, gpu: GpuContext) -> None:
         self._nodes, self._faces = TexelRows(gpu, BVH_WIDTH, "u4"), TexelRows(gpu, BVH_WIDTH, "u4")
         self._held: Sequence[Tree] = ()
+        self._held_above: set[tuple[int, bytes]] = set()  # place and contents of each node
 
     def write(self, forest: Forest) -> None:
         """Replaces the contents; trees that they have already are not packed again."""
@@ -34,9 +35,11 @@ class BvhTextures:
         for tree in forest.trees:
             if tree not in held:
                 self._write_tree(tree)
-        for at, row in zip(forest.above_at.tolist(), forest.above, strict=True):
-            self._nodes.renewed(NODE_TEXELS * at, NODE_TEXELS)[:] = row.reshape(-1, 4)
-        self._held = forest.trees
+        above = {(at, row.tobytes()) for at, row in zip(forest.above_at.tolist(), forest.above, strict=True)}
+        for at, packed in above - self._held_above:
+            texels = np.frombuffer(packed, np.float32).reshape(-1, 4)
+            self._nodes.renewed(NODE_TEXELS * at, NODE_TEXELS)[:] = texels
+        self._held, self._held_above = forest.trees, above
 
     def _write_tree(self, tree: Tree) -> None:
         part, bvh = tree.part, tree.bvh
