@@ -17,7 +17,7 @@ class TexelRows:
     def __init__(self, gpu: GpuContext, width: int, dtype: str) -> None:
         self._gpu, self._width, self._dtype = gpu, width, dtype
         self._texels = np.zeros((0, width, 4), np.float32)
-        self._is_stale = np.zeros(0, bool)  # of each row on the GPU
+        self._is_stale = np.zeros(2, bool)  # of each row on the GPU, between two that are none
         self._texture: moderngl.Texture | None = None
 
     def reserve(self, count: int) -> None:
@@ -28,11 +28,12 @@ class TexelRows:
         before = self._texels[:rows]
         self._texels = np.zeros((rows, self._width, 4), np.float32)
         self._texels[: len(before)] = before
-        self._is_stale = np.ones(rows, bool)
+        self._is_stale = np.zeros(rows + 2, bool)
+        self._is_stale[1:-1] = True
 
     def renewed(self, first: int, count: int) -> Float32[np.ndarray, "count 4"]:
         """Returns texels to be written in place."""
-        self._is_stale[first // self._width : -(-(first + count) // self._width)] = True
+        self._is_stale[1 + first // self._width : 1 - (-(first + count) // self._width)] = True
         return self._texels.reshape(-1, 4)[first : first + count]
 
     @property
@@ -42,7 +43,7 @@ class TexelRows:
         if self._texture is None or self._texture.size != size:
             release_all(self._texture)
             self._texture = texture_2d(self._gpu, size, 4, self._dtype)
-        ends = np.flatnonzero(np.diff(self._is_stale, prepend=False, append=False))
+        ends = np.flatnonzero(self._is_stale[1:] != self._is_stale[:-1])
         for first, last in ends.reshape(-1, 2).tolist():
             self._texture.write(self._texels[first:last], (0, first, self._width, last - first), alignment=1)
         self._is_stale[:] = False

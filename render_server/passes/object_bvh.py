@@ -44,11 +44,11 @@ class BvhTextures:
     def _write_tree(self, tree: Tree) -> None:
         part, bvh = tree.part, tree.bvh
         nodes = bvh.packed(tree.first_node, part.first_triangle)
-        faces = bvh.packed_triangles(part.vertices[:, :3], part.triangles, part.first_vertex)
         node_texels = self._nodes.renewed(NODE_TEXELS * tree.first_node, NODE_TEXELS * len(nodes))
         node_texels[:] = nodes.reshape(-1, 4)
-        face_texels = self._faces.renewed(FACE_TEXELS * part.first_triangle, FACE_TEXELS * len(faces))
-        face_texels[:] = faces.reshape(-1, 4)
+        faces = self._faces.renewed(FACE_TEXELS * part.first_triangle, FACE_TEXELS * len(part.triangles))
+        out = faces.reshape(-1, FACE_TEXELS, 4)
+        bvh.packed_triangles(part.vertices[:, :3], part.triangles, part.first_vertex, out)
 
     @property
     def bindings(self) -> dict[str, Binding]:

@@ -51,19 +51,21 @@ class Bvh:
         positions: Float32[np.ndarray, "n 3"],
         triangles: Int32[np.ndarray, "m 3"],
         first_vertex: int = 0,
-    ) -> Float32[np.ndarray, "m 12"]:
+        out: Float32[np.ndarray, "m 3 4"] | None = None,
+    ) -> Float32[np.ndarray, "m 3 4"]:
         """Packs triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex.
 
-        `first_vertex`: how many vertices of others stand before these.
+        `first_vertex`: how many vertices of others stand before these. `out`: where the triangles are to be packed.
         """
         vertices = padded(positions)
         vertices.view(np.int32)[:, 3] = np.arange(first_vertex, first_vertex + len(vertices))
-        rows = vertices.take(triangles.take(self.order, axis=0), axis=0)
+        # In its default mode, "raise", NumPy would gather into a copy first.
+        rows = vertices.take(triangles.take(self.order, axis=0), axis=0, out=out, mode="clip")
         for axis in range(3):  # one by one, as in `_box_rows`
             first, second, third = rows[:, :, axis].T
             second -= first
             third -= first
-        return rows.reshape(-1, 12)
+        return rows
 
     @property
     def cost(self) -> float:

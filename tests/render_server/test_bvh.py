@@ -203,7 +203,7 @@ def test_packed_triangles_name_their_vertices() -> None:
     vertices = np.random.default_rng(5).integers(0, 99, (50, 3)).astype(np.int32)
     corners = positions[vertices]
     bvh = build_bvh(corners)
-    rows = bvh.packed_triangles(positions, vertices).reshape(50, 3, 4)
+    rows = bvh.packed_triangles(positions, vertices)
     np.testing.assert_array_equal(rows.view(np.int32)[:, :, 3], vertices[bvh.order])
     np.testing.assert_array_equal(rows[:, 0, :3], corners[bvh.order, 0])
     np.testing.assert_array_equal(rows[:, 1:, :3], (corners[:, 1:] - corners[:, :1])[bvh.order])
