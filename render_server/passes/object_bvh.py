@@ -111,7 +111,7 @@ class ObjectBvh:
         def pack() -> None:
             if before is not None:
                 before.result()
-            self._textures.write(self._forest.of(shape.parts))
+            self._textures.write(self._forest.fitted_to(shape.parts))
 
         self._packed = submit(pack)
 

@@ -21,7 +21,7 @@ class LastingBvh:
         self._built: Bvh | None = None
         self._fresh_cost = 0.0
 
-    def of(self, corners: Float32[np.ndarray, "m 3 3"]) -> Bvh:
+    def fitted_to(self, corners: Float32[np.ndarray, "m 3 3"]) -> Bvh:
         """Returns the hierarchy of these triangles."""
         if self._built is not None and len(self._built.order) == len(corners):
             bvh = self._built.refitted(corners)
@@ -62,19 +62,19 @@ class BvhForest:
         self._lasting_above = LastingBvh()
         self._known: dict[MeshPart, Bvh] = {}
 
-    def of(self, parts: Sequence[MeshPart]) -> Forest:
+    def fitted_to(self, parts: Sequence[MeshPart]) -> Forest:
         """Returns the hierarchy of these parts; those that it knows keep their own."""
         missing = len(parts) - len(self._lasting)
         self._lasting = [*self._lasting, *(LastingBvh() for _ in range(missing))][: len(parts)]
         bvhs = [
-            self._known[part] if part in self._known else lasting.of(part.corners)
+            self._known[part] if part in self._known else lasting.fitted_to(part.corners)
             for part, lasting in zip(parts, self._lasting, strict=True)
         ]
         self._known = dict(zip(parts, bvhs, strict=True))
         if len(parts) == 1:
             return lone_tree(parts[0], bvhs[0])
         boxes = np.stack([(each.low[0], each.high[0], each.high[0]) for each in bvhs])
-        return _planted(parts, bvhs, self._lasting_above.of(boxes))
+        return _planted(parts, bvhs, self._lasting_above.fitted_to(boxes))
 
 
 def lone_tree(part: MeshPart, bvh: Bvh) -> Forest:

@@ -303,7 +303,7 @@ def test_rays_find_the_closest_triangle_of_several_parts(gpu: GpuContext, count:
     meshes = first, merged_again(first, groups, moved), merge_parts(moved[1:]), merge_parts(moved)
     forest, textures, rays = BvhForest(), BvhTextures(gpu), random_rays()
     for mesh in meshes:
-        textures.write(forest.of(mesh.parts))
+        textures.write(forest.fitted_to(mesh.parts))
         assert_hits_are_closest(hits_in(gpu, textures, *rays), mesh.corners, rays)
     textures.release()
 
@@ -320,7 +320,7 @@ def nodes_of(forest: Forest) -> np.ndarray:
 
 def test_boxes_of_a_forest_enclose_what_is_below_and_skip_it() -> None:
     parts = merge_parts([[triangle_mesh_of(cluster(number))] for number in range(23)]).parts
-    rows = nodes_of(BvhForest().of(parts))
+    rows = nodes_of(BvhForest().fitted_to(parts))
     low, high, skip = rows[:, :3], rows[:, 4:7], rows.view(np.int32)[:, 7]
     assert np.isfinite(low).all()
     for node, after in enumerate(skip.tolist()):
@@ -338,8 +338,8 @@ def test_parts_that_rest_keep_their_hierarchy() -> None:
     before = merge_parts(groups)
     moved = [*groups[:2], [groups[2][0].changed(positions=cluster(2, 0.05).reshape(-1, 3))], *groups[3:]]
     forest = BvhForest()
-    old = {tree.part: tree for tree in forest.of(before.parts).trees}
-    new = {tree.part: tree for tree in forest.of(merged_again(before, groups, moved).parts).trees}
+    old = {tree.part: tree for tree in forest.fitted_to(before.parts).trees}
+    new = {tree.part: tree for tree in forest.fitted_to(merged_again(before, groups, moved).parts).trees}
     assert len(new) == 6
     assert len(set(old.values()) & set(new.values())) == 5
 
