@@ -128,7 +128,12 @@ def registration_from_albedo_percentile(
     if np.count_nonzero(usable) < MIN_PIXELS:
         return Registration(np.ones(3, np.float32), "given", None, _NOTHING_SEEN)
     factor = max(float(np.percentile(rest[usable] / light[usable], PERCENTILE)), MIN_IRRADIANCE)
-    return Registration(np.full(3, factor, np.float32), "percentile", None, _NO_PATCH)
+    return Registration(
+        np.full(3, factor, np.float32),
+        "percentile",
+        None,
+        _NO_PATCH.format("colour is not matched to the picture"),
+    )
 
 
 def guessed_balance(
@@ -161,12 +166,7 @@ _POOR_FIT = (
 )
 _NO_PATCH = (
     "No white paper of the marker board was usable, so the lights' scale comes from the brightest real "
-    "surface, taken to have albedo 0.95, and their colour is not matched to the picture: if objects are too bright, "
-    "too dark or tinted, show the board's paper unclipped, or set lights.registration."
-)
-_GUESSED_BALANCE = (
-    "No white paper of the marker board was usable, so the lights' scale comes from the brightest real "
-    "surface, taken to have albedo 0.95, and their white balance is a guess: if objects are too bright, "
+    "surface, taken to have albedo 0.95, and their {}: if objects are too bright, "
     "too dark or tinted, show the board's paper unclipped, or set lights.registration."
 )
 _NOTHING_SEEN = (
@@ -209,8 +209,8 @@ def register_lights(
 
     `lights` are not registered yet. Light that visible real surfaces reflect is measured, so it is in camera units
     already; what the others reflect is in those of the lights. So a factor is tried before another is found, until
-    they agree; an `estimate` from earlier frames is tried once. `guesses_balance`: without paper, the white balance is
-    estimated too, because that of the lights is another camera's.
+    they agree; an `estimate` from earlier frames is tried once. `guesses_balance`: the lights' white balance is
+    another camera's, so it is estimated too where there is no paper.
     """
     if estimate is not None:
         return _registered_with(graph, lights, estimate, guesses_balance)
@@ -247,7 +247,7 @@ def _guessed_registration(lit: LightSamples, own_balance: Float32[np.ndarray, "3
         return registration_from_albedo_percentile(measured, light, bounce)
     balance = guessed_balance(measured, light, bounce, own_balance)
     found = registration_from_albedo_percentile(measured, balance * light, bounce)
-    warning = _GUESSED_BALANCE if found.source == "percentile" else found.warning
+    warning = _NO_PATCH.format("white balance is a guess") if found.source == "percentile" else found.warning
     return replace(found, factor=(balance * found.factor).astype(np.float32), warning=warning)
 
 
