@@ -142,7 +142,7 @@ def guessed_balance(
     bounce_irradiance: Float[np.ndarray, "k 3"],
     own: Float[np.ndarray, "3"],
 ) -> Float64[np.ndarray, "3"]:
-    """Estimates the lights' white balance: factors R G B, with G = 1, on lights whose balance is unknown.
+    """Estimates the lights' white balance: factors R G B, with G = 1 (docs/method.md 1.4).
 
     Each ratio is the median of three guesses: `own`, which leaves the lights as they were given; the balance under
     which their light is white, as if the camera had balanced its picture; and that under which the 99th percentile
