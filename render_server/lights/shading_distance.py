@@ -4,7 +4,6 @@ Divided by the irradiance of lights in their right places, a picture is albedo, 
 shadows and falloff are gone (intrinsic images, Barrow & Tenenbaum 1978).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +15,7 @@ from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.occlusion import are_occluded
 from deltalight.protocol.octahedral import sample_octahedral
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
+from deltalight.render_server.lights.light_distance import CANDIDATES, DistanceCue, tiles_of
 from deltalight.render_server.lights.octahedral import irradiance_map
 from deltalight.render_server.scene.albedo import unclipped
 from deltalight.render_server.scene.depth_surface import depth_surface, noise_sigma
@@ -28,51 +28,21 @@ SPANS = (4, 8)
 SAME_CHROMA = 0.1  # largest difference of log colour between points that may be of one material
 LARGEST_STEP = 0.2  # of log albedo: beyond it, materials differ, whatever the light
 MIN_PAIRS = 500
-# Inverse distances to try, 1/m: neighbours differ by less than what shading can tell apart.
-CANDIDATES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
-# Near lights must leave fewer steps than far ones at 2.5 % significance: a paired t-test over tiles of the picture.
-MIN_T = 2.0
-TILE = 10  # points
 SHADOW_STEPS = 32
 OFFSET_SIGMAS = 4.0  # from a surface to where its shadow rays start, in noise of its depth
 
 
-def distance_by_shading(frame: ViewFrame, sky: SkyLights) -> float | None:
-    """Estimates one distance of all lights from the fish-eye camera, m; None where they seem far away.
+def shading_cue(frame: ViewFrame, sky: SkyLights) -> DistanceCue | None:
+    """Returns how many steps the picture's albedo has if the lights are at each distance from the fish-eye camera.
 
-    Of all distances it is the one under which the picture's albedo has the fewest steps, most of all near the
-    fish-eye camera. Frames without depth or pose, and those that show too little, say nothing.
+    Those near the fish-eye camera count most. None for frames without depth or pose, and those that show too little.
     """
     seen = _seen_points(frame, sky.world_from_fisheye[:3, 3])
     if seen is None:
         return None
     smooth = sample_octahedral(irradiance_map(sky.residual), seen.normals[None])[0]
-
-    def steps(candidate: int) -> Float32[np.ndarray, " p"]:
-        lit = (seen.lit_by(light, sky, CANDIDATES[candidate]) for light in sky.lights)
-        return seen.pairs.steps(sum(lit, smooth))
-
-    # Every other candidate, then the neighbours of the best one: the sum has one minimum but for noise.
-    left = {candidate: steps(candidate) for candidate in range(0, len(CANDIDATES), 2)}
-    coarse = _least(left)
-    left |= {near: steps(near) for near in (coarse - 1, coarse + 1) if 0 <= near < len(CANDIDATES)}
-    best = _least(left)
-    if best == 0 or not seen.pairs.has_fewer(left[best], left[0]):
-        return None
-    return 1 / _vertex({candidate: float(one.sum()) for candidate, one in left.items()}, best)
-
-
-def _least(left: Mapping[int, Float32[np.ndarray, " p"]]) -> int:
-    return min(left, key=lambda candidate: float(left[candidate].sum()))
-
-
-def _vertex(costs: Mapping[int, float], best: int) -> float:
-    """Returns the inverse distance of the least cost: a parabola through the best candidate and its neighbours."""
-    around = [best - 1, best, best + 1]
-    if not all(candidate in costs for candidate in around):
-        return CANDIDATES[best]
-    a, b, _ = np.polyfit([CANDIDATES[one] for one in around], [costs[one] for one in around], 2)
-    return float(-b / (2 * a))
+    lit = (sum((seen.lit_by(light, sky, one) for light in sky.lights), smooth) for one in CANDIDATES)
+    return DistanceCue.of(CANDIDATES, [seen.pairs.steps(light) for light in lit], seen.pairs.tile)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +60,6 @@ class _Pairs:
         log = np.log(np.maximum(light, 1e-6)).mean(axis=1)
         step = np.abs(self.difference - (log[self.first] - log[self.second]))
         return np.asarray(self.weight * np.minimum(step, LARGEST_STEP))
-
-    def has_fewer(self, steps: Float32[np.ndarray, " p"], others: Float32[np.ndarray, " p"]) -> bool:
-        """Whether `steps` are significantly fewer than `others`."""
-        gain = np.bincount(self.tile, others - steps)[np.bincount(self.tile) > 0]
-        return bool(gain.sum() > MIN_T * np.std(gain) * np.sqrt(len(gain)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +172,7 @@ def _pairs(
     mean = log.mean(axis=-1)
     chroma = log - mean[..., None]
     index = np.arange(usable.size).reshape(usable.shape)
-    tile = index // usable.shape[1] // TILE * usable.shape[1] + index % usable.shape[1] // TILE
+    tile = tiles_of(index, usable.shape[1])
     parts = []
     for span in SPANS:
         for one, other in ((np.s_[:, :-span], np.s_[:, span:]), (np.s_[:-span], np.s_[span:])):

@@ -13,16 +13,17 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.light_cutter import LightCutter
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
-from deltalight.render_server.lights.light_distance import fit_distance, paper_light
+from deltalight.render_server.lights.light_distance import common_distance
 from deltalight.render_server.lights.light_models import DirectionalLight, Light, SphereLight
 from deltalight.render_server.lights.lights import AMBIENT_SIZE, LightSet, build_lights, light_set
-from deltalight.render_server.lights.octahedral import above_horizon, irradiance
-from deltalight.render_server.lights.shading_distance import distance_by_shading
+from deltalight.render_server.lights.octahedral import above_horizon
+from deltalight.render_server.lights.paper_distance import paper_cue, paper_light
+from deltalight.render_server.lights.shading_distance import shading_cue
 
 # Fraction of a lamp's radius that it must move to count as moved. Soft edges of its shadows are then off by a
 # twentieth of their width, whereas noise of the marker's pose would make them tremble and cost a rebuild per frame.
 STILL_FRACTION = 0.1
-UP = np.array([[0.0, 0.0, 1.0]])
+PAPER = "the board's paper"
 
 
 class LightSource(Protocol):
@@ -182,8 +183,8 @@ class FisheyeSource:
     def _find_distance(self, frame: ViewFrame, sky: SkyLights) -> bool:
         """Estimates the lights' distance on the first frame that can tell; returns whether that succeeded.
 
-        The board's paper measures best. Where it shows no near lights (a lamp may light only a part of it), and
-        without a board, shading and shadows of all surfaces are asked.
+        All cues that say significantly that the lights are near are taken together: the falloff of light over the
+        board's paper, and shading and shadows of all surfaces. A board may still come into view.
         """
         if not (self._wants_distance and sky.lights):
             return False
@@ -191,13 +192,13 @@ class FisheyeSource:
         if paper is None and (frame.board is not None or frame.depth is None or frame.pose is None):
             return False
         self._wants_distance = False
-        if paper is not None:
-            ambient = irradiance(sky.residual, UP)[0]
-            self._distance_m = fit_distance(paper, sky.world_from_fisheye[:3, 3], sky.lights, ambient)
-            self._measure = "the board's paper tells"
-        if self._distance_m is None:
-            self._distance_m = distance_by_shading(frame, sky)
-            self._measure = "shading and shadows tell"
+        cues = {
+            PAPER: None if paper is None else paper_cue(paper, sky),
+            "shading and shadows": shading_cue(frame, sky),
+        }
+        near = {name: cue for name, cue in cues.items() if cue is not None and cue.tells_near}
+        self._distance_m = common_distance([*near.values()])
+        self._measure = f"{', '.join(near)} tell{'s' if [*near] == [PAPER] else ''}"
         return self._distance_m is not None
 
     def _lights(self, sky: SkyLights) -> LightSet:

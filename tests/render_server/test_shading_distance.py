@@ -9,8 +9,9 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
 from deltalight.protocol.scene_lights import LightCut, Lights
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
+from deltalight.render_server.lights.light_distance import common_distance
 from deltalight.render_server.lights.light_models import DirectionalLight, SphereLight
-from deltalight.render_server.lights.shading_distance import distance_by_shading
+from deltalight.render_server.lights.shading_distance import shading_cue
 from deltalight.render_server.lights.sources import FisheyeSource
 
 LOW, HIGH = np.array([-0.12, 0.05, 0.0]), np.array([-0.02, 0.12, 0.1])
@@ -81,6 +82,12 @@ def sky() -> SkyLights:
     return SkyLights(LightCut(), fisheye, (light,), (), residual, np.ones((32, 32, 1), np.float32))
 
 
+def distance_by_shading(frame: ViewFrame, given: SkyLights) -> float | None:
+    """The distance that shading and shadows tell alone; None where they tell nothing."""
+    cue = shading_cue(frame, given)
+    return common_distance([cue]) if cue is not None and cue.tells_near else None
+
+
 @pytest.mark.parametrize("distance_m", [0.5, 0.8, 1.4])
 def test_shading_tells_how_far_a_lamp_is(distance_m: float) -> None:
     assert distance_by_shading(scene(distance_m), sky()) == pytest.approx(distance_m, rel=0.15)
@@ -118,7 +125,7 @@ def test_frames_that_show_nothing_say_nothing() -> None:
         replace(frame, depth=nothing),
         replace(frame, color=black),
     ):
-        assert distance_by_shading(blind, sky()) is None
+        assert shading_cue(blind, sky()) is None
 
 
 def test_lamps_come_near_without_a_board() -> None:
