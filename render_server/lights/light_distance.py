@@ -16,7 +16,7 @@ CANDIDATES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2
 # reflect or the grain of wood, is alike within one and not in others.
 TILE = 1 / 8
 MIN_TILES = 2
-SIGNIFICANCE = 0.05
+SIGNIFICANCE = 0.05  # of what is found, else lights are far, or all at one distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,8 @@ class DistanceCue:
         tile: Int64[np.ndarray, " k"],
     ) -> "DistanceCue | None":
         """Adds up the losses of observations in each tile; None where too few tiles show any."""
-        used = np.bincount(tile) > 0
-        if np.count_nonzero(used) < MIN_TILES:
-            return None
-        return cls(inverses, np.stack([np.bincount(tile, one)[used] for one in losses]))
+        by_tile = sum_by_tile(losses, tile)
+        return cls(inverses, by_tile) if by_tile.shape[1] >= MIN_TILES else None
 
     @property
     def best(self) -> int:
@@ -55,12 +53,8 @@ class DistanceCue:
 
     @property
     def tells_near(self) -> bool:
-        """Whether lights near by explain the cue significantly better than lights far away: a paired t-test."""
-        from scipy.special import stdtrit
-
-        gain = self.losses[0] - self.losses[self.best]
-        least_t = float(stdtrit(len(gain) - 1, 1 - SIGNIFICANCE))
-        return bool(gain.sum() > least_t * np.std(gain, ddof=1) * np.sqrt(len(gain)))
+        """Whether lights near by explain the cue significantly better than lights far away."""
+        return is_significant(self.losses[0] - self.losses[self.best])
 
     @cached_property
     def estimate(self) -> tuple[float, float]:
@@ -77,18 +71,29 @@ class DistanceCue:
         return inverse, float(scatter) / curvature
 
 
-def common_distance(cues: Sequence[DistanceCue]) -> float | None:
-    """Returns the distance that cues say together, m: the mean of their inverse distances, weighted by 1 / variance.
-
-    Only cues should be given that tell that the lights are near; None where there are none.
-    """
-    if not cues:
-        return None
-    inverse, error = np.array([cue.estimate for cue in cues]).T
-    return float(1 / np.average(inverse, weights=np.maximum(error, 1e-6) ** -2.0))
-
-
 def tiles_of(pixel: Int64[np.ndarray, "*shape"], width: int) -> Int64[np.ndarray, "*shape"]:
     """Returns the tile of each pixel; pixels count row by row."""
     edge = max(round(TILE * width), 1)
     return np.asarray(pixel // width // edge * width + pixel % width // edge)
+
+
+def sum_by_tile(
+    losses: Sequence[Float[np.ndarray, " k"]], tile: Int64[np.ndarray, " k"]
+) -> Float64[np.ndarray, "c t"]:
+    """Adds up each of the losses in every tile that shows any observation."""
+    used = np.bincount(tile) > 0
+    return np.stack([np.bincount(tile, one)[used] for one in losses])
+
+
+def is_significant(gain: Float64[np.ndarray, " t"], tests: int = 1) -> bool:
+    """Whether tiles gain on average: a one-sided t-test, one of several `tests` (Bonferroni)."""
+    from scipy.special import stdtrit
+
+    least_t = float(stdtrit(len(gain) - 1, 1 - SIGNIFICANCE / tests))
+    return bool(gain.sum() > least_t * np.std(gain, ddof=1) * np.sqrt(len(gain)))
+
+
+def common_inverse(cues: Sequence[DistanceCue]) -> float:
+    """Returns the inverse distance, 1/m, that cues which tell near lights say together: a mean by 1 / variance."""
+    inverse, error = np.array([cue.estimate for cue in cues]).T
+    return float(np.average(inverse, weights=np.maximum(error, 1e-6) ** -2.0))

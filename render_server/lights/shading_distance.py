@@ -4,7 +4,9 @@ Divided by the irradiance of lights in their right places, a picture is albedo, 
 shadows and falloff are gone (intrinsic images, Barrow & Tenenbaum 1978).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,7 +17,13 @@ from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.occlusion import are_occluded
 from deltalight.protocol.octahedral import sample_octahedral
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
-from deltalight.render_server.lights.light_distance import CANDIDATES, DistanceCue, tiles_of
+from deltalight.render_server.lights.light_distance import (
+    CANDIDATES,
+    DistanceCue,
+    is_significant,
+    sum_by_tile,
+    tiles_of,
+)
 from deltalight.render_server.lights.octahedral import irradiance_map
 from deltalight.render_server.scene.albedo import unclipped
 from deltalight.render_server.scene.depth_surface import depth_surface, noise_sigma
@@ -28,21 +36,76 @@ SPANS = (4, 8)
 SAME_CHROMA = 0.1  # largest difference of log colour between points that may be of one material
 LARGEST_STEP = 0.2  # of log albedo: beyond it, materials differ, whatever the light
 MIN_PAIRS = 500
+ROUNDS = 2  # over all lamps: where one is depends on the others
 SHADOW_STEPS = 32
 OFFSET_SIGMAS = 4.0  # from a surface to where its shadow rays start, in noise of its depth
 
 
-def shading_cue(frame: ViewFrame, sky: SkyLights) -> DistanceCue | None:
-    """Returns how many steps the picture's albedo has if the lights are at each distance from the fish-eye camera.
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """What shading and shadows of a picture say about the distances of lamps from the fish-eye camera.
 
-    Those near the fish-eye camera count most. None for frames without depth or pose, and those that show too little.
+    The nearer places are to that camera the more they count. `lit` is the irradiance of the points by each lamp at
+    each of CANDIDATES, `smooth` that by all other light.
     """
-    seen = _seen_points(frame, sky.world_from_fisheye[:3, 3])
-    if seen is None:
-        return None
-    smooth = sample_octahedral(irradiance_map(sky.residual), seen.normals[None])[0]
-    lit = (sum((seen.lit_by(light, sky, one) for light in sky.lights), smooth) for one in CANDIDATES)
-    return DistanceCue.of(CANDIDATES, [seen.pairs.steps(light) for light in lit], seen.pairs.tile)
+
+    sky: SkyLights
+    seen: "_SeenPoints"
+    lamps: list[list[TrackedLight]]
+    lit: list[list[Float32[np.ndarray, "k 3"]]]
+    smooth: Float32[np.ndarray, "k 3"]
+
+    @classmethod
+    def of(cls, frame: ViewFrame, sky: SkyLights) -> "Shading | None":
+        """Returns what a frame says; None without depth or pose, and where it shows too little."""
+        seen = _seen_points(frame, sky.world_from_fisheye[:3, 3])
+        if seen is None:
+            return None
+        lamps = _lamps(sky.lights)
+        lit = [[seen.lit_by(lamp, sky, inverse) for inverse in CANDIDATES] for lamp in lamps]
+        smooth = sample_octahedral(irradiance_map(sky.residual), seen.normals[None])[0]
+        return cls(sky, seen, lamps, lit, smooth)
+
+    @cached_property
+    def cue(self) -> DistanceCue | None:
+        """How many steps the picture's albedo has if all lamps are at one distance."""
+        return self._cue([sum(lit, self.smooth) for lit in zip(*self.lit, strict=True)])
+
+    def own_inverses(self) -> dict[int, float]:
+        """Returns inverse distances, 1/m, of the lights (by identity) that are not as far as the others.
+
+        One of its own must leave significantly fewer steps than the distance common to all.
+        """
+        if self.cue is None or len(self.lamps) == 1:
+            return {}
+        common, _ = self.cue.estimate
+        pairs, found = self.seen.pairs, dict[int, float]()
+        now = [self.seen.lit_by(lamp, self.sky, common) for lamp in self.lamps]
+        for index in ROUNDS * sorted(range(len(now)), key=lambda index: -float(now[index].sum())):
+            others = sum(now[:index] + now[index + 1 :], self.smooth)
+            own = self._cue([others + lit for lit in self.lit[index]])
+            (before,) = sum_by_tile([pairs.steps(others + now[index])], pairs.tile)
+            if own is not None and is_significant(before - own.losses[own.best], len(now)):
+                inverse, _ = own.estimate
+                found |= {light.identity: inverse for light in self.lamps[index]}
+                now[index] = self.seen.lit_by(self.lamps[index], self.sky, inverse)
+        return found
+
+    def _cue(self, lights: Sequence[Float32[np.ndarray, "k 3"]]) -> DistanceCue | None:
+        """Returns the steps under each of some irradiances."""
+        pairs = self.seen.pairs
+        return DistanceCue.of(CANDIDATES, [pairs.steps(light) for light in lights], pairs.tile)
+
+
+def _lamps(lights: Sequence[TrackedLight]) -> list[list[TrackedLight]]:
+    """Returns the lights of each lamp: large ones are cut into several, whose discs touch."""
+    from scipy.sparse.csgraph import connected_components
+
+    toward = np.array([light.to_light for light in lights])
+    radius = np.array([light.angular_radius_rad for light in lights])
+    touch = np.arccos(np.clip(toward @ toward.T, -1, 1)) <= radius + radius[:, None]
+    count, lamp = connected_components(touch, directed=False)
+    return [[light for light, own in zip(lights, lamp, strict=True) if own == one] for one in range(count)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +136,13 @@ class _SeenPoints:
     normals: Float32[np.ndarray, "k 3"]
     pairs: _Pairs
 
-    def lit_by(self, light: TrackedLight, sky: SkyLights, inverse: float) -> Float32[np.ndarray, "k 3"]:
-        """Returns the irradiance from a light at an inverse distance from the fish-eye camera."""
+    def lit_by(
+        self, lamp: Sequence[TrackedLight], sky: SkyLights, inverse: float
+    ) -> Float32[np.ndarray, "k 3"]:
+        """Returns the irradiance from a lamp's lights at an inverse distance from the fish-eye camera."""
+        return sum((self._lit_by(light, sky, inverse) for light in lamp), np.zeros_like(self.points))
+
+    def _lit_by(self, light: TrackedLight, sky: SkyLights, inverse: float) -> Float32[np.ndarray, "k 3"]:
         offset = self.points - sky.world_from_fisheye[:3, 3].astype(np.float32)
         to_lamp = light.to_light.astype(np.float32) - np.float32(inverse) * offset  # in units of its distance
         distance = np.linalg.norm(to_lamp, axis=1)

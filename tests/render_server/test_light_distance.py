@@ -8,7 +8,7 @@ import pytest
 from deltalight.protocol.octahedral import octahedral_grid, texel_solid_angles
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
-from deltalight.render_server.lights.light_distance import CANDIDATES, DistanceCue, common_distance
+from deltalight.render_server.lights.light_distance import CANDIDATES, DistanceCue, common_inverse
 from deltalight.render_server.lights.paper_distance import PaperLight, paper_cue
 
 TO_LAMP = np.array([0.8, -0.2, 0.55]) / np.linalg.norm([0.8, -0.2, 0.55])
@@ -52,7 +52,7 @@ def test_walls_as_far_as_the_lamp_do_not_make_it_seem_nearer(distance_m: float) 
     cue = paper_cue(paper(distance_m), sky())
     assert cue is not None
     assert cue.tells_near
-    assert common_distance([cue]) == pytest.approx(distance_m, rel=0.06)
+    assert 1 / common_inverse([cue]) == pytest.approx(distance_m, rel=0.06)
 
 
 def test_the_standard_error_of_the_paper_grows_with_its_noise() -> None:
@@ -69,7 +69,7 @@ def test_a_shadow_on_the_paper_changes_little() -> None:
     partly = replace(whole, irradiance=np.where(shadowed[:, None], 0.6, 1) * whole.irradiance)
     cue = paper_cue(partly, sky())
     assert cue is not None
-    assert common_distance([cue]) == pytest.approx(1.0, rel=0.1)
+    assert common_inverse([cue]) == pytest.approx(1.0, rel=0.1)
 
 
 def cue(inverse: float, error: float, tiles: int = 40) -> DistanceCue:
@@ -84,11 +84,8 @@ def test_a_cue_knows_its_standard_error() -> None:
 
 
 def test_cues_count_by_how_sure_they_are() -> None:
-    alike = common_distance([cue(1.0, 0.1), cue(1.4, 0.1)])
-    assert alike == pytest.approx(1 / 1.2)
-    surer = common_distance([cue(1.0, 0.3), cue(1.4, 0.1)])
-    assert surer == pytest.approx(1 / 1.36)
-    assert common_distance([]) is None
+    assert common_inverse([cue(1.0, 0.1), cue(1.4, 0.1)]) == pytest.approx(1.2)
+    assert common_inverse([cue(1.0, 0.3), cue(1.4, 0.1)]) == pytest.approx(1.36)
 
 
 def test_what_tiles_disagree_about_tells_nothing() -> None:
