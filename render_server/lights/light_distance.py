@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 
 # Inverse distances to try, 1/m, from far away to 20 cm: neighbours differ by about what shading can tell apart.
-CANDIDATES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
+CANDIDATES: Sequence[float] = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
 # Tiles of the picture are squares of this fraction of its width: what a cue leaves out, such as light that things
 # reflect or the grain of wood, is alike within one and not in others.
 TILE = 1 / 8

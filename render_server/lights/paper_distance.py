@@ -68,7 +68,7 @@ def paper_cue(paper: PaperLight, sky: SkyLights) -> DistanceCue | None:
     rough = _cue(paper, sky, CANDIDATES)
     if rough is None:
         return None
-    low, _, high = CANDIDATES[rough.around]
+    low, high = CANDIDATES[rough.around][0], CANDIDATES[rough.around][-1]
     return _cue(paper, sky, sorted({0.0, *np.linspace(low, high, FINE_STEPS + 1).tolist()}))
 
 
