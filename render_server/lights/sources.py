@@ -137,7 +137,7 @@ class FisheyeSource:
         self._cutter = LightCutter(self._cut)
         self._sky: SkyLights | None = None
         self._remark: str | None = None
-        self._measure = ""
+        self._found: tuple[str, ...] = ()  # sentence on the distances
         self._wants_distance = lights.fisheye.distance_m == "auto"
         given = lights.fisheye.distance_m
         self._inverse = 1 / given if isinstance(given, float) else 0.0  # of the lights' distance, 1/m
@@ -175,11 +175,7 @@ class FisheyeSource:
         if self._sky is None:
             return (_NO_PICTURE,)
         remarks = () if self._remark is None else (self._remark,)
-        if not self._measure:
-            return remarks
-        inverses = {self._inverse_of(light) for light in self._sky.lights} or {self._inverse}
-        found = ", ".join(f"{1 / one:.2g} m" if one else "far" for one in sorted(inverses, reverse=True))
-        return (*remarks, f"lights of the fish-eye picture: {found} away, as {self._measure}")
+        return remarks + self._found
 
     def _find_distance(self, frame: ViewFrame, sky: SkyLights) -> bool:
         """Estimates the lights' distance on the first frame that can tell; returns whether that succeeded.
@@ -202,9 +198,12 @@ class FisheyeSource:
         if not near:
             return False
         self._inverse = common_inverse([*near.values()])
-        self._measure = f"{', '.join(near)} tell{'s' if [*near] == [PAPER] else ''}"
         if shading is not None:
             self._own_inverses = shading.own_inverses()
+        inverses = sorted({self._inverse_of(light) for light in sky.lights}, reverse=True)
+        distances = ", ".join(f"{1 / inverse:.2g} m" if inverse else "far" for inverse in inverses)
+        verb = "tells" if [*near] == [PAPER] else "tell"
+        self._found = (f"lights of the fish-eye picture: {distances} away, as {', '.join(near)} {verb}",)
         return True
 
     def _inverse_of(self, light: TrackedLight) -> float:
