@@ -24,7 +24,8 @@ _VALUE = re.compile(r"^const bool (\w+) = switched;$", re.MULTILINE)
 _WORD = re.compile(r"\b[A-Za-z_]\w*")
 _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
 _CONDITION = re.compile(r"^\s*#\s*(ifdef|ifndef|if|elif|else|endif)\b\s*(.*?)\s*(?://.*)?$")
-_DIRECTIVE = re.compile(  # not from the line's beginning on: what begins with a character is found sooner
+# A number sign begins nothing else in GLSL, and is found sooner than the beginning of a line.
+_DIRECTIVE = re.compile(
     r"#[ \t]*(define|ifdef|ifndef|if|elif|else|endif)\b[ \t]*(\w*)(?:[ \t]+(.*))?.*$", re.MULTILINE
 )
 

@@ -138,11 +138,12 @@ def _cone_weights(half_angle: float, size: int, source_size: int) -> Float32[np.
     solid_angles, least = texel_solid_angles(source_size).ravel(), np.cos(half_angle)
     weights = np.empty((len(axes), len(source)), np.float32)
     for first in range(0, len(axes), AXES_AT_ONCE):
-        part = weights[first : first + AXES_AT_ONCE]
-        part[:] = axes[first : first + AXES_AT_ONCE] @ source.T
-        part[part <= least] = 0
-        part *= solid_angles
-        part /= part.sum(axis=1, keepdims=True)
+        part = slice(first, first + AXES_AT_ONCE)
+        weight = weights[part]
+        weight[:] = axes[part] @ source.T
+        weight[weight <= least] = 0
+        weight *= solid_angles
+        weight /= weight.sum(axis=1, keepdims=True)
     return weights
 
 
