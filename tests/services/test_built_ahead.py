@@ -30,6 +30,7 @@ from tests.services.test_render_server_sockets import Node
 
 pytestmark = pytest.mark.slow(seconds=20)
 PATIENCE_S = 90.0
+FRAMES_PER_S = 10  # real renderers draw them all
 SERVER = "render server"
 USES_IT = "goes on with the scene that was built ahead"
 COMMAND_LINE = "from deltalight.services.cli import main\nmain()"
@@ -54,7 +55,7 @@ class Station:
         arguments = ("-P", "-c", code, "server", *options, *sockets)
         spec = ChildSpec(SERVER, arguments, warm=PREPARED["server"], rehearsed=True)
         self.supervisor = Supervisor([spec], forward=self.lines.append)
-        self._node = Node(ports.endpoint(node_port))
+        self._node = Node(ports.endpoint(node_port), frames_per_s=FRAMES_PER_S)
         self._receiver = Receiver([ports.endpoint(published)], ["composite"])
         self._client = RequestClient(ports.endpoint(control))
         self._heard = ""

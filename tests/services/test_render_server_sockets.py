@@ -43,8 +43,10 @@ PATIENCE_S = 60.0
 class Node:
     """Publishes numbered frames as `name` until it is closed; `newest` is the last number sent."""
 
-    def __init__(self, endpoint: str, first: int = 0, name: str = "cam") -> None:
-        self.newest, self._name = first, name
+    def __init__(
+        self, endpoint: str, first: int = 0, name: str = "cam", frames_per_s: float = FRAMES_PER_S
+    ) -> None:
+        self.newest, self._name, self._period_s = first, name, 1 / frames_per_s
         self._publisher = Publisher(endpoint)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(first,), daemon=True)
@@ -52,7 +54,7 @@ class Node:
 
     def _run(self, first: int) -> None:
         for number in itertools.count(first):
-            if self._closed.wait(1 / FRAMES_PER_S):
+            if self._closed.wait(self._period_s):
                 return
             self.newest = number
             for message in (color, depth, pose):
