@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float64
 from pydantic import AfterValidator, Field, StringConstraints
 
 from deltalight.protocol.documents import NAME_PATTERN
@@ -118,6 +119,14 @@ Strengths = Annotated[tuple[Strength, Strength, Strength], Field(strict=False)]
 ResidualSize = Annotated[int, Field(ge=4, le=512, strict=True), AfterValidator(_power_of_two)]
 TexelEdge = Annotated[int, Field(ge=0, le=MAX_EDGE_PX, strict=True)]
 Rectangle = Annotated[tuple[TexelEdge, TexelEdge, TexelEdge, TexelEdge], Field(strict=False)]
+
+
+def matrix_rows(matrix: Float64[np.ndarray, "4 4"]) -> Matrix4:
+    """Returns a matrix as a message holds it."""
+    first, second, third, fourth = ((float(a), float(b), float(c), float(d)) for a, b, c, d in matrix)
+    return first, second, third, fourth
+
+
 RegionEdges = Annotated[Rectangle, AfterValidator(_rectangle)]
 Channels = Annotated[int, Field(ge=3, le=3, strict=True)]
 PictureShape = Annotated[tuple[Edge, Edge, Channels], Field(strict=False)]

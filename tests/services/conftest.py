@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.codecs import encode_color, encode_depth
 from deltalight.protocol.envelope import encode
+from deltalight.protocol.message_fields import matrix_rows
 from deltalight.protocol.messages import ColorMessage, DepthMessage, PoseMessage
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.cli import run
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 72, 54  # no power of two (CONTRIBUTING.md)
 DATABASES = ("sqlite", "postgres")
-IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
+IDENTITY = matrix_rows(np.eye(4))
 
 RunCli = Callable[..., subprocess.CompletedProcess[str]]
 
