@@ -8,6 +8,7 @@ import trimesh
 from jaxtyping import Float64
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_output import Shading
@@ -244,7 +245,7 @@ def test_colours_that_were_passed_over_are_not_computed(tmp_path: Path) -> None:
 
 
 def precomputed(document: SceneDocument, **settings: object) -> SceneDocument:
-    shading = Shading(name="precomputed", **{"rays": 256, **settings})
+    shading = Shading(name="precomputed", rays=256).replaced(**settings)
     return document.replaced(shading=shading, method=NoneMethod())
 
 
@@ -262,7 +263,7 @@ class Shown:
         self.position = array_of(surface.buffer.position)[self.pixels, :3]
 
 
-def shown(gpu: GpuContext, document: SceneDocument, view: object = None) -> Shown:
+def shown(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None = None) -> Shown:
     renderer = SceneRenderer(gpu, document, checks=True)
     renderer.render(frame() if view is None else view)
     found = Shown(renderer)

@@ -427,7 +427,8 @@ def test_transmission_and_volume_of_gltf_files(tmp_path: Path) -> None:
     expected = [np.log(2) / 0.2, 0.0, np.log(4) / 0.2]
     assert material.absorption_per_m == pytest.approx(np.array(expected), rel=1e-5)
     thin = load_mesh(sheet(tmp_path, transmission={"transmissionFactor": 1}))[0].material
-    assert (thin.is_thin, thin.refraction_index) == (True, pytest.approx(1.5))
+    assert thin.is_thin
+    assert thin.refraction_index == pytest.approx(1.5)
     assert not thin.absorption_per_m.any()
 
 
