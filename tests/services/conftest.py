@@ -4,7 +4,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
@@ -166,7 +166,9 @@ def depth(
     return received(encode(message, [encode_depth(image, image > 0, "raw", 0.001)]), 0)
 
 
-def pose(frame_id: int, capture_ns: int, status: str = "ok", node: str = "cam") -> ReceivedMultipart:
+def pose(
+    frame_id: int, capture_ns: int, status: Literal["ok", "no_board"] = "ok", node: str = "cam"
+) -> ReceivedMultipart:
     matrix = IDENTITY if status == "ok" else None
     message = PoseMessage(
         node=node, frame_id=frame_id, capture_ns=capture_ns, status=status, world_from_camera=matrix
