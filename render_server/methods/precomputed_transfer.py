@@ -8,10 +8,10 @@ from jaxtyping import Float32, Float64
 
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.frame import FrameResources, ObjectSurface
+from deltalight.render_server.geometry_state import GeometryState, PlacedObject
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.light_map import coefficients_around, distant_coefficients
 from deltalight.render_server.lights.lights import LightSet

@@ -8,10 +8,10 @@ import moderngl
 
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.caustic_beams import TracedBeams, beam_stages, casts_caustics
 from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, Points, object_bvh

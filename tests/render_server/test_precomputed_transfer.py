@@ -12,8 +12,8 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_output import Shading
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.lights.light_map import COSINE_BANDS, coefficients_around, distant_coefficients
 from deltalight.render_server.lights.lights import build_lights
 from deltalight.render_server.lights.octahedral import even_directions, harmonics, turned_harmonics

@@ -15,9 +15,9 @@ import trimesh
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import DlpvMethod, DvctMethod
 from deltalight.protocol.scene_objects import Material, Pose
+from deltalight.render_server.geometry_state import ObjectExtent
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
-from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods.dvct import DVCT, state_memory
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels
