@@ -386,7 +386,7 @@ def test_the_floor_draws_the_object_and_leaves_all_else(gpu: GpuContext, take: T
     assert (shown[~covered] == frame.color[~covered]).all()
     assert (np.abs(shown[covered].astype(int) - frame.color[covered]).max(axis=1) > 8).mean() > 0.9
     assert not any("shadow" in name or "voxel" in name for name in moved.stages)
-    assert {"lamps", "virtual surface"} <= dimmed.stages.keys()
+    assert {"lamps", "object radiance"} <= dimmed.stages.keys()
 
 
 @pytest.mark.slow

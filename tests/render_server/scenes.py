@@ -217,7 +217,7 @@ def with_neighbours(pixels: np.ndarray) -> np.ndarray:
     return np.asarray(binary_erosion(pixels, np.ones((3, 3), bool), border_value=1))
 
 
-OWN_RADIANCE = ("image-based surface", "precomputed surface", "virtual surface")
+OWN_RADIANCE = ("image-based radiance", "precomputed radiance", "object radiance")
 """Stages that shade the objects; the first of them in a graph does."""
 
 

@@ -236,7 +236,7 @@ def shaded_by(renderer: SceneRenderer, view: ViewFrame) -> Shaded:
     pixels &= with_neighbours(with_neighbours(pixels))
     open_ = uniform_filter(array_of(graph["ambient occlusion"].open)[..., 0], 4)
     return Shaded(
-        array_of(graph["image-based surface"])[pixels, :3],
+        array_of(graph["image-based radiance"])[pixels, :3],
         array_of(surface.buffer.normal)[pixels, :3],
         array_of(surface.buffer.position)[pixels, :3],
         open_[pixels],
@@ -327,8 +327,8 @@ def test_method_does_not_shade_the_objects_too(gpu: GpuContext, tmp_path: Path) 
     graph = renderer.graph
     assert graph is not None
     unshaded = array_of(graph["object surface"].coverage.texture)[..., 0] == 0
-    assert "image-based surface" in graph
-    assert graph.resource("virtual surface").version == 0
+    assert "image-based radiance" in graph
+    assert graph.resource("object radiance").version == 0
     assert not np.array_equal(plain[~unshaded], other[~unshaded])
     assert np.array_equal(plain[unshaded], other[unshaded])
     renderer.release()

@@ -258,7 +258,7 @@ class Shown:
         surface = graph["object surface"]
         pixels = array_of(surface.coverage.texture)[..., 0] == 1
         self.pixels = pixels & with_neighbours(with_neighbours(pixels))
-        self.radiance = array_of(graph["precomputed surface"])[self.pixels, :3]
+        self.radiance = array_of(graph["precomputed radiance"])[self.pixels, :3]
         self.normal = array_of(surface.buffer.normal)[self.pixels, :3]
         self.position = array_of(surface.buffer.position)[self.pixels, :3]
 
@@ -375,7 +375,7 @@ def test_only_the_objects_change(gpu: GpuContext, tmp_path: Path) -> None:
     graph = renderer.graph
     assert graph is not None
     unshaded = array_of(graph["object surface"].coverage.texture)[..., 0] == 0
-    assert graph.resource("virtual surface").version == 0
+    assert graph.resource("object radiance").version == 0
     assert not np.array_equal(plain[~unshaded], other[~unshaded])
     assert np.array_equal(plain[unshaded], other[unshaded])
     renderer.release()

@@ -103,7 +103,7 @@ def shaded(gpu: GpuContext, document: SceneDocument, pose: BoardPose) -> tuple[n
     renderer.render(view)
     graph = renderer.graph
     assert graph is not None
-    name = "image-based surface" if document.shading.is_image_based else "precomputed surface"
+    name = "image-based radiance" if document.shading.is_image_based else "precomputed radiance"
     radiance = array_of(graph[name])[..., :3]
     pixels = array_of(graph["object surface"].coverage.texture)[..., 0] == 1
     renderer.release()

@@ -122,7 +122,7 @@ BOUNCES = {
     "paper": {"voxelize objects", "split inject"},
     "dlpv": {"voxelize objects", "inject change", "bounces"},
 }
-FOLLOWS = {"object surface", "shadow maps objects", "direct light", "virtual surface"}
+FOLLOWS = {"object surface", "shadow maps objects", "direct light", "object radiance"}
 
 
 @pytest.mark.parametrize("method", BOUNCES)

@@ -245,7 +245,7 @@ def test_a_pane_shows_the_lamp_behind_it(gpu: GpuContext, stage: Stage) -> None:
     renderer = SceneRenderer(gpu, stage.document([glass(stage, pane)], [lamp], floor()))
     renderer.render(frame(pose=look_at((eye[0], eye[1], eye[2]), (0.0, 0.0, 0.55))))
     assert renderer.graph is not None
-    through = array_of(renderer.graph["transmitted light"]) - array_of(renderer.graph["virtual surface"])
+    through = array_of(renderer.graph["transmitted light"]) - array_of(renderer.graph["object radiance"])
     renderer.release()
     shown = through[..., 1]
     passing = float((1 - fresnel(np.array([0.96]), 1 / IOR)[0]) ** 2)
