@@ -120,13 +120,6 @@ ResidualSize = Annotated[int, Field(ge=4, le=512, strict=True), AfterValidator(_
 TexelEdge = Annotated[int, Field(ge=0, le=MAX_EDGE_PX, strict=True)]
 Rectangle = Annotated[tuple[TexelEdge, TexelEdge, TexelEdge, TexelEdge], Field(strict=False)]
 
-
-def matrix_rows(matrix: Float64[np.ndarray, "4 4"]) -> Matrix4:
-    """Returns a matrix as a message holds it."""
-    first, second, third, fourth = ((float(a), float(b), float(c), float(d)) for a, b, c, d in matrix)
-    return first, second, third, fourth
-
-
 RegionEdges = Annotated[Rectangle, AfterValidator(_rectangle)]
 Channels = Annotated[int, Field(ge=3, le=3, strict=True)]
 PictureShape = Annotated[tuple[Edge, Edge, Channels], Field(strict=False)]
@@ -136,3 +129,9 @@ LightList = Annotated[tuple[PlainDict, ...], Field(strict=False, max_length=MAX_
 Durations = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e7)]], Field(max_length=MAX_LABELS)]
 Counts = Annotated[dict[Label, Count], Field(max_length=MAX_LABELS)]
 Rates = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e6)]], Field(max_length=MAX_LABELS)]
+
+
+def matrix_rows(matrix: Float64[np.ndarray, "4 4"]) -> Matrix4:
+    """Returns the rows of a matrix, as a message holds them."""
+    first, second, third, fourth = ((float(a), float(b), float(c), float(d)) for a, b, c, d in matrix)
+    return first, second, third, fourth
