@@ -12,12 +12,11 @@ from deltalight.render_server.frame_graph import FrameGraph
 from deltalight.render_server.lights.light_models import DirectionalLight
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import solid_angle_mean
-from deltalight.render_server.scene.albedo import MIN_PIXELS
+from deltalight.render_server.scene.albedo import ALBEDO_RANGE, MIN_PIXELS
 
 OUTLIER_DEVIATIONS = 3.0
 MIN_IRRADIANCE = 1e-4
 MIN_OPEN_FRACTION = 0.05  # of the hemisphere that must be open: below, noise of the paper dominates
-MAX_ALBEDO = 0.95
 PERCENTILE = 99.0
 # Relative misfit from which users are warned: people notice unexplained differences of a few per cent within one
 # surface.
@@ -122,7 +121,7 @@ def registration_from_albedo_percentile(
     so the percentile of the factors that give each pixel an albedo of 0.95 is the factor sought.
     """
     light = np.asarray(light_irradiance, np.float64) @ LUMINANCE
-    wanted = np.pi / MAX_ALBEDO * (np.asarray(measured, np.float64) @ LUMINANCE)
+    wanted = np.pi / ALBEDO_RANGE[1] * (np.asarray(measured, np.float64) @ LUMINANCE)
     rest = wanted - np.asarray(bounce_irradiance, np.float64) @ LUMINANCE
     usable = np.isfinite(rest) & (light > MIN_IRRADIANCE)
     if np.count_nonzero(usable) < MIN_PIXELS:

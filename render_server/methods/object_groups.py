@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.render_server.gpu_scene import ObjectExtent
+from deltalight.render_server.geometry_state import ObjectExtent
 from deltalight.render_server.passes.volumes import MOST_VOLUMES
 
 

@@ -106,7 +106,9 @@ class Station:
         assert self.ask("set_scene", scene=changed).ok
 
     def shown(self) -> SceneDocument:
-        return parse_scene(self.ask("get_scene").payload["scene"])
+        found = self.ask("get_scene").payload["scene"]
+        assert isinstance(found, dict)
+        return parse_scene(found)
 
 
 def scene(folder: Path) -> SceneDocument:
@@ -142,7 +144,7 @@ def station_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
 def test_a_spare_waits_for_a_frame_of_each_camera_longer_than_a_server_would() -> None:
     one, other, published, control = map(ports.endpoint, ports.private_ports(4))
     settings = ServerSettings(subscribe=(one, other), publish=published, control=control)
-    cameras = RoomCameras(None, pytest.fail, needs_depth=False, endpoints=2)
+    cameras = RoomCameras(None, lambda error: pytest.fail(str(error)), needs_depth=False, endpoints=2)
     nodes = [Node(one, name="left")]
     late = threading.Timer(1.0, lambda: nodes.append(Node(other, name="right")))
     late.start()

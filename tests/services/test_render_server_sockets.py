@@ -32,9 +32,8 @@ from deltalight.services import ports
 from deltalight.services.api.streams import ProcessWatch
 from tests.services.api_samples import UPLOAD, running_api
 from tests.services.conftest import camera, color, depth, pose
-from tests.services.render_server_samples import Started
+from tests.services.render_server_samples import InvertingRenderer, Started
 from tests.services.storage_samples import TETRAHEDRON
-from tests.services.test_session import InvertingRenderer
 
 FRAMES_PER_S = 100
 PATIENCE_S = 60.0
@@ -139,6 +138,10 @@ def serving(
         server.close()
 
 
+def behind(frame_id: int) -> Callable[[CompositeMessage], bool]:
+    return lambda message: message.frame_id > frame_id
+
+
 @pytest.mark.parametrize("immediate", [True, False], ids=["software", "gpu"])
 def test_a_rest_change_is_in_the_first_picture_that_is_begun_after_its_answer(
     tmp_path: Path, immediate: bool
@@ -158,7 +161,7 @@ def test_a_rest_change_is_in_the_first_picture_that_is_begun_after_its_answer(
                 assert changed.json()["picture"]["state"] == "shown"
                 shown = server.ask("ping").payload
                 assert renderer.scenes[-1].objects[0].pose.translation_m[2] == height
-                later = server.first(lambda message, begun=begun: message.frame_id > begun)
+                later = server.first(behind(begun))
                 assert (shown["scene_id"], shown["revision"]) == (made["id"], changed.json()["revision"])
                 assert (later.scene_id, later.scene_revision) == (made["id"], changed.json()["revision"])
         node.close()
@@ -218,7 +221,7 @@ def test_a_faulty_node_does_not_end_the_server() -> None:
     with serving() as (server, _, node_port):
         faulty = Publisher(ports.endpoint(node_port))
         wrong = {**camera().to_dict(), "distortion_model": "w" * 5000}
-        while "bad_frames" not in server.ask("stats").payload["stats"]["drops"]:  # type: ignore[index, call-overload, operator]
+        while "bad_frames" not in server.ask("stats").payload["stats"]["drops"]:  # type: ignore[index]
             for number in range(140):
                 faulty.send([f"color.{number:03}{'x' * 110}".encode(), b"no header"])
             for message in (color(1, 1, 0, wrong), depth(1, 1), pose(1, 1)):
