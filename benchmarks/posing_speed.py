@@ -15,8 +15,8 @@ import trimesh
 
 from deltalight.benchmarks.glb_builder import GlbBuilder
 from deltalight.render_server.scene.gltf_meshes import load_gltf
+from deltalight.render_server.scene.gpu_mesh import merge_for_gpu
 from deltalight.render_server.scene.moved_meshes import transformed
-from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
 
 JOINTS = 40
 REPEATS = 9

@@ -12,8 +12,9 @@ from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.voxelize import Chosen, VoxelizedMesh
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS
+from deltalight.render_server.scene.gpu_mesh import GpuMesh
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 Corners = Float32[np.ndarray, "m 3 3"]
 
@@ -56,6 +57,11 @@ class ObjectExtent:
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates of the points, m."""
         return short_axis.bounds(self.points)
+
+    @cached_property
+    def middle(self) -> Float64[np.ndarray, "3"]:
+        """Middle of `upright`, m."""
+        return np.asarray(self.upright.mean(axis=0))
 
     @cached_property
     def extended_parts(self) -> Sequence["ObjectExtent"]:

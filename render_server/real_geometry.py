@@ -18,11 +18,12 @@ from deltalight.render_server.passes.voxelize import Chosen
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, BOUND_POINTS, REAL_MATERIAL
 from deltalight.render_server.scene.depth_surface import noise_sigma
 from deltalight.render_server.scene.depth_views import PosedSurface
+from deltalight.render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.moved_meshes import transformed
 from deltalight.render_server.scene.seen_depth import Grazing, SeenDepth
 from deltalight.render_server.scene.threads import submit
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.scene.tsdf_mesh import TsdfScene
 from deltalight.render_server.view import CameraView, PosedFrame
 

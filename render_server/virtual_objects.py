@@ -21,11 +21,12 @@ from deltalight.render_server.scene.gltf_animation import Clip
 from deltalight.render_server.scene.gltf_lamps import MOST_LAMPS
 from deltalight.render_server.scene.gltf_meshes import GltfAsset
 from deltalight.render_server.scene.gltf_posing import Pose
+from deltalight.render_server.scene.gpu_mesh import GpuMesh, merged_again
 from deltalight.render_server.scene.material_file import read_material
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import Asset, load_asset
-from deltalight.render_server.scene.moved_meshes import TurnedMesh, merged_again, turned
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of
+from deltalight.render_server.scene.moved_meshes import TurnedMesh, turned
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, bounds_of
 
 MARKER_FRAME = "marker:"
 CORNER_PICKS = np.array(
@@ -46,6 +47,10 @@ class AnimatedObject:
     def lamps(self, world_from_asset: Float64[np.ndarray, "4 4"]) -> tuple[Light, ...]:
         """Returns the asset's lights in the current pose, in the world."""
         return () if self._pose is None else self.asset.lamps(self._pose, world_from_asset)
+
+    def plays(self, asset: GltfAsset, clip: Clip, animation: Animation) -> bool:
+        """Whether that is what it plays."""
+        return asset is self.asset and clip is self._clip and animation == self.animation
 
     @property
     def is_still(self) -> bool:
@@ -147,7 +152,7 @@ class VirtualObjects:
         self._board: BoardSpec | None = None
         self._moving: dict[str, AnimatedObject] = {}
         self._standing: dict[str, _ObjectInWorld] = {}
-        self._kept_merged: tuple[Sequence[TriangleMesh], GpuMesh | None] = (), None
+        self._kept_merged: tuple[Sequence[Sequence[TriangleMesh]], GpuMesh | None] = (), None
         self.state: GeometryState | None = None
 
     def load(self, objects: Sequence[SceneObject]) -> None:
@@ -195,11 +200,14 @@ class VirtualObjects:
         return [asset.left_out for asset in loaded if asset.left_out is not None]
 
     def _animated(self, item: SceneObject) -> AnimatedObject | None:
-        """Returns the object animated by its clip; None if it plays none."""
+        """Returns the object animated by its clip: as before if it plays the same; None if it plays none."""
         asset = self._assets[item.asset].animated
         clip = clip_of(item, asset)
         if asset is None or clip is None or item.playing is None:
             return None
+        before = self._moving.get(item.id)
+        if before is not None and before.plays(asset, clip, item.playing):
+            return before
         return AnimatedObject(asset, clip, item.playing)
 
     def update(
@@ -214,7 +222,8 @@ class VirtualObjects:
             self._moving = {name: moving for name, moving in animated.items() if moving is not None}
             names = {item.id for item in shown}
             self._standing = {name: kept for name, kept in self._standing.items() if name in names}
-            self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
+            used = _materials(shown)
+            self._given = {each: made for each, made in self._given.items() if each in used}
         moved = [moving.advance_to(capture_ns) for moving in self._moving.values()]
         if is_new or any(moved):
             self.state = self._build() if shown else None
@@ -223,7 +232,7 @@ class VirtualObjects:
     def _build(self) -> GeometryState | None:
         """Merges and uploads the triangles; returns None if all are degenerate."""
         each = [self._in_world(item) for item in self._shown]
-        merged = self._merged([mesh for item in each for mesh in item.placed.meshes])
+        merged = self._merged([item.placed.meshes for item in each])
         lasting = np.concatenate([item.extent.points for item in each])
         low, high = short_axis.bounds(lasting)
         if not (low < high).any():
@@ -295,10 +304,10 @@ class VirtualObjects:
             self._given[item.material] = given_material(item.material)
         return self._given[item.material]
 
-    def _merged(self, meshes: Sequence[TriangleMesh]) -> GpuMesh:
-        """Merges the meshes of all objects."""
+    def _merged(self, objects: Sequence[Sequence[TriangleMesh]]) -> GpuMesh:
+        """Merges the meshes of all objects, each object's into a part."""
         before, merged = self._kept_merged
-        self._kept_merged = meshes, merged_again(merged, before, meshes)
+        self._kept_merged = objects, merged_again(merged, before, objects)
         return self._kept_merged[1]
 
     def _swept(self, item: PlacedObject, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:

@@ -149,7 +149,9 @@ def guessed_balance(
     `registration_from_albedo_percentile`; where they tell nothing, it is `own`.
     """
     light = np.asarray(light_irradiance, np.float64)
-    rest = np.pi / MAX_ALBEDO * np.asarray(measured, np.float64) - np.asarray(bounce_irradiance, np.float64)
+    rest = np.pi / ALBEDO_RANGE[1] * np.asarray(measured, np.float64) - np.asarray(
+        bounce_irradiance, np.float64
+    )
     usable = np.isfinite(rest).all(axis=1) & (light > MIN_IRRADIANCE).all(axis=1)
     guesses = [np.asarray(own, np.float64)]
     if np.count_nonzero(usable) >= MIN_PIXELS:

@@ -15,7 +15,7 @@ from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, lagging_behind_objects
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA, CausticBeams
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.mesh_buffers import ObjectBvh
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.passes.volumes import PlacedVolume
 
 

@@ -53,7 +53,8 @@ from deltalight.render_server.methods.voxel_volumes import DirectionalVoxels, jo
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceRealCones, TraceVirtualCones
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.mesh_buffers import MeshBuffers, ObjectBvh
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.passes.shading import DirectLightPair
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.passes.voxel_light import AlbedoTexture

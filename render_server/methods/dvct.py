@@ -44,7 +44,7 @@ from deltalight.render_server.passes.cones import (
 )
 from deltalight.render_server.passes.distant import DistantChange
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.mesh_buffers import ObjectBvh
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.volumes import MOST_VOLUMES
 from deltalight.render_server.passes.voxel_light import NO_SUPPORT

@@ -21,7 +21,7 @@ from deltalight.render_server.lights.mirror_lights import mirror_lights
 from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.methods.object_groups import points_of_groups
 from deltalight.render_server.passes.lights import LightBuffers, MirrorVisibility
-from deltalight.render_server.passes.mesh_buffers import ObjectBvh
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 from deltalight.render_server.view import NOWHERE, Rectangle

@@ -1,7 +1,6 @@
 """Groups of objects far apart (docs/method.md 4): each has a volume and light maps of its own."""
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,7 +21,7 @@ def points_of_groups(extent: ObjectExtent) -> list[Float64[np.ndarray, "n 3"]]:
 
 def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
     """Returns the gaps between objects' own volumes, by half the sum of two edges; negative: they overlap."""
-    middles = np.stack([each.upright.mean(axis=0) for each in parts])
+    middles = np.stack([each.middle for each in parts])
     halves = np.array([each.volume_edge / 2 for each in parts])
     reach = halves[:, None] + halves
     return np.asarray(np.abs(middles[:, None] - middles).max(axis=-1) / reach - 1)
@@ -31,8 +30,11 @@ def relative_gaps(parts: Sequence[ObjectExtent]) -> Float64[np.ndarray, "n n"]:
 def group_near(gaps: Float64[np.ndarray, "n n"], most: int = MOST_VOLUMES) -> list[list[int]]:
     """Joins objects whose gap is negative, then the nearest until `most` groups are left (single linkage)."""
     groups = {index: [index] for index in range(len(gaps))}
-    for one, other in sorted(combinations(groups, 2), key=lambda pair: gaps[pair]):
-        if gaps[one, other] >= 0 and len({id(group) for group in groups.values()}) <= most:
+    first, second = np.triu_indices(len(gaps), 1)
+    order = np.argsort(gaps[first, second], kind="stable")
+    pairs = first[order].tolist(), second[order].tolist(), gaps[first, second][order].tolist()
+    for one, other, gap in zip(*pairs, strict=True):
+        if gap >= 0 and len({id(group) for group in groups.values()}) <= most:
             break
         if groups[one] is not groups[other]:
             joined = sorted(groups[one] + groups[other])

@@ -21,7 +21,7 @@ from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.mesh_buffers import ObjectBvh
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.passes.reflections import (
     RAY_ROUGHNESS,
     ROUGHEST,

@@ -12,7 +12,8 @@ from deltalight.render_server.gpu.list_groups import list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.cones import LowResGrid, reuse_define
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.mesh_buffers import MaterialTable, ObjectBvh
+from deltalight.render_server.passes.mesh_buffers import MaterialTable
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 
 RAYS = 4  # of each block of a light's object map
 # Through transparent objects, of each ray: at glass a third path has less than 0.2 % of the light but at the rim.

@@ -10,7 +10,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.list_groups import GROUP, LIST_HEADER_BYTES, ListGroups, list_threads
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
-from deltalight.render_server.passes.mesh_buffers import ObjectBvh
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.passes.voxels import VoxelMipmap
 
 

@@ -20,7 +20,7 @@ from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.passes.voxelize import WriteChosen
 from deltalight.render_server.scene.depth_mesh import node_rays, stride_for_budget
 from deltalight.render_server.scene.depth_surface import jump_terms
-from deltalight.render_server.scene.triangle_mesh import GpuMesh
+from deltalight.render_server.scene.gpu_mesh import GpuMesh
 from deltalight.render_server.view import CameraView
 
 Strides = tuple[int, int]

@@ -1,22 +1,21 @@
-"""Meshes on the GPU: vertices and triangles, the objects' hierarchy for rays, and materials with their textures."""
+"""Meshes on the GPU: vertices and triangles, and materials with their textures."""
 
 from collections.abc import Sequence
-from concurrent.futures import Future
 from typing import Any
 
 import moderngl
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
-from deltalight.render_server.gpu.textures import release_all, texture_2d, texture_rows
-from deltalight.render_server.scene.bvh import Bvh, build_bvh
+from deltalight.render_server.gpu.texel_rows import TexelRows
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.scene.gpu_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from deltalight.render_server.scene.material_tables import coating_table, map_table, measured_table
 from deltalight.render_server.scene.texture_maps import TextureMap, map_edge, resampled
-from deltalight.render_server.scene.threads import submit
-from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh, padded
+from deltalight.render_server.scene.triangle_mesh import padded
 
 # Of the vertices of meshes that have either, in a buffer of their own.
 PLACEMENT_LAYOUT, PLACEMENT_ATTRIBUTES = "2f 4f", ("in_second_uv", "in_tangent")
@@ -28,19 +27,11 @@ METALLIC, REFLECTANCE, ROUGHNESS, DOUBLE_SIDED, BY_LIGHT = (
     14,
 )  # columns of the material table, as materials.glsl has them
 
-TEXEL_BYTES = 16
-BVH_ROW_BYTES = 1024 * TEXEL_BYTES
-
-# Refitting costs a fraction of building (8 000 triangles: 1.3 against 34 ms), so rays through a
-# hierarchy may become half as expensive again before it is rebuilt.
-WORN = 1.5
-
 BASE_MAPS, ALL_MAPS = 5, 13  # of a material, as materials.glsl has them
 LEAST_EDGE = 2
 """Of an array of maps, texels: one without mip levels makes Mesa's llvmpipe compile all kernels with maps anew."""
 
 NO_CUTOUTS: Bindings = {"CUTOUTS": False}
-NO_TRIANGLES: Int32[np.ndarray, "0 3"] = np.zeros((0, 3), np.int32)
 NO_COARSE = range(0)
 VERTEX_BYTES, TRIANGLE_BYTES = 48, 12  # of a row of VERTEX_LAYOUT, and of three indices
 CORNERS_ROW = 1024  # triangles in a row of their corners' texels
@@ -57,19 +48,12 @@ class MeshBuffers:
         self._vertices = gpu.ctx.buffer(reserve=4)
         self._indices = gpu.ctx.buffer(reserve=4)
         self._sides = gpu.ctx.buffer(reserve=4)
-        self._held_triangles, self._held_sides = (
-            NO_TRIANGLES,
-            b"",
-        )  # what these two hold, as far as it is known
+        self._held: GpuMesh | None = None  # what the first two hold, unless a kernel wrote it
+        self._held_sides = b""
         self._placement: moderngl.Buffer | None = None
-        self._corners: moderngl.Texture | None = None
-        self._corner_texels = np.zeros(
-            (0, 3, 4), np.float32
-        )  # kept, for new memory takes longer than its contents
-        self._shows_corners = False  # those of the triangles that were written last
-        self._written: GpuMesh | None = None  # if not by a kernel
+        self._corners = TexelRows(gpu, 3 * CORNERS_ROW, "f4")
+        self._shown: GpuMesh | None = None  # whose corners these are
         self._arrays: dict[int, moderngl.VertexArray] = {}
-        self.triangles: Int32[np.ndarray, "m 3"] = NO_TRIANGLES
         self.triangle_count = 0  # of those that are drawn, with any without area
         self.coarse = NO_COARSE  # triangles behind these, of a coarser mesh, which are not drawn
         self.cutouts = NO_CUTOUTS
@@ -96,31 +80,24 @@ class MeshBuffers:
 
     def _corner_texture(self) -> moderngl.Texture:
         """Returns the positions of the triangles' corners."""
-        assert self._written is not None
-        if self._corners is None or not self._shows_corners:
-            rows = texture_rows(-(-len(self.triangles) // CORNERS_ROW))
-            if len(self._corner_texels) != rows * CORNERS_ROW:
-                self._corner_texels = np.zeros((rows * CORNERS_ROW, 3, 4), np.float32)
-            texels = self._corner_texels[: len(self.triangles)]
+        mesh = self._held
+        assert mesh is not None
+        self._corners.reserve(3 * len(mesh.triangles))
+        for part in mesh.parts_beside(self._shown):
+            texels = self._corners.renewed(3 * part.first_triangle, 3 * len(part.triangles))
             # In its default mode, "raise", NumPy would gather into a copy first.
-            padded(self._written.vertices[:, :3]).take(self.triangles, axis=0, out=texels, mode="clip")
-            size = 3 * CORNERS_ROW, rows
-            self._corners = rewritten(self._gpu, self._corners, size, "f4", self._corner_texels)
-            self._shows_corners = True
-        return self._corners
+            padded(part.vertices[:, :3]).take(part.triangles.ravel(), axis=0, out=texels, mode="clip")
+        self._shown = mesh
+        return self._corners.texture
 
     def write(self, mesh: GpuMesh) -> None:
-        """Replaces the contents by those of `mesh`."""
-        vertices = np.ascontiguousarray(mesh.vertices, np.float32)
-        self._reserve(len(vertices), len(mesh.triangles), mesh)
-        self._written = mesh
-        self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
-        if self.triangle_count:
-            self._vertices.write(vertices)
-            held = self._held_triangles  # of an object that moves they stay
-            if self.triangles is not held and not np.array_equal(self.triangles, held):
-                self._indices.write(self.triangles)
-        self._held_triangles = self.triangles
+        """Replaces the contents by those of `mesh`; parts that they have already are not written again."""
+        self._reserve(mesh.vertex_count, len(mesh.triangles), mesh)
+        for part in mesh.parts_beside(self._held):
+            self._vertices.write(part.vertices, offset=VERTEX_BYTES * part.first_vertex)
+        if self._held is None or mesh.triangles is not self._held.triangles:
+            self._indices.write(mesh.triangles)
+        self._held = mesh
         self._write_placement(mesh.placement)
 
     def reserve(
@@ -130,7 +107,7 @@ class MeshBuffers:
 
         `coarse`: those of a coarser mesh, if there is one, behind the `triangle_count` that are drawn.
         """
-        self._held_triangles = NO_TRIANGLES
+        self._held = None
         self._reserve(vertex_count, triangle_count, materials, coarse)
 
     def _reserve(
@@ -139,14 +116,12 @@ class MeshBuffers:
         vertex_bytes = vertex_count * VERTEX_BYTES
         index_bytes = (triangle_count + len(coarse)) * TRIANGLE_BYTES
         if vertex_bytes > self._vertices.size or index_bytes > self._indices.size:
-            self.release()
+            self._release_buffers()
             self._vertices = self._ctx.buffer(reserve=max(vertex_bytes, 4))
             self._indices = self._ctx.buffer(reserve=max(index_bytes, 4))
             self._sides = self._ctx.buffer(reserve=4)
-            self._held_triangles, self._held_sides = NO_TRIANGLES, b""
-        self.triangles, self.triangle_count, self._written = NO_TRIANGLES, triangle_count, None
-        self.coarse = coarse
-        self._shows_corners = False
+            self._held, self._held_sides = None, b""
+        self.triangle_count, self.coarse = triangle_count, coarse
         if triangle_count:
             self._write_sides(materials.material_table[:, DOUBLE_SIDED])
 
@@ -182,10 +157,14 @@ class MeshBuffers:
 
     def release(self) -> None:
         """Frees all buffers."""
+        self._release_buffers()
+        self._corners.release()
+
+    def _release_buffers(self) -> None:
         release_all(*self._arrays.values(), self._vertices, self._indices, self._sides)
-        release_all(self._placement, self._corners)
+        release_all(self._placement)
         self._arrays.clear()
-        self._placement = self._corners = None
+        self._placement = None
 
 
 def _layout_of(program: moderngl.Program, layout: str, names: Sequence[str]) -> tuple[str, ...]:
@@ -194,111 +173,6 @@ def _layout_of(program: moderngl.Program, layout: str, names: Sequence[str]) -> 
     active = {name for _, name in parts if program.get(name, None) is not None}
     formats = (part if name in active else f"{int(part[0]) * 4}x" for part, name in parts)
     return " ".join(formats), *(name for _, name in parts if name in active)
-
-
-def rewritten(
-    gpu: GpuContext,
-    before: moderngl.Texture | None,
-    size: tuple[int, int],
-    dtype: str,
-    data: bytes | Float32[np.ndarray, "..."],
-) -> moderngl.Texture:
-    """Returns a texture of four components with these texels: the one before if its size (width, height) is this."""
-    if before is None or before.size != size:
-        release_all(before)
-        before = texture_2d(gpu, size, 4, dtype)
-    before.write(data, alignment=1)
-    return before
-
-
-def bvh_rows(packed: bytes) -> bytes:
-    """Returns packed nodes or triangles as whole rows of texels, as shaders/common/ray_mesh.glsl reads them."""
-    return packed.ljust(texture_rows(-(-len(packed) // BVH_ROW_BYTES)) * BVH_ROW_BYTES, b"\0")
-
-
-def bvh_texture(gpu: GpuContext, rows: bytes, before: moderngl.Texture | None = None) -> moderngl.Texture:
-    """Returns a texture of `bvh_rows`. `before`: that of those before, which is overwritten or freed."""
-    size = BVH_ROW_BYTES // TEXEL_BYTES, len(rows) // BVH_ROW_BYTES
-    return rewritten(gpu, before, size, "u4", rows)
-
-
-class ObjectBvh:
-    """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced.
-
-    Where rays were traced before, that begins on another thread as soon as the objects are set.
-    """
-
-    def __init__(self, gpu: GpuContext) -> None:
-        self._gpu = gpu
-        self._nodes: moderngl.Texture | None = None
-        self._faces: moderngl.Texture | None = None
-        self._shape: GpuMesh | None = None
-        self._built: GpuMesh | None = None
-        self._mesh: MeshBuffers | None = None
-        self._bvh: Bvh | None = None
-        # Of what was built last, until it is uploaded.
-        self._packed: Future[tuple[bytes, bytes]] | None = None
-        self._is_traced = False  # since the triangles changed
-        self._fresh_cost = 0.0
-        self.centre = np.zeros(3)
-        self.radius = 0.0
-
-    def set_triangles(
-        self,
-        shape: GpuMesh,
-        bounds: tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
-        mesh: MeshBuffers,
-    ) -> None:
-        """Sets triangles, their bounds (m) and the vertices on the GPU; another mesh is another shape."""
-        low, high = bounds
-        self.centre, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
-        self._shape, self._mesh = shape, mesh
-        if self._is_traced and shape is not self._built:
-            self._begin()
-
-    @property
-    def bindings(self) -> dict[str, Binding]:
-        """The bindings of shaders/common/ray_mesh.glsl; brings the hierarchy up to date first."""
-        assert self._mesh is not None
-        if self._shape is not self._built:
-            self._begin()
-        if self._packed is not None:
-            nodes, faces = self._packed.result()
-            self._packed = None
-            self._nodes = bvh_texture(self._gpu, nodes, self._nodes)
-            self._faces = bvh_texture(self._gpu, faces, self._faces)
-        self._is_traced = True
-        return {"bvh_nodes": self._nodes, "bvh_faces": self._faces, **self._mesh.storage}
-
-    def _begin(self) -> None:
-        """Begins to bring the hierarchy up to date, after what was begun before."""
-        assert self._shape is not None
-        before, shape = self._packed, self._shape
-        self._built, self._is_traced = shape, False
-
-        def packed() -> tuple[bytes, bytes]:
-            if before is not None:
-                before.result()
-            bvh = self._renewed(shape.corners)
-            faces = bvh.packed_triangles(shape.vertices[:, :3], shape.triangles)
-            return bvh_rows(bvh.packed()), bvh_rows(faces)
-
-        self._packed = submit(packed)
-
-    def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
-        """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
-        bvh = self._bvh
-        if bvh is not None and len(bvh.order) == len(positions):
-            bvh = bvh.refitted(positions)
-            if bvh.cost <= WORN * self._fresh_cost:
-                return bvh
-        self._bvh = build_bvh(positions)
-        self._fresh_cost = self._bvh.cost
-        return self._bvh
-
-    def release(self) -> None:
-        """Frees the textures."""
-        release_all(self._nodes, self._faces)
 
 
 class MaterialTable:

@@ -11,7 +11,7 @@ from deltalight.render_server.gpu.list_groups import GROUP, LIST_HEADER_BYTES, L
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid, reuse_define
-from deltalight.render_server.passes.mesh_buffers import ObjectBvh
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.passes.shading import DirectLight
 
 # Of equal energy each: up to RAY_ROUGHNESS they are closer together than voxels. There the cone of the lobe is 48

@@ -15,7 +15,7 @@ from deltalight.render_server.gpu.textures import release_all, release_target, t
 from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.mesh_buffers import ObjectBvh
+from deltalight.render_server.passes.object_bvh import ObjectBvh
 from deltalight.render_server.view import CameraView
 
 NOTHING_KEPT: Bindings = {"keeps_unblocked": False}

@@ -35,24 +35,37 @@ class Bvh:
     skip: Int32[np.ndarray, " k"]
     order: Int32[np.ndarray, " m"]
 
-    def packed(self) -> bytes:
-        """Packs nodes as the shader's struct: low corner, leaf, high corner, skip (32 bytes)."""
+    def packed(self, first_node: int = 0, first_triangle: int = 0) -> Float32[np.ndarray, "k 8"]:
+        """Packs nodes as the shader's struct: low corner, leaf, high corner, skip (integers by their bits).
+
+        `first_node`, `first_triangle`: how many of others stand before these.
+        """
         rows = _box_rows(self.low, self.high)
-        rows.view(np.int32)[:, 3], rows.view(np.int32)[:, 7] = self.leaf, self.skip
-        return rows.tobytes()
+        bits = rows.view(np.int32)
+        bits[:, 3] = np.where(self.leaf < 0, self.leaf, self.leaf + (first_triangle << COUNT_BITS))
+        bits[:, 7] = self.skip + first_node
+        return rows
 
     def packed_triangles(
-        self, positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
-    ) -> bytes:
-        """Packs triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex."""
+        self,
+        positions: Float32[np.ndarray, "n 3"],
+        triangles: Int32[np.ndarray, "m 3"],
+        first_vertex: int = 0,
+        out: Float32[np.ndarray, "m 3 4"] | None = None,
+    ) -> Float32[np.ndarray, "m 3 4"]:
+        """Packs triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex.
+
+        `first_vertex`: how many vertices of others stand before these. `out`: where the triangles are to be packed.
+        """
         vertices = padded(positions)
-        vertices.view(np.int32)[:, 3] = np.arange(len(vertices))
-        rows = vertices.take(triangles.take(self.order, axis=0), axis=0)
+        vertices.view(np.int32)[:, 3] = np.arange(first_vertex, first_vertex + len(vertices))
+        # In its default mode, "raise", NumPy would gather into a copy first.
+        rows = vertices.take(triangles.take(self.order, axis=0), axis=0, out=out, mode="clip")
         for axis in range(3):  # one by one, as in `_box_rows`
             first, second, third = rows[:, :, axis].T
             second -= first
             third -= first
-        return rows.tobytes()
+        return rows
 
     @property
     def cost(self) -> float:

@@ -1,20 +1,13 @@
 """Meshes in other frames: what a change of place alone, as of dragged objects, leaves as it is, is kept."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol import short_axis
-from deltalight.render_server.scene.triangle_mesh import (
-    GpuMesh,
-    TriangleMesh,
-    merge_for_gpu,
-    turned_tangents,
-    write_columns,
-)
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, turned_tangents
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,30 +53,3 @@ def turned(mesh: TriangleMesh, linear: Float64[np.ndarray, "3 3"]) -> TurnedMesh
 def transformed(mesh: TriangleMesh, matrix: Float64[np.ndarray, "4 4"]) -> TriangleMesh:
     """Returns a mesh in another frame; a mirroring matrix reverses the winding."""
     return turned(mesh, matrix[:3, :3]).at(matrix[:3, 3])
-
-
-def merged_again(
-    merged: GpuMesh | None, before: Sequence[TriangleMesh], meshes: Sequence[TriangleMesh]
-) -> GpuMesh:
-    """Merges meshes as `merge_for_gpu` does, writing only what moved since those `before` were `merged`.
-
-    Raises:
-        DeltalightError: there is no mesh.
-    """
-    if merged is None or len(before) != len(meshes) or not all(map(_has_only_moved, meshes, before)):
-        return merge_for_gpu(meshes)
-    rows, first = merged.vertices.copy(), 0
-    for mesh, old in zip(meshes, before, strict=True):
-        own = rows[first : first + len(mesh.positions)]
-        if mesh.positions is not old.positions:
-            write_columns(own, 0, mesh.positions)
-        if mesh.normals is not old.normals:
-            write_columns(own, 3, mesh.normals)
-        first += len(own)
-    return replace(merged, vertices=rows)
-
-
-def _has_only_moved(mesh: TriangleMesh, old: TriangleMesh) -> bool:
-    """Whether nothing but positions and normals differs."""
-    kept = "triangles", "uv", "material", "colors", "second_uv", "opacity", "tangents"
-    return all(getattr(mesh, name) is getattr(old, name) for name in kept)

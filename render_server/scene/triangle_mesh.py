@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from deltalight.protocol import short_axis
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene.asset_check import MAX_TRIANGLES
-from deltalight.render_server.scene.material_tables import material_table
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.texture_maps import TextureMap
 
@@ -311,11 +310,11 @@ def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
         np.concatenate([part.positions for part in parts]),
         np.concatenate([part.normals for part in parts]),
         joined_triangles([part.triangles for part in parts], [len(part.positions) for part in parts]),
-        _joined_attribute([part.uv for part in parts], parts, 0.0),
+        joined_attribute([part.uv for part in parts], parts, 0.0),
         parts[0].material,
-        _joined_attribute([part.colors for part in parts], parts, 1.0),
-        _joined_attribute([part.second_uv for part in parts], parts, 0.0),
-        _joined_attribute([part.opacity for part in parts], parts, 1.0),
+        joined_attribute([part.colors for part in parts], parts, 1.0),
+        joined_attribute([part.second_uv for part in parts], parts, 0.0),
+        joined_attribute([part.opacity for part in parts], parts, 1.0),
         joined_tangents(parts),
     )
 
@@ -335,10 +334,10 @@ def joined_triangles(
 
 def joined_tangents(parts: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 4"] | None:
     """Concatenates tangents; zero for parts without; None if no part has any."""
-    return _joined_attribute([part.tangents for part in parts], parts, 0.0)
+    return joined_attribute([part.tangents for part in parts], parts, 0.0)
 
 
-def _joined_attribute(
+def joined_attribute(
     values: Sequence[np.ndarray | None], parts: Sequence[TriangleMesh], default: float
 ) -> np.ndarray | None:
     """Concatenates an attribute; parts without it get the default; None if no part has it."""
@@ -352,111 +351,10 @@ def _joined_attribute(
     return np.concatenate(filled)
 
 
-VERTEX_LAYOUT = "3f 3f 2f 3f 1f"
-CLEAR_FRACTION = 0.5  # beside the material's whole number, that of a vertex of opacity 0
-VERTEX_ATTRIBUTES = ("in_position", "in_normal", "in_uv", "in_color", "in_material")
-
-
-@dataclass(frozen=True, eq=False)
-class GpuMesh:
-    """Several meshes in one vertex buffer.
-
-    A row of `vertices` is position 3, normal 3, uv 2, colour 3, material index 1 (`VERTEX_LAYOUT`).
-    For `material_table` see `materials.material_table`. A row of `placement` is what maps need beside it: the second
-    uv 2, tangent 4, zero where there is none; None if no vertex has either.
-    """
-
-    vertices: Float32[np.ndarray, "n 12"]
-    triangles: Int32[np.ndarray, "m 3"]
-    materials: tuple[Material, ...]
-    material_table: Float32[np.ndarray, "k 20"]
-    placement: Float32[np.ndarray, "n 6"] | None
-
-    @cached_property
-    def corners(self) -> Float32[np.ndarray, "m 3 3"]:
-        """Positions of each triangle's corners."""
-        return np.asarray(padded(self.vertices[:, :3]).take(self.triangles, axis=0)[..., :3])
-
-    def repeats_per_m(self) -> Float32[np.ndarray, " k"]:
-        """Returns how often the base colour's map repeats over a metre of each material's triangles, on average."""
-        corners = self.vertices[self.triangles].astype(np.float64)
-        edges, turns = (corners[:, 1:, part] - corners[:, :1, part] for part in (slice(0, 3), slice(6, 8)))
-        material = corners[:, 0, 11].astype(int)
-        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-        sums = [
-            np.bincount(material, each, len(self.materials)) for each in (np.abs(np.linalg.det(turns)), area)
-        ]
-        scale = np.array([_map_area(each) for each in self.materials])
-        return np.sqrt(scale * sums[0] / np.maximum(sums[1], 1e-30)).astype(np.float32)
-
-    def mean_path_m(self, material: int) -> float:
-        """Returns the mean length of straight paths through a closed part of that material, 4 V / A (Cauchy 1841)."""
-        of_part = self.vertices[self.triangles[:, 0], 11].astype(int) == material
-        a, b, c = np.moveaxis(self.vertices[self.triangles[of_part], :3].astype(np.float64), 1, 0)
-        across = np.cross(b - a, c - a)
-        volume = abs(float(((a - a.mean(axis=0)) * across).sum())) / 6
-        return 4 * volume / max(float(np.linalg.norm(across, axis=1).sum()) / 2, 1e-30)
-
-
-def _map_area(material: Material) -> float:
-    """Returns the area of the base colour's map that a unit of texture coordinates covers."""
-    placed = material.base_color_map
-    return 1.0 if placed is None else abs(float(np.linalg.det(placed.from_uv[:, :2])))
-
-
 def bounds_of(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "2 3"]:
     """Returns the least and greatest coordinates of several meshes together."""
     each = np.stack([mesh.bounds() for mesh in meshes])
     return np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
-
-
-def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
-    """Merges meshes (each with its own material, in this order) into one interleaved buffer.
-
-    Raises:
-        DeltalightError: there is no mesh.
-    """
-    if not meshes:
-        raise DeltalightError("there is no mesh to draw; give the scene an object.")
-    materials = tuple(mesh.material for mesh in meshes)
-    return GpuMesh(
-        _interleaved(meshes),
-        joined_triangles([mesh.triangles for mesh in meshes], [len(mesh.positions) for mesh in meshes]),
-        materials,
-        material_table(materials),
-        _placement(meshes),
-    )
-
-
-def _placement(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 6"] | None:
-    second_uv = _joined_attribute([mesh.second_uv for mesh in meshes], meshes, 0.0)
-    tangents = joined_tangents(meshes)
-    if second_uv is None and tangents is None:
-        return None
-    rows = np.zeros((sum(len(mesh.positions) for mesh in meshes), 6), np.float32)
-    for columns, values in ((slice(0, 2), second_uv), (slice(2, 6), tangents)):
-        if values is not None:
-            rows[:, columns] = values
-    return rows
-
-
-def _interleaved(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "n 12"]:
-    """Returns the vertices of meshes as rows."""
-    ends = np.cumsum([len(mesh.positions) for mesh in meshes])
-    rows = np.empty((ends[-1], 12), np.float32)
-    for index, (mesh, end) in enumerate(zip(meshes, ends, strict=True)):
-        own = rows[end - len(mesh.positions) : end]
-        for first, values in ((0, mesh.positions), (3, mesh.normals), (6, mesh.uv), (8, mesh.colors)):
-            if values is not None:
-                write_columns(own, first, values)
-        if mesh.uv is None:
-            own[:, 6:8] = 0
-        if mesh.colors is None:
-            own[:, 8:11] = 1
-        own[:, 11] = index
-        if mesh.opacity is not None:
-            own[:, 11] += CLEAR_FRACTION * (1 - np.clip(mesh.opacity[:, 0], 0, 1))
-    return rows
 
 
 def padded(positions: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
@@ -464,9 +362,3 @@ def padded(positions: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
     rows = np.zeros((len(positions), 4), np.float32)
     rows[:, :3] = positions
     return rows
-
-
-def write_columns(rows: Float32[np.ndarray, "n 12"], first: int, values: Float32[np.ndarray, "n k"]) -> None:
-    """Writes k columns from `first` on; one by one, because NumPy is slow along short rows."""
-    for column, part in enumerate(values.T, first):
-        rows[:, column] = part

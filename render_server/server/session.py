@@ -35,6 +35,7 @@ from deltalight.render_server.server.cameras import RoomCameras, Taken
 from deltalight.render_server.server.frames import AssembledFrame, PairingSettings, SourceRequest
 from deltalight.render_server.server.renderer_interface import Pending, Renderer
 from deltalight.render_server.server.requests import PickRequest, RoomMeshRequest, WatchRequest
+from deltalight.render_server.server.scene_reader import SceneReader
 from deltalight.render_server.server.session_host import SessionHost, SessionIdentity
 from deltalight.render_server.server.snapshot import SnapshotRequest, take_snapshot
 
@@ -103,6 +104,7 @@ class RenderSession:
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.scene = scene
+        self._reader = SceneReader()
         self.scene_id: str | None = None
         self.instance = uuid.uuid4().hex
         self.counts: Counter[str] = Counter()
@@ -422,7 +424,7 @@ class RenderSession:
             document = {**document, "revision": request.revision}
         elif request.scene_id is None:
             document = {**document, "revision": self.scene.revision + 1}
-        return parse_scene(document)
+        return self._reader.read(document)
 
     def _use_scene(self, scene: SceneDocument, scene_id: str | None) -> dict[str, object]:
         self._renderer.set_scene(scene)

@@ -13,20 +13,18 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.passes.mesh_buffers import (
-    BVH_ROW_BYTES,
-    MeshBuffers,
-    ObjectBvh,
-    bvh_rows,
-    bvh_texture,
-)
+from deltalight.render_server.passes.mesh_buffers import MeshBuffers
+from deltalight.render_server.passes.object_bvh import BvhTextures, ObjectBvh
 from deltalight.render_server.scene.bvh import COUNT_BITS, LEAF_SIZE, ROUNDING, Bvh, RayCaster, build_bvh
+from deltalight.render_server.scene.bvh_forest import BvhForest, Forest, lone_tree
+from deltalight.render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu, merge_parts, merged_again
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 RAYS = 2048
 SHADER = Path(__file__).with_name("rays")
+MATERIAL = Material()
 UNREAD: Bindings = {
     "Vertices": None,
     "Materials": None,
@@ -52,11 +50,15 @@ def vertices_of(corners: np.ndarray) -> np.ndarray:
     return np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
 
 
-def mesh_of(corners: np.ndarray) -> GpuMesh:
+def triangle_mesh_of(corners: np.ndarray) -> TriangleMesh:
     """Each corner is a vertex of its own."""
     positions = corners.reshape(-1, 3)
-    triangles = vertices_of(corners)
-    return merge_for_gpu([TriangleMesh(positions, np.zeros_like(positions), triangles, None, Material())])
+    return TriangleMesh(positions, np.zeros_like(positions), vertices_of(corners), None, MATERIAL)
+
+
+def mesh_of(corners: np.ndarray) -> GpuMesh:
+    """Each corner is a vertex of its own."""
+    return merge_for_gpu([triangle_mesh_of(corners)])
 
 
 def random_rays(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -93,19 +95,26 @@ def traced(
 ) -> np.ndarray:
     """Rows of (distance, triangle, two barycentric coordinates)."""
     bvh = bvh or build_bvh(corners)
-    rows = np.zeros((len(origins), 2, 4), np.float32)
-    rows[:, 0, :3], rows[:, 1, :3] = origins, directions
-    faces = bvh.packed_triangles(corners.reshape(-1, 3), vertices_of(corners))
-    rays, hits = (gpu.ctx.buffer(content) for content in (rows.tobytes(), bytes(16 * len(origins))))
-    textures = [bvh_texture(gpu, bvh_rows(packed)) for packed in (bvh.packed(), faces)]
-    hierarchy = {"bvh_nodes": textures[0], "bvh_faces": textures[1]}
-    kernel = Kernel(gpu, SHADER)
-    kernel.run((len(origins),), UNREAD, hierarchy, Rays=rays, Hits=hits, count=len(origins))
-    found = np.frombuffer(hits.read(), np.float32).reshape(-1, 4).copy()
+    textures = BvhTextures(gpu)
+    textures.write(lone_tree(mesh_of(corners).parts[0], bvh))
+    found = hits_in(gpu, textures, origins, directions)
+    textures.release()
     met = found[:, 1] >= 0
     found[met, 1] = bvh.order[found[met, 1].astype(int)]
-    kernel.release()
-    release_all(rays, hits, *textures)
+    return found
+
+
+def hits_in(
+    gpu: GpuContext, textures: BvhTextures, origins: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """Rows of (distance, triangle in the order of the hierarchy, two barycentric coordinates)."""
+    rows = np.zeros((len(origins), 2, 4), np.float32)
+    rows[:, 0, :3], rows[:, 1, :3] = origins, directions
+    rays, hits = (gpu.ctx.buffer(content) for content in (rows.tobytes(), bytes(16 * len(origins))))
+    kernel = Kernel(gpu, SHADER)
+    kernel.run((len(origins),), UNREAD, textures.bindings, Rays=rays, Hits=hits, count=len(origins))
+    found = np.frombuffer(hits.read(), np.float32).reshape(-1, 4).copy()
+    release_all(kernel, rays, hits)
     return found
 
 
@@ -132,7 +141,7 @@ def test_what_lies_before_the_first_triangle_is_none(gpu: GpuContext) -> None:
     corners = soup(3000)
     bvh = build_bvh(corners)
     faces = bvh.packed_triangles(corners.reshape(-1, 3), vertices_of(corners))
-    packed = np.frombuffer(faces, np.float32).reshape(-1, 4)
+    packed = faces.reshape(-1, 4)
     corner, first_edge, second_edge = packed[1021:1024, :3]
     origins, _ = random_rays()
     share = np.random.default_rng(2).dirichlet((1, 1, 1), RAYS)[:, 1:]
@@ -183,10 +192,10 @@ def test_every_triangle_is_in_one_leaf_and_boxes_enclose_what_is_below(corners: 
 
 def test_same_triangles_give_the_same_bvh() -> None:
     one, other = build_bvh(soup(2000)), build_bvh(soup(2000))
-    assert one.packed() == other.packed()
+    assert one.packed().tobytes() == other.packed().tobytes()
     positions, triangles = soup(2000).reshape(-1, 3), vertices_of(soup(2000))
     packed = [bvh.packed_triangles(positions, triangles) for bvh in (one, other)]
-    assert packed[0] == packed[1]
+    assert packed[0].tobytes() == packed[1].tobytes()
 
 
 def test_packed_triangles_name_their_vertices() -> None:
@@ -194,7 +203,7 @@ def test_packed_triangles_name_their_vertices() -> None:
     vertices = np.random.default_rng(5).integers(0, 99, (50, 3)).astype(np.int32)
     corners = positions[vertices]
     bvh = build_bvh(corners)
-    rows = np.frombuffer(bvh.packed_triangles(positions, vertices), np.float32).reshape(50, 3, 4)
+    rows = bvh.packed_triangles(positions, vertices)
     np.testing.assert_array_equal(rows.view(np.int32)[:, :, 3], vertices[bvh.order])
     np.testing.assert_array_equal(rows[:, 0, :3], corners[bvh.order, 0])
     np.testing.assert_array_equal(rows[:, 1:, :3], (corners[:, 1:] - corners[:, :1])[bvh.order])
@@ -224,7 +233,7 @@ def test_a_refitted_bvh_is_the_built_one_and_finds_what_moved(gpu: GpuContext) -
     corners = torus()
     bvh = build_bvh(corners)
     same = bvh.refitted(corners)
-    assert (same.packed(), same.cost) == (bvh.packed(), bvh.cost)
+    assert (same.packed().tobytes(), same.cost) == (bvh.packed().tobytes(), bvh.cost)
     bent = corners + np.float32(0.3) * np.sin(4 * corners[..., [1, 2, 0]])
     moved = bvh.refitted(bent)
     assert moved.cost < 2 * build_bvh(bent).cost
@@ -262,10 +271,77 @@ def test_a_refitted_bvh_of_shuffled_triangles_is_worn(gpu: GpuContext) -> None:
         objects.set_triangles(mesh_of(each), bounds, mesh)
         nodes = objects.bindings["bvh_nodes"]
         assert isinstance(nodes, moderngl.Texture)
-        packed = build_bvh(each).packed()
+        packed = build_bvh(each).packed().tobytes()
         assert nodes.read()[: len(packed)] == packed
     objects.release()
     mesh.release()
+
+
+def cluster(number: int, offset: float = 0.0) -> np.ndarray:
+    """A small soup at a place of its own."""
+    place = np.random.default_rng(number).normal(size=3) + offset
+    return (0.2 * soup(200 + number, seed=number) + place).astype(np.float32)
+
+
+def assert_hits_are_closest(
+    hits: np.ndarray, corners: np.ndarray, rays: tuple[np.ndarray, np.ndarray]
+) -> None:
+    expected = brute_force(corners, *rays)
+    hit = hits[:, 1] >= 0
+    assert np.mean(hit != np.isfinite(expected)) < 0.002, "only rays along an edge may differ"
+    both = hit & np.isfinite(expected)
+    assert both.any()
+    np.testing.assert_allclose(hits[both, 0], expected[both], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [2, 5, 30])
+def test_rays_find_the_closest_triangle_of_several_parts(gpu: GpuContext, count: int) -> None:
+    """Also where one has moved far away since, where one is gone, and where one came."""
+    groups = [[triangle_mesh_of(cluster(number))] for number in range(count)]
+    moved = [*groups[:-1], [groups[-1][0].changed(positions=cluster(count - 1, 2.0).reshape(-1, 3))]]
+    first = merge_parts(groups)
+    meshes = first, merged_again(first, groups, moved), merge_parts(moved[1:]), merge_parts(moved)
+    forest, textures, rays = BvhForest(), BvhTextures(gpu), random_rays()
+    for mesh in meshes:
+        textures.write(forest.fitted_to(mesh.parts))
+        assert_hits_are_closest(hits_in(gpu, textures, *rays), mesh.corners, rays)
+    textures.release()
+
+
+def nodes_of(forest: Forest) -> np.ndarray:
+    """All nodes of a forest in their order, as they are packed."""
+    rows = np.full((forest.node_count, 8), np.nan, np.float32)
+    rows[forest.above_at] = forest.above
+    for tree in forest.trees:
+        own = tree.bvh.packed(tree.first_node, tree.part.first_triangle)
+        rows[tree.first_node : tree.first_node + len(own)] = own
+    return rows
+
+
+def test_boxes_of_a_forest_enclose_what_is_below_and_skip_it() -> None:
+    parts = merge_parts([[triangle_mesh_of(cluster(number))] for number in range(23)]).parts
+    rows = nodes_of(BvhForest().fitted_to(parts))
+    low, high, skip = rows[:, :3], rows[:, 4:7], rows.view(np.int32)[:, 7]
+    assert np.isfinite(low).all()
+    for node, after in enumerate(skip.tolist()):
+        assert node < after <= len(rows)
+        assert (low[node] <= low[node:after]).all()
+        assert (high[node] >= high[node:after]).all()
+    leaves = rows.view(np.int32)[:, 3]
+    held = [np.arange(leaf >> COUNT_BITS, (leaf >> COUNT_BITS) + (leaf & 7)) for leaf in leaves[leaves >= 0]]
+    total = sum(len(part.triangles) for part in parts)
+    np.testing.assert_array_equal(np.sort(np.concatenate(held)), np.arange(total))
+
+
+def test_parts_that_rest_keep_their_hierarchy() -> None:
+    groups = [[triangle_mesh_of(cluster(number))] for number in range(6)]
+    before = merge_parts(groups)
+    moved = [*groups[:2], [groups[2][0].changed(positions=cluster(2, 0.05).reshape(-1, 3))], *groups[3:]]
+    forest = BvhForest()
+    old = {tree.part: tree for tree in forest.fitted_to(before.parts).trees}
+    new = {tree.part: tree for tree in forest.fitted_to(merged_again(before, groups, moved).parts).trees}
+    assert len(new) == 6
+    assert len(set(old.values()) & set(new.values())) == 5
 
 
 RAY_PACKAGES = {"embreex": "embreex.mesh_construction", "igl": "igl.embree"}
@@ -304,15 +380,3 @@ def test_without_any_package_a_sentence_says_what_to_install(monkeypatch: pytest
     only("none", monkeypatch)
     with pytest.raises(DeltalightError, match="-m pip install embreex"):
         RayCaster(torus().reshape(-1, 3), vertices_of(torus()))
-
-
-@pytest.mark.parametrize(
-    "size", [0, 16, BVH_ROW_BYTES, BVH_ROW_BYTES + 1, 4 * BVH_ROW_BYTES, 8 * BVH_ROW_BYTES]
-)
-def test_textures_are_never_a_power_of_two_high(size: int) -> None:
-    """Else llvmpipe would compile all kernels that trace rays anew with an object more."""
-    padded = bvh_rows(b"x" * size)
-    rows, beyond = divmod(len(padded), BVH_ROW_BYTES)
-    assert beyond == 0
-    assert rows & (rows - 1)
-    assert padded == b"x" * size + bytes(len(padded) - size)

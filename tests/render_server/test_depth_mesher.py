@@ -17,7 +17,7 @@ from deltalight.render_server.passes.depth_mesh import DepthFrame, DepthMesher
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.real_geometry import EMPTY_MESH, RealGeometry
 from deltalight.render_server.scene.depth_mesh import BOUND_POINTS, bound_points, depth_mesh
-from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
+from deltalight.render_server.scene.gpu_mesh import merge_for_gpu
 from deltalight.render_server.view import CameraView
 from tests.render_server.test_real_surface import room, shown_normals
 from tests.render_server.test_scene_depth_mesh import LENS, NORMAL, PINHOLE, image, plane_depth

@@ -49,7 +49,9 @@ def test_balance_does_not_depend_on_the_factor_that_is_tried() -> None:
 
 
 def test_without_lit_pixels_the_balance_is_the_lights_own() -> None:
-    assert guessed_balance(*np.zeros((3, 100, 3)), np.array([1.0, 2.0, 4.0])).tolist() == [0.5, 1, 2]
+    nothing = np.zeros((100, 3))
+    balance = guessed_balance(nothing, nothing, nothing, np.array([1.0, 2.0, 4.0]))
+    assert balance.tolist() == [0.5, 1, 2]
 
 
 @pytest.mark.parametrize("mode", ["environment", "manual"])

@@ -8,7 +8,7 @@ import trimesh
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
-from deltalight.render_server.scene.triangle_mesh import GpuMesh
+from deltalight.render_server.scene.gpu_mesh import GpuMesh
 from tests.render_server.voxel_lab import gpu_mesh, solid_buffer
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -25,7 +25,8 @@ def held(buffers: MeshBuffers, mesh: GpuMesh) -> bool:
 def test_buffers_hold_each_mesh_that_is_written(gpu: GpuContext) -> None:
     """One that moved, one of other triangles or sides, one that needs more room, and one after a kernel wrote."""
     box = gpu_mesh(trimesh.creation.box())
-    moved = replace(box, vertices=box.vertices + np.float32(0.5))
+    (part,) = box.parts
+    moved = replace(box, parts=(replace(part, vertices=part.vertices + np.float32(0.5)),))
     turned = replace(moved, triangles=np.ascontiguousarray(moved.triangles[:, ::-1]))
     other_sides = box.material_table.copy()
     other_sides[:, 12] = 1 - other_sides[:, 12]

@@ -11,10 +11,11 @@ from PIL import Image
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Material as MaterialDocument
+from deltalight.render_server.scene.gpu_mesh import merge_for_gpu
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.texture_maps import TextureMap
-from deltalight.render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.scene.triangle_splitting import split_triangles
 
 CUBE_OBJ = """

@@ -12,8 +12,8 @@ from deltalight.render_server.real_geometry import COARSE_DIVISOR, RealGeometry
 from deltalight.render_server.scene import seen_depth, threads
 from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.scene.depth_surface import depth_surface
+from deltalight.render_server.scene.gpu_mesh import GpuMesh
 from deltalight.render_server.scene.threads import LEAST_BAND_ROWS, by_bands
-from deltalight.render_server.scene.triangle_mesh import GpuMesh
 from deltalight.render_server.view import CameraView, PosedFrame
 from tests.render_server.scenes import checkered, depth_image, floor_depth, frame, look_at
 

@@ -22,8 +22,8 @@ from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, BOUND_POINTS, stride_for_budget
 from deltalight.render_server.scene.depth_surface import depth_surface
 from deltalight.render_server.scene.depth_views import PosedSurface
+from deltalight.render_server.scene.gpu_mesh import merge_for_gpu
 from deltalight.render_server.scene.seen_depth import SeenDepth
-from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
 from deltalight.render_server.view import CameraView, PosedFrame
 from tests.render_server.scenes import Stage, look_at, psnr_db
 from tests.render_server.test_depth_mesher import by_corners

@@ -35,12 +35,9 @@ from deltalight.render_server.passes.voxels import (
     VoxelStore,
 )
 from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
+from deltalight.render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.triangle_mesh import (
-    GpuMesh,
-    TriangleMesh,
-    merge_for_gpu,
-)
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.render_server.scene.triangle_splitting import split_triangles
 from tests.render_server.voxel_lab import VoxelLab, gpu_mesh
 

@@ -24,8 +24,9 @@ from deltalight.render_server.passes.voxels import (
     VoxelMipmap,
     VoxelStore,
 )
+from deltalight.render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from deltalight.render_server.scene.materials import Material
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu, smooth_normals
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, smooth_normals
 
 
 def gpu_mesh(mesh: trimesh.Trimesh, radiance: float = 0.0, *, inside_out: bool = False) -> GpuMesh:

@@ -17,7 +17,7 @@ uniform sampler2D grazing_depth;   // 1/m, of surfaces too oblique to measure; 0
 uniform ivec2 node_strides;        // pixels
 uniform mat4 world_from_camera;
 layout(rgba32f) writeonly uniform image2D nodes_out;   // 1/m, 0 for a hole; 1/m; 1 if another camera shows it larger
-layout(std430) writeonly buffer Vertices { float vertices[]; };   // VERTEX_FLOATS each (scene/triangle_mesh.py)
+layout(std430) writeonly buffer Vertices { float vertices[]; };   // VERTEX_FLOATS each (scene/gpu_mesh.py)
 
 const int CELL_SAMPLES = 6, MOST_SAMPLES = CELL_SAMPLES * CELL_SAMPLES;
 const uint VERTEX_FLOATS = 12u;

@@ -241,7 +241,7 @@ Material material_of(int index, vec2 uv, vec3 tint, float size) {
     return m;
 }
 
-// Vertices hold their opacity beside the material's number, as a fraction (scene/triangle_mesh.py).
+// Vertices hold their opacity beside the material's number, as a fraction (scene/gpu_mesh.py).
 float opacity_of_vertices(float clear) { return 1.0 - 2.0 * clear; }
 
 // Maps of a mask hold coverage already, unless vertices' alpha multiplies them: then this makes it, one half at the cutoff.

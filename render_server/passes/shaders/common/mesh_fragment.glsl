@@ -3,7 +3,7 @@
 #include "common/solid_mesh.glsl"
 #include "common/plane.glsl"
 #ifdef MATERIAL_MAPS
-// Of the vertices, none of meshes without: second texture coordinate, tangent (scene/triangle_mesh.py).
+// Of the vertices, none of meshes without: second texture coordinate, tangent (scene/gpu_mesh.py).
 layout(std430) readonly buffer MapPlacement { float placement[]; };
 const uint PLACEMENT_FLOATS = 6u;
 #endif

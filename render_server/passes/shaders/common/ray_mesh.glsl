@@ -11,7 +11,7 @@ struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first trian
 // Of textures, because software renderers load buffers lane by lane, number by number. Their bits are floats and integers.
 layout(rgba32ui) readonly uniform uimage2D bvh_nodes;   // 2 texels a node, in rows one after the other
 layout(rgba32ui) readonly uniform uimage2D bvh_faces;   // 3 a triangle: corner, 2 edges; w: rows of vertices
-layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/triangle_mesh.py)
+layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/gpu_mesh.py)
 
 const int VERTEX_FLOATS = 12;
 const int BVH_WIDTH = 1024;   // texels of a row

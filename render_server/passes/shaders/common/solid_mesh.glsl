@@ -2,7 +2,7 @@
 struct Corner { vec3 place; vec2 uv; vec4 tint; };   // tint: colour, opacity
 struct Piece { Corner a; Corner b; Corner c; };   // of a triangle, or all of it
 
-layout(std430) readonly buffer Vertices { float vertices[]; };   // VERTEX_FLOATS each (scene/triangle_mesh.py)
+layout(std430) readonly buffer Vertices { float vertices[]; };   // VERTEX_FLOATS each (scene/gpu_mesh.py)
 layout(std430) readonly buffer Indices { uint indices[]; };      // three a triangle
 
 const uint VERTEX_FLOATS = 12u;
@@ -12,7 +12,7 @@ vec3 vertex_vector(uint i) { return vec3(vertices[i], vertices[i + 1u], vertices
 
 Corner corner_at(uint vertex) {
     uint i = vertex * VERTEX_FLOATS;
-    // A fraction beside the material's number (scene/triangle_mesh.py), 0 where vertices are opaque.
+    // A fraction beside the material's number (scene/gpu_mesh.py), 0 where vertices are opaque.
     float opacity = 1.0 - 2.0 * fract(vertices[i + 11u]);
     return Corner(vertex_vector(i), vec2(vertices[i + 6u], vertices[i + 7u]), vec4(vertex_vector(i + 8u), opacity));
 }
