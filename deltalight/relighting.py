@@ -1,6 +1,6 @@
 """Relighting of frames in this process: no servers, no sockets."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -136,7 +136,7 @@ class Renderer:
         """
         return self.render_views([frame], scene)[0]
 
-    def render_views(self, frames: Sequence[ViewFrame], scene: Scene | SceneDocument) -> list[RelitPicture]:
+    def render_views(self, frames: Iterable[ViewFrame], scene: Scene | SceneDocument) -> list[RelitPicture]:
         """Relights one frame of each of several cameras in one room, all of one moment; returns their pictures.
 
         The cameras' poses must be of the same board. They share one real scene and its light: what one camera sees

@@ -1,7 +1,7 @@
 """Cameras: intrinsics, lens distortion, rays and projection, and their ROS camera_info files."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -43,12 +43,11 @@ class CameraModel:
     height: int
     matrix: Float64[np.ndarray, "3 3"]
     distortion_model: DistortionModel = "plumb_bob"
-    distortion: Float64[np.ndarray, " k"] | None = None
+    distortion: Float64[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        coefficients = np.zeros(0) if self.distortion is None else self.distortion
         object.__setattr__(self, "matrix", _frozen_array(self.matrix, "the camera matrix"))
-        object.__setattr__(self, "distortion", _frozen_array(coefficients, "the distortion"))
+        object.__setattr__(self, "distortion", _frozen_array(self.distortion, "the distortion"))
         self._check()
 
     def _check(self) -> None:
@@ -70,9 +69,9 @@ class CameraModel:
             raise DeltalightError(
                 f"the distortion model `{self.distortion_model:.60}` is unknown; use {known}."
             )
-        if self._coefficients.shape not in {(length,) for length in lengths}:
+        if self.distortion.shape not in {(length,) for length in lengths}:
             raise DeltalightError(
-                f"{self.distortion_model} has no form of {self._coefficients.size} coefficients; "
+                f"{self.distortion_model} has no form of {self.distortion.size} coefficients; "
                 f"give one of {lengths}."
             )
 
@@ -86,18 +85,13 @@ class CameraModel:
     @cached_property
     def _values(self) -> tuple[int | float | str, ...]:
         """All that tells cameras apart."""
-        numbers = (*self.matrix.ravel().tolist(), *self._coefficients.tolist())
+        numbers = (*self.matrix.ravel().tolist(), *self.distortion.tolist())
         return (self.width, self.height, self.distortion_model, *numbers)
-
-    @property
-    def _coefficients(self) -> Float64[np.ndarray, " k"]:
-        assert self.distortion is not None  # set in __post_init__
-        return self.distortion
 
     @cached_property
     def has_distortion(self) -> bool:
         """Whether rays differ from a pinhole's (`equidistant` with zeros is still a fish-eye)."""
-        return self.distortion_model == "equidistant" or bool(self._coefficients.any())
+        return self.distortion_model == "equidistant" or bool(self.distortion.any())
 
     def rays(self) -> Float32[np.ndarray, "h w 2"]:
         """Returns (x/z, y/z) of the ray through every pixel centre, by the full lens model.
@@ -147,10 +141,10 @@ class CameraModel:
             cv2, "undistortPointsIter"
         ):  # OpenCV 4 takes the termination criteria in a separate function
             rays = cv2.undistortPointsIter(
-                points, self.matrix, self._coefficients, np.eye(3), np.eye(3), _CRITERIA
+                points, self.matrix, self.distortion, np.eye(3), np.eye(3), _CRITERIA
             )
         else:
-            rays = cv2.undistortPoints(points, self.matrix, self._coefficients, criteria=_CRITERIA)
+            rays = cv2.undistortPoints(points, self.matrix, self.distortion, criteria=_CRITERIA)
         return np.asarray(rays, np.float64).reshape(-1, 2)
 
     def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
@@ -175,12 +169,12 @@ class CameraModel:
         if self.distortion_model == "equidistant":
             pixels, _ = cv2.fisheye.projectPoints(shaped, zero, zero, self.matrix, self._fisheye_coefficients)
         else:
-            pixels, _ = cv2.projectPoints(shaped, zero, zero, self.matrix, self._coefficients)
+            pixels, _ = cv2.projectPoints(shaped, zero, zero, self.matrix, self.distortion)
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
     @property
     def _fisheye_coefficients(self) -> Float64[np.ndarray, "4"]:
-        return self._coefficients if self._coefficients.size else np.zeros(4)
+        return self.distortion if self.distortion.size else np.zeros(4)
 
     def resized(self, width: int, height: int) -> "CameraModel":
         """Returns the camera of the same picture resampled to another size (pixel centres stay correct)."""
@@ -188,7 +182,7 @@ class CameraModel:
         matrix = self.matrix.copy()
         matrix[[0, 1], [0, 1]] *= scale
         matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
-        return CameraModel(width, height, matrix, self.distortion_model, self._coefficients)
+        return CameraModel(width, height, matrix, self.distortion_model, self.distortion)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values that msgpack, JSON and YAML can hold."""
@@ -197,7 +191,7 @@ class CameraModel:
             "height": self.height,
             "matrix": self.matrix.ravel().tolist(),
             "distortion_model": self.distortion_model,
-            "distortion": self._coefficients.tolist(),
+            "distortion": self.distortion.tolist(),
         }
 
     @classmethod

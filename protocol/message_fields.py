@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float64
 from pydantic import AfterValidator, Field, StringConstraints
 
 from deltalight.protocol.documents import NAME_PATTERN
@@ -118,6 +119,7 @@ Strengths = Annotated[tuple[Strength, Strength, Strength], Field(strict=False)]
 ResidualSize = Annotated[int, Field(ge=4, le=512, strict=True), AfterValidator(_power_of_two)]
 TexelEdge = Annotated[int, Field(ge=0, le=MAX_EDGE_PX, strict=True)]
 Rectangle = Annotated[tuple[TexelEdge, TexelEdge, TexelEdge, TexelEdge], Field(strict=False)]
+
 RegionEdges = Annotated[Rectangle, AfterValidator(_rectangle)]
 Channels = Annotated[int, Field(ge=3, le=3, strict=True)]
 PictureShape = Annotated[tuple[Edge, Edge, Channels], Field(strict=False)]
@@ -127,3 +129,9 @@ LightList = Annotated[tuple[PlainDict, ...], Field(strict=False, max_length=MAX_
 Durations = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e7)]], Field(max_length=MAX_LABELS)]
 Counts = Annotated[dict[Label, Count], Field(max_length=MAX_LABELS)]
 Rates = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e6)]], Field(max_length=MAX_LABELS)]
+
+
+def matrix_rows(matrix: Float64[np.ndarray, "4 4"]) -> Matrix4:
+    """Returns the rows of a matrix, as a message holds them."""
+    first, second, third, fourth = ((float(a), float(b), float(c), float(d)) for a, b, c, d in matrix)
+    return first, second, third, fourth

@@ -191,8 +191,8 @@ class FisheyeLights(LightCut):
     distance_m: Distance = Field(
         default="auto",
         description="Distance of the lights from the fish-eye camera, metres; `far` = distant like the sun; "
-        "`auto` = from the falloff of light over the board's paper, else from shading and shadows; far if neither "
-        "tells.",
+        "`auto` = from the falloff of light over the board's paper and from shading and shadows, which may tell "
+        "each lamp's own; far if neither tells.",
     )
 
     @property

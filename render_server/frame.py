@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deltalight.protocol.frames import DepthImage, ViewFrame
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.uniform_block import UniformBlock
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.passes.camera_image import CameraImage

@@ -20,11 +20,11 @@ from deltalight.render_server.frame import (
     declare_frame,
     join_measurements,
 )
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.gpu.timers import PassTimers
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.registry import MethodChoice

@@ -23,10 +23,10 @@ from deltalight.render_server.frame_graph import (
     FrameInputs,
 )
 from deltalight.render_server.frame_graph_pool import FrameGraphPool
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.timers import PassTimers
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.methods.registry import MethodChoice, MethodChooser
 from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.shadow_maps import most_maps_bytes

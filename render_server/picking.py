@@ -10,8 +10,8 @@ from jaxtyping import Float64, Int64
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.render_server.frame_graph import ShownBuffers
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.gpu.textures import read_texel
-from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.scene.bvh import first_hit
 from deltalight.render_server.scene.depth_surface import depth_surface
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh

@@ -10,8 +10,8 @@ from jaxtyping import Float64
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import ModelGeometry, RealScene
 from deltalight.render_server.camera_history import CameraHistory
+from deltalight.render_server.geometry_state import ChooseBacks, DrawnMesh, GeometryState
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import ChooseBacks, DrawnMesh, GeometryState
 from deltalight.render_server.passes.depth_mesh import DepthFrame, DepthMesher
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.passes.voxelize import Chosen

@@ -12,8 +12,8 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import Animation, AnyMaterial, SceneObject
 from deltalight.protocol.scene_objects import Material as MaterialDocument
+from deltalight.render_server.geometry_state import DrawnMesh, GeometryState, ObjectExtent, PlacedObject
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import DrawnMesh, GeometryState, ObjectExtent, PlacedObject
 from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.passes.mesh_buffers import MaterialTable, MeshBuffers
 from deltalight.render_server.scene.gaussian_brdf import GaussianBrdf

@@ -6,7 +6,6 @@ from functools import lru_cache
 from typing import Literal, TypedDict
 
 import numpy as np
-from jaxtyping import Float64
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.codecs import encode_array, encode_color, encode_depth
@@ -20,7 +19,7 @@ from deltalight.protocol.frames import (
     RadianceMap,
     SensorFrame,
 )
-from deltalight.protocol.message_fields import Matrix4
+from deltalight.protocol.message_fields import matrix_rows
 from deltalight.protocol.messages import (
     ColorMessage,
     DepthMessage,
@@ -83,8 +82,8 @@ def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stam
     message = PoseMessage(
         **stamps,
         status="ok",
-        world_from_camera=_rows(pose.world_from_camera),
-        alternative=None if pose.alternative is None else _rows(pose.alternative),
+        world_from_camera=matrix_rows(pose.world_from_camera),
+        alternative=None if pose.alternative is None else matrix_rows(pose.alternative),
         reprojection_error_px=pose.reprojection_error_px,
         board=described,
     )
@@ -166,7 +165,7 @@ def radiance_multipart(radiance: RadianceMap, stamps: Stamps, jpeg_quality: int)
         size=len(radiance.radiance),
         picture_shape=(height, width, 3),
         clipped_share=float(radiance.clipped_share),
-        world_from_fisheye=_rows(radiance.world_from_fisheye),
+        world_from_fisheye=matrix_rows(radiance.world_from_fisheye),
         camera=camera,
         has_response=response is not None,
     )
@@ -190,7 +189,7 @@ def lights_multipart(sky: SkyLights, stamps: Stamps, radiance: Stamps) -> list[b
         size=len(sky.residual),
         radiance_frame_id=radiance["frame_id"],
         radiance_capture_ns=radiance["capture_ns"],
-        world_from_fisheye=_rows(sky.world_from_fisheye),
+        world_from_fisheye=matrix_rows(sky.world_from_fisheye),
         lights=tuple(map(_light_entry, sky.lights)),
         regions=tuple((each.top, each.bottom, each.left, each.right) for each in sky.regions),
     )
@@ -211,11 +210,7 @@ def _light_entry(light: TrackedLight) -> LightEntry:
 def lamps_multipart(lamps: Sequence[LampPose], stamps: Stamps) -> list[bytes]:
     """Returns the message of the lamps that one colour frame shows."""
     entries = (
-        LampEntry(marker=int(lamp.marker), world_from_marker=_rows(lamp.world_from_marker)) for lamp in lamps
+        LampEntry(marker=int(lamp.marker), world_from_marker=matrix_rows(lamp.world_from_marker))
+        for lamp in lamps
     )
     return encode(LampsMessage(**stamps, lamps=tuple(entries)))
-
-
-def _rows(matrix: Float64[np.ndarray, "4 4"]) -> Matrix4:
-    first, second, third, fourth = (tuple(float(value) for value in row) for row in matrix)
-    return first, second, third, fourth  # type: ignore[return-value]  # four of four each

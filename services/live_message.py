@@ -59,7 +59,9 @@ class PictureHeader(BaseModel):
     lights: list[dict[str, Any]] = Field(description="Lights used for the picture.")
     camera: LiveCamera = Field(description="Matrix that projects points in camera space onto this picture.")
     world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null if there is no pose.")
-    node: str | None = Field(None, description="Node of the camera, if the room has several; else null.")
+    node: str | None = Field(
+        default=None, description="Node of the camera, if the room has several; else null."
+    )
     view: ShownView = Field(
         description="View in the picture: the requested one, or the scene's own until the first picture of that "
         "view."

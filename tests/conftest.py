@@ -144,7 +144,7 @@ def shared_context() -> Iterator["GpuContext"]:
 @pytest.fixture(scope="module")
 def gpu(shared_context: "GpuContext") -> "GpuContext":
     gc.collect()  # frees contexts that other modules left now, and not in the middle of a test: that is a GL error
-    shared_context.ctx.__enter__()  # other modules make contexts of their own, which are current then
+    shared_context.ctx.__enter__()  # type: ignore[no-untyped-call]  # other modules' contexts may be current
     return shared_context
 
 

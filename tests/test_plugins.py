@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +22,7 @@ from deltalight.protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneM
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods import registry
-from deltalight.render_server.methods.method import RelightingMethod
+from deltalight.render_server.methods.method import SOFTWARE_DEFAULTS, RelightingMethod
 from deltalight.render_server.methods.surface_shading import Layers
 from deltalight.sensor_node.cameras.discovery import discover
 from deltalight.sensor_node.cameras.drivers import driver_plugins
@@ -372,7 +373,7 @@ def test_a_method_that_cannot_declare_its_stages_is_named(
     broken = InstalledMethod(direct.plugin, direct.settings, RelightingMethod(direct.settings, declare))
     monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": broken}, {}))
     choice = registry.choose_method(direct.settings(), software=True)
-    assert choice.resolved == registry.SOFTWARE_DEFAULTS
+    assert choice.resolved == SOFTWARE_DEFAULTS
     nothing = cast(Any, None)
     with pytest.raises(DeltalightError, match=r"`direct` of package direct-light 1\.0 .*no module of mine"):
         choice.declare(Graph(nothing), nothing, nothing)
@@ -397,6 +398,11 @@ def test_a_method_that_cannot_declare_its_stages_is_named(
         registry.choose_method(direct.settings(), software=True)
 
 
+def layers_of(made: Any) -> Layers:  # noqa: ANN401
+    """One resource in the place of each that a method must declare."""
+    return Layers(made, made, made, made, made, made, made, made, made)
+
+
 def test_a_stage_that_fails_is_named_with_its_plugin(
     install: Install, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -407,7 +413,7 @@ def test_a_stage_that_fails_is_named_with_its_plugin(
         raise ValueError("too thin")
 
     def declare(graph: Graph, *_: object) -> Any:  # noqa: ANN401
-        return Layers(*[graph.stage("fog", fail)] * 9)
+        return layers_of(graph.stage("fog", fail))
 
     weak = InstalledMethod(direct.plugin, direct.settings, RelightingMethod(direct.settings, declare))
     monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": weak}, {}))
@@ -443,7 +449,7 @@ def test_what_a_plugin_does_with_objects_and_transparency_is_blamed_on_it(
     said = r"`direct` of package direct-light 1\.0 .*\(KeyError: 'mesh'\)"
     with pytest.raises(DeltalightError, match=said):
         choice.require([SceneObject(asset="cube.ply")])
-    layers = Layers(*[nothing] * 9, transmit=fail)
+    layers = replace(layers_of(nothing), transmit=fail)
     with pytest.raises(DeltalightError, match=said):
         choice.shaded(Graph(nothing), nothing, layers, (4, 4), nothing)
 
@@ -453,17 +459,15 @@ Stages = Callable[[Graph], Layers]
 
 def wrong_value(graph: Graph) -> Layers:
     made: Any = graph.stage("fog", dict)
-    return Layers(*[graph.source(str(number), "world") for number in range(8)], made)
+    return replace(layers_of(graph.source("other", "world")), lights=made)
 
 
 def wrong_count(graph: Graph) -> Layers:
-    made: Any = graph.stages("fog", dict, outputs=("fog near", "fog far"))[0]
-    return Layers(*[made] * 9)
+    return layers_of(graph.stages("fog", dict, outputs=("fog near", "fog far"))[0])
 
 
 def unwritten_input(graph: Graph) -> Layers:
-    made: Any = graph.stage("fog", dict, "wind")
-    return Layers(*[made] * 9)
+    return layers_of(graph.stage("fog", dict, "wind"))
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,10 @@
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -181,7 +183,7 @@ def test_objects_are_named_changed_and_saved(scene: dl.Scene, cube: Path, tmp_pa
 def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) -> None:
     bag = tmp_path / "desk.bag"
     bag.touch()
-    cases = {
+    cases: dict[str, Callable[[], object]] = {
         "no object `cup`; it has: ": lambda: scene.move("cup", to=(0, 0, 0)),
         "does not exist; correct the path": lambda: scene.add(tmp_path / "cup.glb"),
         "has an object `knot` already": lambda: scene.add(cube, name="knot"),
@@ -197,7 +199,7 @@ def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) 
         "'fast' is not a quality; use one of live, balanced, best": lambda: dl.Renderer(quality="fast"),  # type: ignore[arg-type]
         r"the object `cube`: the key `pose.translation_m\[2\]` is missing": lambda: scene.add(
             cube, at=(1, 2)
-        ),  # type: ignore[arg-type]
+        ),
         "`pose.scale` is wrong: input should be greater than 0": lambda: scene.add(cube, scale=0),
         "unknown key `colour`": lambda: scene.change("knot", colour="red"),
         "the nearest known key is `volume_size`": lambda: scene.document.replaced(
@@ -289,11 +291,12 @@ def test_frames_of_a_programs_own_are_checked(take: dl.Take, scene: dl.Scene) ->
             dl.DeltalightError, match=r"A list with a frame of each camera .* write `\[frame\]`"
         ):
             renderer.render_views(frame, scene)  # type: ignore[arg-type]
-        for no_scene in (None, "scene.json", {"objects": []}):
+        no_scenes: tuple[Any, ...] = (None, "scene.json", {"objects": []})
+        for no_scene in no_scenes:
             with pytest.raises(
                 dl.DeltalightError, match=r"A scene is needed and .* load one with `Scene.load`"
             ):
-                renderer.render(frame, no_scene)  # type: ignore[arg-type]
+                renderer.render(frame, no_scene)
         (after,) = renderer.render_views((each for each in take[:1]), scene)
     assert (after.color == before.color).all()
     assert repr(frame) == "<ViewFrame 0, 640x480, pose, depth>"

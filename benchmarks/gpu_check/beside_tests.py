@@ -74,7 +74,7 @@ def compare_picture(gpu: "GpuContext", case: Any, folder: Path) -> ComparedPictu
     return ComparedPicture(str(case), picture, golden, psnr_db, scenes.LEAST_PSNR_DB)
 
 
-def _module(name: str) -> Any:  # noqa: ANN401 (of the tests, which mypy does not check)
+def _module(name: str) -> Any:  # noqa: ANN401 (a module of the tests, which a wheel lacks)
     require_tests()
     return importlib.import_module(f"tests.render_server.{name}")
 

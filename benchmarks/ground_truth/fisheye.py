@@ -46,7 +46,7 @@ def fisheye_sensor(camera: CameraModel, world_from_camera: Float[np.ndarray, "4 
     """
     import mitsuba as mi
 
-    if camera.distortion is not None and camera.distortion.any():
+    if camera.distortion.any():
         raise DeltalightError("the rendered fish-eye lens is exactly equidistant; give zeros as distortion.")
     _register(mi.variant())
     fx, fy, cx, cy = (float(v) for v in camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])

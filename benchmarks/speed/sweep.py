@@ -127,19 +127,19 @@ SWEEPS = (
     Sweep(
         "Image-based shading by picture, 40 samples ([D] 4.2)",
         "camera",
-        {"shading": ("ambient occlusion", "image-based surface")},
+        {"shading": ("ambient occlusion", "image-based radiance")},
         tuple(_pictures("image_based", (1.3, 6.1, 14.4))),
     ),
     Sweep(
         "Shading by precomputed transfer by picture ([D] table 4.1)",
         "camera",
-        {"shading": ("transferred light", "precomputed surface")},
+        {"shading": ("transferred light", "precomputed radiance")},
         tuple(_pictures("precomputed", (0.02, 0.021, 0.04))),
     ),
     Sweep(
         "Image-based shading by samples, 1280x720 ([D] figure 4.5)",
         "camera",
-        {"shading": ("image-based surface",)},
+        {"shading": ("image-based radiance",)},
         tuple(_samples()),
     ),
     Sweep(

@@ -56,6 +56,7 @@ class LightEstimator:
         self._notify = notify
         self._has_tracked_lamps = settings.mode == "tracked"
         self._wants_registration = settings.resolved_registration == "auto"
+        self._guesses_balance = settings.mode in ("fisheye", "environment")
         given = settings.mode in ("manual", "tracked") and not self._wants_registration
         self._wants_unseen = given and settings.surroundings == "auto"
         self._wants_ground = self._wants_unseen or settings.mode == "fisheye"
@@ -161,7 +162,7 @@ class LightEstimator:
 
     def _register(self, graph: FrameGraph, raw: LightSet) -> None:
         """Registers the lights on this frame and averages the result with earlier ones."""
-        found = register_lights(graph, raw, self._factor)
+        found = register_lights(graph, raw, self._factor, guesses_balance=self._guesses_balance)
         if self._factor is None:
             factor = ", ".join(f"{value:.3g}" for value in found.factor)
             fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"

@@ -1,4 +1,4 @@
-"""The lights' common factor, found from the picture (docs/method.md 1.4)."""
+"""The factor on all lights, found from the picture (docs/method.md 1.4)."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -7,17 +7,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
 from deltalight.protocol.frames import LUMINANCE
-from deltalight.render_server.estimation.samples import bounced_light, sample_light
+from deltalight.render_server.estimation.samples import LightSamples, bounced_light, sample_light
 from deltalight.render_server.frame_graph import FrameGraph
 from deltalight.render_server.lights.light_models import DirectionalLight
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import solid_angle_mean
-from deltalight.render_server.scene.albedo import MIN_PIXELS
+from deltalight.render_server.scene.albedo import ALBEDO_RANGE, MIN_PIXELS
 
 OUTLIER_DEVIATIONS = 3.0
 MIN_IRRADIANCE = 1e-4
 MIN_OPEN_FRACTION = 0.05  # of the hemisphere that must be open: below, noise of the paper dominates
-MAX_ALBEDO = 0.95
 PERCENTILE = 99.0
 # Relative misfit from which users are warned: people notice unexplained differences of a few per cent within one
 # surface.
@@ -122,13 +121,44 @@ def registration_from_albedo_percentile(
     so the percentile of the factors that give each pixel an albedo of 0.95 is the factor sought.
     """
     light = np.asarray(light_irradiance, np.float64) @ LUMINANCE
-    wanted = np.pi / MAX_ALBEDO * (np.asarray(measured, np.float64) @ LUMINANCE)
+    wanted = np.pi / ALBEDO_RANGE[1] * (np.asarray(measured, np.float64) @ LUMINANCE)
     rest = wanted - np.asarray(bounce_irradiance, np.float64) @ LUMINANCE
     usable = np.isfinite(rest) & (light > MIN_IRRADIANCE)
     if np.count_nonzero(usable) < MIN_PIXELS:
         return Registration(np.ones(3, np.float32), "given", None, _NOTHING_SEEN)
     factor = max(float(np.percentile(rest[usable] / light[usable], PERCENTILE)), MIN_IRRADIANCE)
-    return Registration(np.full(3, factor, np.float32), "percentile", None, _NO_PATCH)
+    return Registration(
+        np.full(3, factor, np.float32),
+        "percentile",
+        None,
+        _NO_PATCH.format("colour is not matched to the picture"),
+    )
+
+
+def guessed_balance(
+    measured: Float[np.ndarray, "k 3"],
+    light_irradiance: Float[np.ndarray, "k 3"],
+    bounce_irradiance: Float[np.ndarray, "k 3"],
+    own: Float[np.ndarray, "3"],
+) -> Float64[np.ndarray, "3"]:
+    """Estimates the lights' white balance: factors R G B, with G = 1 (docs/method.md 1.4).
+
+    Each ratio is the median of three guesses: `own`, which leaves the lights as they were given; the balance under
+    which their light is white, as if the camera had balanced its picture; and that under which the 99th percentile
+    of albedo is the same in all channels, as if the brightest surfaces were white. The pixels must be as for
+    `registration_from_albedo_percentile`; where they tell nothing, it is `own`.
+    """
+    light = np.asarray(light_irradiance, np.float64)
+    rest = np.pi / ALBEDO_RANGE[1] * np.asarray(measured, np.float64) - np.asarray(
+        bounce_irradiance, np.float64
+    )
+    usable = np.isfinite(rest).all(axis=1) & (light > MIN_IRRADIANCE).all(axis=1)
+    guesses = [np.asarray(own, np.float64)]
+    if np.count_nonzero(usable) >= MIN_PIXELS:
+        light, rest = light[usable], rest[usable]
+        brightest = np.percentile(rest / light, PERCENTILE, axis=0)
+        guesses += [1 / light.mean(axis=0), np.maximum(brightest, MIN_IRRADIANCE)]
+    return np.asarray(np.median([each / each[1] for each in guesses], axis=0))
 
 
 _POOR_FIT = (
@@ -137,7 +167,7 @@ _POOR_FIT = (
 )
 _NO_PATCH = (
     "No white paper of the marker board was usable, so the lights' scale comes from the brightest real "
-    "surface, taken to have albedo 0.95, and their colour is not matched to the picture: if objects are too bright, "
+    "surface, taken to have albedo 0.95, and their {}: if objects are too bright, "
     "too dark or tinted, show the board's paper unclipped, or set lights.registration."
 )
 _NOTHING_SEEN = (
@@ -170,26 +200,33 @@ class RegistrationAverage:
 
 
 def register_lights(
-    graph: FrameGraph, lights: LightSet, estimate: Float32[np.ndarray, "3"] | None = None
+    graph: FrameGraph,
+    lights: LightSet,
+    estimate: Float32[np.ndarray, "3"] | None = None,
+    *,
+    guesses_balance: bool,
 ) -> Registration:
     """Estimates a factor R G B on all lights: from white paper and grey cards, else from the brightest albedo.
 
     `lights` are not registered yet. Light that visible real surfaces reflect is measured, so it is in camera units
     already; what the others reflect is in those of the lights. So a factor is tried before another is found, until
-    they agree; an `estimate` from earlier frames is tried once.
+    they agree; an `estimate` from earlier frames is tried once. `guesses_balance`: the lights' white balance is
+    another camera's, so it is estimated too where there is no paper.
     """
     if estimate is not None:
-        return _registered_with(graph, lights, estimate)
-    found = _registered_with(graph, lights, np.full(3, _trial_scale(lights), np.float32))
+        return _registered_with(graph, lights, estimate, guesses_balance)
+    found = _registered_with(graph, lights, np.full(3, _trial_scale(lights), np.float32), guesses_balance)
     for _ in range(MAX_TRIALS - 1):
         tried = found.factor
-        found = _registered_with(graph, lights, tried)
+        found = _registered_with(graph, lights, tried, guesses_balance)
         if np.allclose(found.factor, tried, rtol=TRIALS_AGREE, atol=0):
             break
     return found
 
 
-def _registered_with(graph: FrameGraph, lights: LightSet, tried: Float32[np.ndarray, "3"]) -> Registration:
+def _registered_with(
+    graph: FrameGraph, lights: LightSet, tried: Float32[np.ndarray, "3"], guesses_balance: bool
+) -> Registration:
     """Returns the registration that the picture shows while this factor is tried.
 
     The cones are traced twice, with and without the environment.
@@ -200,8 +237,19 @@ def _registered_with(graph: FrameGraph, lights: LightSet, tried: Float32[np.ndar
     found = registration_from_patch(known.measured, known.light, known.bounce, known.albedo)
     if found is None:
         lit = samples.of(samples.usable & samples.unshadowed)
-        found = registration_from_albedo_percentile(lit.measured, lit.light, lit.bounce)
+        found = _guessed_registration(lit, 1 / tried if guesses_balance else None)
     return replace(found, factor=found.factor * tried)
+
+
+def _guessed_registration(lit: LightSamples, own_balance: Float32[np.ndarray, "3"] | None) -> Registration:
+    """Returns the registration by the brightest albedo; it keeps the lights' balance if there is no `own_balance`."""
+    measured, light, bounce = lit.measured, lit.light, lit.bounce
+    if own_balance is None:
+        return registration_from_albedo_percentile(measured, light, bounce)
+    balance = guessed_balance(measured, light, bounce, own_balance)
+    found = registration_from_albedo_percentile(measured, balance * light, bounce)
+    warning = _NO_PATCH.format("white balance is a guess") if found.source == "percentile" else found.warning
+    return replace(found, factor=(balance * found.factor).astype(np.float32), warning=warning)
 
 
 def _trial_scale(lights: LightSet) -> float:

@@ -20,7 +20,7 @@ from deltalight.render_server.estimation.registration import unseen_radiance_fro
 from deltalight.render_server.estimation.samples import LightSamples, SeenSurface, decoded
 from deltalight.render_server.frame import Observation
 from deltalight.render_server.frame_graph import FrameGraph
-from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import irradiance_map
 

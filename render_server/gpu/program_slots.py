@@ -9,7 +9,7 @@ import moderngl
 import numpy as np
 
 SETS_KEPT = 32  # sets of resources whose calls a program keeps: some for each camera of a room
-Value = float | int | bool | Sequence[float] | Sequence[Sequence[float]] | np.ndarray[Any, Any]
+Value = float | int | bool | np.generic | Sequence[float] | Sequence[Sequence[float]] | np.ndarray[Any, Any]
 Calls = Sequence[Callable[[], None]]
 
 # The `kind` of slots, by OpenGL's number.

@@ -21,12 +21,12 @@ _BLOCK = re.compile(
 _SWITCH = re.compile(r"^\s*#\s*pragma\s+switch\s+(?:bool\s+)?(\w+)\s*$", re.MULTILINE)
 _CONSTANT = re.compile(r"#pragma switch bool (\w+)")
 _VALUE = re.compile(r"^const bool (\w+) = switched;$", re.MULTILINE)
-_DECLARES = re.compile("uniform|buffer|local_size")
 _WORD = re.compile(r"\b[A-Za-z_]\w*")
 _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
 _CONDITION = re.compile(r"^\s*#\s*(ifdef|ifndef|if|elif|else|endif)\b\s*(.*?)\s*(?://.*)?$")
+# A number sign begins nothing else in GLSL, and is found sooner than the beginning of a line.
 _DIRECTIVE = re.compile(
-    r"^[ \t]*#[ \t]*(define|ifdef|ifndef|if|elif|else|endif)\b[ \t]*(\w*)(?:[ \t]+(.*))?.*$", re.MULTILINE
+    r"#[ \t]*(define|ifdef|ifndef|if|elif|else|endif)\b[ \t]*(\w*)(?:[ \t]+(.*))?.*$", re.MULTILINE
 )
 
 
@@ -193,7 +193,8 @@ def _local_size(text: str) -> tuple[int, int, int]:
 
 def _declaring(text: str) -> str:
     """Returns the statements that may declare a uniform, a block or a size; parsing only these saves time."""
-    return ";".join([part for part in text.split(";") if _DECLARES.search(part)]) + ";"
+    parts = text.split(";")
+    return ";".join([p for p in parts if "uniform" in p or "buffer" in p or "local_size" in p]) + ";"
 
 
 def _variables(text: str) -> Iterator[tuple[str, str, str, str]]:

@@ -10,7 +10,7 @@ sources are rewritten for it:
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -22,7 +22,7 @@ _IMAGES = re.compile(r"image(?:2D|3D|2DArray) \w")
 _BLOCK = re.compile(r"layout\(std430\) (\w+) buffer (\w+) \{([^}]*?)(\w+) (\w+)\[\]; \}")
 _STRUCT = re.compile(r"struct (\w+) \{([^}]*)\}")
 _MEMBER = re.compile(r"\s*(\w+) \w+(?:\[(\d+)\])?")
-_SAMPLERS = [f"{kind}sampler{shape}" for kind in ("", "i", "u") for shape in ("2D", "3D", "2DArray")]
+_SAMPLER = re.compile(r"uniform ([iu]?sampler(?:2D|3D|2DArray)) (\w+);")
 _ELEMENTS: Final = {  # of an array: format and type of the image, components that hold one
     "uint": ("r32ui", "uimageBuffer", "r"),
     "int": ("r32i", "iimageBuffer", "r"),
@@ -43,19 +43,21 @@ def with_images(source: str, most_images: int) -> str:
     code = _PRAGMA.sub("", without_comments(source))
     room = max(most_images - len(_IMAGES.findall(code)), 0)
     formats = {name: texels for texels, names in _PRAGMA.findall(source) for name in names.split()}
-    samplers = [name for name in formats if _is_only_fetched(code, name)][:room]
+    declared = _SAMPLER.findall(code)
+    kinds = {name: [kind for kind, other in declared if other == name] for name in formats}
+    samplers = [name for name in formats if _is_only_fetched(code, name, len(kinds[name]))][:room]
     for name in samplers:
-        source = _without_sampler(source, name, formats[name])
+        source = _without_sampler(source, name, kinds[name], formats[name])
     for array in list(_arrays(source))[: room - len(samplers)]:
         source = array.replaced(source)
     return source
 
 
-def _is_only_fetched(code: str, name: str) -> bool:
-    fetches = code.count(f"texelFetch({name}, ")
-    declared = sum(code.count(f"uniform {sampler} {name};") for sampler in _SAMPLERS) if fetches else 0
-    known = fetches + declared + code.count(f"textureSize({name}, 0)")
-    return declared > 0 and known == len(list(_places(code, name)))
+def _is_only_fetched(code: str, name: str, declared: int) -> bool:
+    """Whether a sampler, `declared` so often, is fetched from and used in no other way."""
+    fetches = code.count(f"texelFetch({name}, ") if declared else 0
+    known = fetches + declared + code.count(f"textureSize({name}, 0)") if fetches else 0
+    return known > 0 and known == len(list(_places(code, name)))
 
 
 def _places(text: str, word: str) -> Iterator[int]:
@@ -68,10 +70,10 @@ def _places(text: str, word: str) -> Iterator[int]:
         at = text.find(word, at + len(word))
 
 
-def _without_sampler(source: str, name: str, texels: str) -> str:
-    for sampler in _SAMPLERS:
-        image = f"layout({texels}) restrict readonly uniform {sampler.replace('sampler', 'image')} {name};"
-        source = source.replace(f"uniform {sampler} {name};", image)
+def _without_sampler(source: str, name: str, kinds: Collection[str], texels: str) -> str:
+    for kind in set(kinds):
+        image = f"layout({texels}) restrict readonly uniform {kind.replace('sampler', 'image')} {name};"
+        source = source.replace(f"uniform {kind} {name};", image)
     source = source.replace(f"textureSize({name}, 0)", f"imageSize({name})")
     head = f"texelFetch({name}, "
     # From the last one on, so that those in arguments are replaced before.

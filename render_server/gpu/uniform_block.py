@@ -13,9 +13,9 @@ from deltalight.render_server.gpu.context import GpuContext
 Bool = Annotated[bool, "bool"]
 Int = Annotated[int, "int"]
 Float = Annotated[float, "float"]
-Vec2 = Annotated[Sequence[float], "vec2"]
-Vec3 = Annotated[Sequence[float], "vec3"]
-Vec4 = Annotated[Sequence[float], "vec4"]
+Vec2 = Annotated[Sequence[float] | np.ndarray[Any, Any], "vec2"]
+Vec3 = Annotated[Sequence[float] | np.ndarray[Any, Any], "vec3"]
+Vec4 = Annotated[Sequence[float] | np.ndarray[Any, Any], "vec4"]
 Mat4 = Annotated[np.ndarray[Any, Any], "mat4"]
 """Row-major here, as everywhere in Python."""
 

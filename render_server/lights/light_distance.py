@@ -1,118 +1,99 @@
-"""How far the lights of a fish-eye camera are.
+"""How far the lights of a fish-eye camera are: what cues in the colour camera's picture say together.
 
 A fish-eye picture gives directions only, but shadows of a lamp one metre away diverge by ten degrees over a table.
-Paper of one albedo is a light meter with hundreds of cells: across it, light of a near lamp varies by I cos / d^2.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float, Float64, Int64
 
-from deltalight.protocol.frames import ViewFrame, decode_lut
-from deltalight.protocol.sky_lights import TrackedLight
-from deltalight.render_server.scene.albedo import MIN_PIXELS, known_albedo, unclipped
-
-# Candidate inverse distances, 1/m: from far away to 20 cm, finer than the paper resolves.
-INVERSE_DISTANCES = np.linspace(0.0, 5.0, 101)
-# Near lights are accepted if they explain this fraction of all smooth differences (a plane over the paper) from far
-# lights: uneven ambient light and shadows do not vary like near lamps by chance ...
-MIN_EXPLAINED = 0.75
-# ... and if the improvement is significant at 0.1 % (F-test with 1 and many degrees of freedom), where four
-# neighbouring values of pixels and channels count as one, because lens and demosaicing mix them.
-MIN_F_RATIO = 11.0
-CORRELATED_VALUES = 4
-OUTLIER_DEVIATIONS = 3.0
+# Inverse distances to try, 1/m, from far away to 20 cm: neighbours differ by about what shading can tell apart.
+CANDIDATES: Sequence[float] = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
+# Tiles of the picture are squares of this fraction of its width: what a cue leaves out, such as light that things
+# reflect or the grain of wood, is alike within one and not in others.
+TILE = 1 / 8
+MIN_TILES = 2
+SIGNIFICANCE = 0.05  # of what is found, else lights are far, or all at one distance
 
 
 @dataclass(frozen=True, eq=False)
-class PaperLight:
-    """Irradiance (camera units) at points of the board (world, m) with known albedo."""
+class DistanceCue:
+    """How badly lights at each inverse distance (1/m, rising from 0) explain what each tile of the picture shows.
 
-    points: Float64[np.ndarray, "k 3"]
-    irradiance: Float64[np.ndarray, "k 3"]
-
-
-def paper_light(frame: ViewFrame) -> PaperLight | None:
-    """Measures irradiance on paper and grey cards; None for fewer than 30 unclipped pixels."""
-    if frame.board is None or frame.pose is None:
-        return None
-    albedo = known_albedo(frame.board, frame.camera, frame.pose)
-    coded = decode_lut(frame.response)[frame.color, np.arange(3)]
-    usable = (albedo > 0) & unclipped(frame.color, coded)
-    if np.count_nonzero(usable) < MIN_PIXELS:
-        return None
-    matrix = frame.pose.world_from_camera
-    rays = np.insert(frame.camera.rays()[usable].astype(np.float64), 2, 1.0, axis=1) @ matrix[:3, :3].T
-    points = matrix[:3, 3] - rays * (matrix[2, 3] / rays[:, 2:])
-    irradiance = np.pi * coded[usable].astype(np.float64) / (albedo[usable, None] * frame.exposure_scale)
-    return PaperLight(points, irradiance)
-
-
-def fit_distance(
-    paper: PaperLight,
-    position: Float64[np.ndarray, "3"],
-    lights: Sequence[TrackedLight],
-    ambient: Float64[np.ndarray, "3"],
-) -> float | None:
-    """Estimates the distance of the lights from the fish-eye camera at `position`, m; None where they seem far away.
-
-    The paper's irradiance is f (sum of E_i (D/d)^2 cos + ambient) with a factor f per channel; D, one distance for
-    all lights, is fitted by least squares and must be significant. `ambient` is the irradiance of all other light
-    on the paper, in the units of the lights.
+    `losses` are in any unit.
     """
-    far = _predicted(paper, position, lights, ambient, 0.0)
-    misfits = [
-        _misfit(paper, _predicted(paper, position, lights, ambient, inverse)) for inverse in INVERSE_DISTANCES
-    ]
-    best = int(np.argmin(misfits))
-    gain = misfits[0] - misfits[best]
-    explainable = misfits[0] - _misfit(paper, far * _plane(paper, far))
-    values = paper.irradiance.size / CORRELATED_VALUES
-    if gain < MIN_EXPLAINED * explainable or gain * values < MIN_F_RATIO * misfits[best] or best == 0:
-        return None
-    return float(1 / INVERSE_DISTANCES[best])
+
+    inverses: Sequence[float]
+    losses: Float64[np.ndarray, "c t"]
+
+    @classmethod
+    def of(
+        cls,
+        inverses: Sequence[float],
+        losses: Sequence[Float[np.ndarray, " k"]],
+        tile: Int64[np.ndarray, " k"],
+    ) -> "DistanceCue | None":
+        """Adds up the losses of observations in each tile; None where too few tiles show any."""
+        by_tile = sum_by_tile(losses, tile)
+        return cls(inverses, by_tile) if by_tile.shape[1] >= MIN_TILES else None
+
+    @property
+    def best(self) -> int:
+        """Index of the inverse distance with the least loss."""
+        return int(np.argmin(self.losses.sum(axis=1)))
+
+    @property
+    def around(self) -> slice:
+        """The best of the inverse distances and its neighbours."""
+        best = min(max(self.best, 1), len(self.inverses) - 2)
+        return slice(best - 1, best + 2)
+
+    @property
+    def tells_near(self) -> bool:
+        """Whether lights near by explain the cue significantly better than lights far away."""
+        return is_significant(self.losses[0] - self.losses[self.best])
+
+    @cached_property
+    def estimate(self) -> tuple[float, float]:
+        """The inverse distance of the least loss, 1/m, and its standard error.
+
+        A parabola through the best one and its neighbours has its vertex there. The error is the sandwich
+        estimate (Huber 1967): the scatter of the tiles' slopes over the curvature.
+        """
+        tried = self.inverses[self.around]
+        bend, slope, _ = np.polyfit(tried, self.losses[self.around], 2)
+        curvature = max(2 * float(bend.sum()), 1e-12)
+        inverse = float(np.clip(-slope.sum() / curvature, tried[0], tried[-1]))
+        scatter = np.std(2 * bend * inverse + slope, ddof=1) * np.sqrt(len(bend))
+        return inverse, float(scatter) / curvature
 
 
-def _predicted(
-    paper: PaperLight,
-    position: Float64[np.ndarray, "3"],
-    lights: Sequence[TrackedLight],
-    ambient: Float64[np.ndarray, "3"],
-    inverse: float,
-) -> Float64[np.ndarray, "k 3"]:
-    """Returns the irradiance of the paper under lights at an inverse distance."""
-    predicted = np.tile(ambient, (len(paper.points), 1))
-    for light in lights:
-        to_lamp = light.to_light - inverse * (paper.points - position)  # in units of the lamp's distance
-        attenuation = np.maximum(to_lamp[:, 2], 0) / np.linalg.norm(to_lamp, axis=1) ** 3
-        predicted += attenuation[:, None] * light.irradiance
-    return np.asarray(np.maximum(predicted, 1e-12))
+def tiles_of(pixel: Int64[np.ndarray, "*shape"], width: int) -> Int64[np.ndarray, "*shape"]:
+    """Returns the tile of each pixel; pixels count row by row."""
+    edge = max(round(TILE * width), 1)
+    return np.asarray(pixel // width // edge * width + pixel % width // edge)
 
 
-def _plane(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
-    """Fits measured over predicted irradiance by a linear function of position per channel."""
-    places = np.column_stack([np.ones(len(paper.points)), paper.points[:, :2]])
-    kept = _without_outliers(paper.irradiance / predicted)
-    return np.stack(
-        [
-            places @ np.linalg.lstsq(places[kept] * one[kept, None], measured[kept])[0]
-            for one, measured in zip(predicted.T, paper.irradiance.T, strict=True)
-        ],
-        axis=1,
-    )
+def sum_by_tile(
+    losses: Sequence[Float[np.ndarray, " k"]], tile: Int64[np.ndarray, " k"]
+) -> Float64[np.ndarray, "c t"]:
+    """Adds up each of the losses in every tile that shows any observation."""
+    used = np.bincount(tile) > 0
+    return np.stack([np.bincount(tile, one)[used] for one in losses])
 
 
-def _misfit(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> float:
-    """Returns the relative mean squared difference to the measured irradiance, after fitting a factor per channel."""
-    kept = _without_outliers(paper.irradiance / predicted)
-    measured, predicted = paper.irradiance[kept], predicted[kept]
-    factor = (measured * predicted).sum(axis=0) / (predicted**2).sum(axis=0)
-    return float(((factor * predicted - measured) ** 2).mean() / (measured**2).mean())
+def is_significant(gain: Float64[np.ndarray, " t"], tests: int = 1) -> bool:
+    """Whether tiles gain on average: a one-sided t-test, one of several `tests` (Bonferroni)."""
+    from scipy.special import stdtrit
+
+    least_t = float(stdtrit(len(gain) - 1, 1 - SIGNIFICANCE / tests))
+    return bool(gain.sum() > least_t * np.std(gain, ddof=1) * np.sqrt(len(gain)))
 
 
-def _without_outliers(ratio: Float64[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
-    deviation = np.abs(ratio - np.median(ratio, axis=0))
-    allowed = OUTLIER_DEVIATIONS * 1.4826 * np.median(deviation, axis=0) + 1e-9
-    return np.asarray((deviation <= allowed).all(axis=1))
+def common_inverse(cues: Sequence[DistanceCue]) -> float:
+    """Returns the inverse distance, 1/m, that cues which tell near lights say together: a mean by 1 / variance."""
+    inverse, error = np.array([cue.estimate for cue in cues]).T
+    return float(np.average(inverse, weights=np.maximum(error, 1e-6) ** -2.0))

@@ -23,7 +23,7 @@ SUMMED_SIZE = 64
 SUMMED_FROM_RAD = 0.4
 CONE_SAMPLES = 64
 CACHED_LEVELS = 16
-AXES_AT_ONCE = 32  # so that their data stays in the processor's cache
+AXES_AT_ONCE = 64  # so that their data stays in the processor's cache
 MAX_ORDER = 5
 
 
@@ -110,8 +110,13 @@ def _cone_average(
 @lru_cache(maxsize=CACHED_LEVELS)
 def _cone_coordinates(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "k n 2"]:
     frames = _tangent_frames(octahedral_grid(size).reshape(-1, 3)).astype(np.float32)
-    directions = _spiral(np.sin(half_angle)).astype(np.float32) @ np.swapaxes(frames, 1, 2)
-    return np.ascontiguousarray(np.swapaxes(texel_coordinates(directions, source_size), 0, 1))
+    spiral = _spiral(np.sin(half_angle)).astype(np.float32)
+    coordinates = np.empty((len(spiral), len(frames), 2), np.float32)
+    for first in range(0, len(frames), AXES_AT_ONCE):
+        part = slice(first, first + AXES_AT_ONCE)
+        directions = spiral @ np.swapaxes(frames[part], 1, 2)
+        coordinates[:, part] = np.swapaxes(texel_coordinates(directions, source_size), 0, 1)
+    return coordinates
 
 
 def _cone_sum(
@@ -133,9 +138,12 @@ def _cone_weights(half_angle: float, size: int, source_size: int) -> Float32[np.
     solid_angles, least = texel_solid_angles(source_size).ravel(), np.cos(half_angle)
     weights = np.empty((len(axes), len(source)), np.float32)
     for first in range(0, len(axes), AXES_AT_ONCE):
-        cosine = (axes[first : first + AXES_AT_ONCE] @ source.T).astype(np.float32)
-        weight = np.where(cosine > least, cosine, 0) * solid_angles
-        weights[first : first + AXES_AT_ONCE] = weight / weight.sum(axis=1, keepdims=True)
+        part = slice(first, first + AXES_AT_ONCE)
+        weight = weights[part]
+        weight[:] = axes[part] @ source.T
+        weight[weight <= least] = 0
+        weight *= solid_angles
+        weight /= weight.sum(axis=1, keepdims=True)
     return weights
 
 

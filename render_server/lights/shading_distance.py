@@ -4,8 +4,9 @@ Divided by the irradiance of lights in their right places, a picture is albedo, 
 shadows and falloff are gone (intrinsic images, Barrow & Tenenbaum 1978).
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -16,6 +17,13 @@ from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
 from deltalight.protocol.occlusion import are_occluded
 from deltalight.protocol.octahedral import sample_octahedral
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
+from deltalight.render_server.lights.light_distance import (
+    CANDIDATES,
+    DistanceCue,
+    is_significant,
+    sum_by_tile,
+    tiles_of,
+)
 from deltalight.render_server.lights.octahedral import irradiance_map
 from deltalight.render_server.scene.albedo import unclipped
 from deltalight.render_server.scene.depth_surface import depth_surface, noise_sigma
@@ -28,51 +36,76 @@ SPANS = (4, 8)
 SAME_CHROMA = 0.1  # largest difference of log colour between points that may be of one material
 LARGEST_STEP = 0.2  # of log albedo: beyond it, materials differ, whatever the light
 MIN_PAIRS = 500
-# Inverse distances to try, 1/m: neighbours differ by less than what shading can tell apart.
-CANDIDATES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
-# Near lights must leave fewer steps than far ones at 2.5 % significance: a paired t-test over tiles of the picture.
-MIN_T = 2.0
-TILE = 10  # points
+ROUNDS = 2  # over all lamps: where one is depends on the others
 SHADOW_STEPS = 32
 OFFSET_SIGMAS = 4.0  # from a surface to where its shadow rays start, in noise of its depth
 
 
-def distance_by_shading(frame: ViewFrame, sky: SkyLights) -> float | None:
-    """Estimates one distance of all lights from the fish-eye camera, m; None where they seem far away.
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """What shading and shadows of a picture say about the distances of lamps from the fish-eye camera.
 
-    Of all distances it is the one under which the picture's albedo has the fewest steps, most of all near the
-    fish-eye camera. Frames without depth or pose, and those that show too little, say nothing.
+    The nearer places are to that camera the more they count. `lit` is the irradiance of the points by each lamp at
+    each of CANDIDATES, `smooth` that by all other light.
     """
-    seen = _seen_points(frame, sky.world_from_fisheye[:3, 3])
-    if seen is None:
-        return None
-    smooth = sample_octahedral(irradiance_map(sky.residual), seen.normals[None])[0]
 
-    def steps(candidate: int) -> Float32[np.ndarray, " p"]:
-        lit = (seen.lit_by(light, sky, CANDIDATES[candidate]) for light in sky.lights)
-        return seen.pairs.steps(sum(lit, smooth))
+    sky: SkyLights
+    seen: "_SeenPoints"
+    lamps: list[list[TrackedLight]]
+    lit: list[list[Float32[np.ndarray, "k 3"]]]
+    smooth: Float32[np.ndarray, "k 3"]
 
-    # Every other candidate, then the neighbours of the best one: the sum has one minimum but for noise.
-    left = {candidate: steps(candidate) for candidate in range(0, len(CANDIDATES), 2)}
-    coarse = _least(left)
-    left |= {near: steps(near) for near in (coarse - 1, coarse + 1) if 0 <= near < len(CANDIDATES)}
-    best = _least(left)
-    if best == 0 or not seen.pairs.has_fewer(left[best], left[0]):
-        return None
-    return 1 / _vertex({candidate: float(one.sum()) for candidate, one in left.items()}, best)
+    @classmethod
+    def of(cls, frame: ViewFrame, sky: SkyLights) -> "Shading | None":
+        """Returns what a frame says; None without depth or pose, and where it shows too little."""
+        seen = _seen_points(frame, sky.world_from_fisheye[:3, 3])
+        if seen is None:
+            return None
+        lamps = _lamps(sky.lights)
+        lit = [[seen.lit_by(lamp, sky, inverse) for inverse in CANDIDATES] for lamp in lamps]
+        smooth = sample_octahedral(irradiance_map(sky.residual), seen.normals[None])[0]
+        return cls(sky, seen, lamps, lit, smooth)
+
+    @cached_property
+    def cue(self) -> DistanceCue | None:
+        """How many steps the picture's albedo has if all lamps are at one distance."""
+        return self._cue([sum(lit, self.smooth) for lit in zip(*self.lit, strict=True)])
+
+    def own_inverses(self) -> dict[int, float]:
+        """Returns inverse distances, 1/m, of the lights (by identity) that are not as far as the others.
+
+        One of its own must leave significantly fewer steps than the distance common to all.
+        """
+        if self.cue is None or len(self.lamps) == 1:
+            return {}
+        common, _ = self.cue.estimate
+        pairs, found = self.seen.pairs, dict[int, float]()
+        now = [self.seen.lit_by(lamp, self.sky, common) for lamp in self.lamps]
+        for index in ROUNDS * sorted(range(len(now)), key=lambda index: -float(now[index].sum())):
+            others = sum(now[:index] + now[index + 1 :], self.smooth)
+            own = self._cue([others + lit for lit in self.lit[index]])
+            (before,) = sum_by_tile([pairs.steps(others + now[index])], pairs.tile)
+            if own is not None and is_significant(before - own.losses[own.best], len(now)):
+                inverse, _ = own.estimate
+                found |= {light.identity: inverse for light in self.lamps[index]}
+                now[index] = self.seen.lit_by(self.lamps[index], self.sky, inverse)
+        return found
+
+    def _cue(self, lights: Sequence[Float32[np.ndarray, "k 3"]]) -> DistanceCue | None:
+        """Returns the steps under each of some irradiances."""
+        pairs = self.seen.pairs
+        return DistanceCue.of(CANDIDATES, [pairs.steps(light) for light in lights], pairs.tile)
 
 
-def _least(left: Mapping[int, Float32[np.ndarray, " p"]]) -> int:
-    return min(left, key=lambda candidate: float(left[candidate].sum()))
+def _lamps(lights: Sequence[TrackedLight]) -> list[list[TrackedLight]]:
+    """Returns the lights of each lamp: large ones are cut into several, whose discs touch."""
+    from scipy.sparse.csgraph import connected_components
 
-
-def _vertex(costs: Mapping[int, float], best: int) -> float:
-    """Returns the inverse distance of the least cost: a parabola through the best candidate and its neighbours."""
-    around = [best - 1, best, best + 1]
-    if not all(candidate in costs for candidate in around):
-        return CANDIDATES[best]
-    a, b, _ = np.polyfit([CANDIDATES[one] for one in around], [costs[one] for one in around], 2)
-    return float(-b / (2 * a))
+    toward = np.array([light.to_light for light in lights])
+    radius = np.array([light.angular_radius_rad for light in lights])
+    touch = np.arccos(np.clip(toward @ toward.T, -1, 1)) <= radius + radius[:, None]
+    count, lamp = connected_components(touch, directed=False)
+    return [[light for light, own in zip(lights, lamp, strict=True) if own == one] for one in range(count)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +124,6 @@ class _Pairs:
         step = np.abs(self.difference - (log[self.first] - log[self.second]))
         return np.asarray(self.weight * np.minimum(step, LARGEST_STEP))
 
-    def has_fewer(self, steps: Float32[np.ndarray, " p"], others: Float32[np.ndarray, " p"]) -> bool:
-        """Whether `steps` are significantly fewer than `others`."""
-        gain = np.bincount(self.tile, others - steps)[np.bincount(self.tile) > 0]
-        return bool(gain.sum() > MIN_T * np.std(gain) * np.sqrt(len(gain)))
-
 
 @dataclass(frozen=True, eq=False)
 class _SeenPoints:
@@ -108,8 +136,13 @@ class _SeenPoints:
     normals: Float32[np.ndarray, "k 3"]
     pairs: _Pairs
 
-    def lit_by(self, light: TrackedLight, sky: SkyLights, inverse: float) -> Float32[np.ndarray, "k 3"]:
-        """Returns the irradiance from a light at an inverse distance from the fish-eye camera."""
+    def lit_by(
+        self, lamp: Sequence[TrackedLight], sky: SkyLights, inverse: float
+    ) -> Float32[np.ndarray, "k 3"]:
+        """Returns the irradiance from a lamp's lights at an inverse distance from the fish-eye camera."""
+        return sum((self._lit_by(light, sky, inverse) for light in lamp), np.zeros_like(self.points))
+
+    def _lit_by(self, light: TrackedLight, sky: SkyLights, inverse: float) -> Float32[np.ndarray, "k 3"]:
         offset = self.points - sky.world_from_fisheye[:3, 3].astype(np.float32)
         to_lamp = light.to_light.astype(np.float32) - np.float32(inverse) * offset  # in units of its distance
         distance = np.linalg.norm(to_lamp, axis=1)
@@ -207,7 +240,7 @@ def _pairs(
     mean = log.mean(axis=-1)
     chroma = log - mean[..., None]
     index = np.arange(usable.size).reshape(usable.shape)
-    tile = index // usable.shape[1] // TILE * usable.shape[1] + index % usable.shape[1] // TILE
+    tile = tiles_of(index, usable.shape[1])
     parts = []
     for span in SPANS:
         for one, other in ((np.s_[:, :-span], np.s_[:, span:]), (np.s_[:-span], np.s_[span:])):

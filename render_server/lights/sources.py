@@ -13,16 +13,17 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.light_cutter import LightCutter
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
-from deltalight.render_server.lights.light_distance import fit_distance, paper_light
+from deltalight.render_server.lights.light_distance import common_inverse
 from deltalight.render_server.lights.light_models import DirectionalLight, Light, SphereLight
 from deltalight.render_server.lights.lights import AMBIENT_SIZE, LightSet, build_lights, light_set
-from deltalight.render_server.lights.octahedral import above_horizon, irradiance
-from deltalight.render_server.lights.shading_distance import distance_by_shading
+from deltalight.render_server.lights.octahedral import above_horizon
+from deltalight.render_server.lights.paper_distance import paper_cue, paper_light
+from deltalight.render_server.lights.shading_distance import Shading
 
 # Fraction of a lamp's radius that it must move to count as moved. Soft edges of its shadows are then off by a
 # twentieth of their width, whereas noise of the marker's pose would make them tremble and cost a rebuild per frame.
 STILL_FRACTION = 0.1
-UP = np.array([[0.0, 0.0, 1.0]])
+PAPER = "the board's paper"
 
 
 class LightSource(Protocol):
@@ -136,11 +137,11 @@ class FisheyeSource:
         self._cutter = LightCutter(self._cut)
         self._sky: SkyLights | None = None
         self._remark: str | None = None
-        self._distance_m: float | None = None
-        self._measure = ""
+        self._found: tuple[str, ...] = ()  # sentence on the distances
         self._wants_distance = lights.fisheye.distance_m == "auto"
-        if isinstance(lights.fisheye.distance_m, float):
-            self._distance_m = lights.fisheye.distance_m
+        given = lights.fisheye.distance_m
+        self._inverse = 1 / given if isinstance(given, float) else 0.0  # of the lights' distance, 1/m
+        self._own_inverses: dict[int, float] = {}  # by identity of the light, where they differ
 
     def update(self, frame: ViewFrame) -> LightSet | None:
         """Returns the unregistered lights of a frame; None where they did not change.
@@ -174,16 +175,13 @@ class FisheyeSource:
         if self._sky is None:
             return (_NO_PICTURE,)
         remarks = () if self._remark is None else (self._remark,)
-        if self._distance_m is None or self._document.fisheye.distance_m != "auto":
-            return remarks
-        found = f"lights of the fish-eye picture: {self._distance_m:.2g} m away, as {self._measure}"
-        return (*remarks, found)
+        return remarks + self._found
 
     def _find_distance(self, frame: ViewFrame, sky: SkyLights) -> bool:
         """Estimates the lights' distance on the first frame that can tell; returns whether that succeeded.
 
-        The board's paper measures best. Where it shows no near lights (a lamp may light only a part of it), and
-        without a board, shading and shadows of all surfaces are asked.
+        All cues that say significantly that the lights are near are taken together: the falloff of light over the
+        board's paper, and shading and shadows of all surfaces. A board may still come into view.
         """
         if not (self._wants_distance and sky.lights):
             return False
@@ -191,23 +189,31 @@ class FisheyeSource:
         if paper is None and (frame.board is not None or frame.depth is None or frame.pose is None):
             return False
         self._wants_distance = False
-        if paper is not None:
-            ambient = irradiance(sky.residual, UP)[0]
-            self._distance_m = fit_distance(paper, sky.world_from_fisheye[:3, 3], sky.lights, ambient)
-            self._measure = "the board's paper tells"
-        if self._distance_m is None:
-            self._distance_m = distance_by_shading(frame, sky)
-            self._measure = "shading and shadows tell"
-        return self._distance_m is not None
+        shading = Shading.of(frame, sky)
+        cues = {
+            PAPER: None if paper is None else paper_cue(paper, sky),
+            "shading and shadows": None if shading is None else shading.cue,
+        }
+        near = {name: cue for name, cue in cues.items() if cue is not None and cue.tells_near}
+        if not near:
+            return False
+        self._inverse = common_inverse([*near.values()])
+        if shading is not None:
+            self._own_inverses = shading.own_inverses()
+        inverses = sorted({self._inverse_of(light) for light in sky.lights}, reverse=True)
+        distances = ", ".join(f"{1 / inverse:.2g} m" if inverse else "far" for inverse in inverses)
+        verb = "tells" if [*near] == [PAPER] else "tell"
+        self._found = (f"lights of the fish-eye picture: {distances} away, as {', '.join(near)} {verb}",)
+        return True
+
+    def _inverse_of(self, light: TrackedLight) -> float:
+        return self._own_inverses.get(light.identity, self._inverse)
 
     def _lights(self, sky: SkyLights) -> LightSet:
-        position, distance_m = sky.world_from_fisheye[:3, 3], self._distance_m
+        position = sky.world_from_fisheye[:3, 3]
         found = light_set(
             self._document,
-            tuple(
-                _distant(light) if distance_m is None else _near(light, position, distance_m)
-                for light in sky.lights
-            ),
+            tuple(_placed(light, position, self._inverse_of(light)) for light in sky.lights),
             sky.residual,
             (1 - sky.seen) * (1 - above_horizon(len(sky.residual))),
             tuple(light.identity for light in sky.lights),
@@ -226,18 +232,18 @@ def _cut_here(sent: LightCut, wanted: LightCut) -> str:
     )
 
 
-def _distant(light: TrackedLight) -> Light:
-    return DirectionalLight(
-        (-light.to_light).astype(np.float32), light.irradiance.astype(np.float32), light.angular_radius_rad
-    )
+def _placed(light: TrackedLight, position: Float64[np.ndarray, "3"], inverse: float) -> Light:
+    """Returns a sphere with the same irradiance (E = I / d^2) and angular size at `position` as the distant light.
 
-
-def _near(light: TrackedLight, position: Float64[np.ndarray, "3"], distance_m: float) -> Light:
-    """Returns a sphere with the same irradiance (E = I / d^2) and angular size at `position` as the distant light."""
+    At an inverse distance of 0 it is a distant light.
+    """
+    irradiance = light.irradiance.astype(np.float32)
+    if inverse == 0:
+        return DirectionalLight((-light.to_light).astype(np.float32), irradiance, light.angular_radius_rad)
     return SphereLight(
-        (position + distance_m * light.to_light).astype(np.float32),
-        (light.irradiance * distance_m**2).astype(np.float32),
-        float(distance_m * np.sin(light.angular_radius_rad)),
+        (position + light.to_light / inverse).astype(np.float32),
+        irradiance / np.float32(inverse**2),
+        float(np.sin(light.angular_radius_rad) / inverse),
     )
 
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState, PlacedObject
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import light_stages
 from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, lagging_behind_objects

@@ -14,11 +14,11 @@ import numpy as np
 
 from deltalight.protocol.scene_method import DifferentialMethod
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState, ObjectExtent
 from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.lights.lights import LightSet

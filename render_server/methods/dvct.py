@@ -7,10 +7,10 @@ import moderngl
 
 from deltalight.protocol.scene_method import DvctMethod
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels, dvct_paper
 from deltalight.render_server.methods.light_maps import lagging_behind_objects, light_stages

@@ -8,15 +8,15 @@ from jaxtyping import Float32
 
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.frame import FrameResources, ObjectSurface
+from deltalight.render_server.geometry_state import GeometryState, ObjectExtent, PlacedObject
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent, PlacedObject
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.light_map import light_map
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import object_extent
-from deltalight.render_server.passes.image_based import AmbientOcclusion, ImageBasedSurface, SurroundingLight
+from deltalight.render_server.passes.image_based import AmbientOcclusion, ImageBasedRadiance, SurroundingLight
 from deltalight.render_server.scene.triangle_mesh import bounds_of
 
 
@@ -27,7 +27,7 @@ class ImageBasedShading:
         self._radius_m = settings.occlusion_radius_m
         self._light = SurroundingLight(gpu)
         self._occlusion = AmbientOcclusion(gpu, size)
-        self._surface = ImageBasedSurface(gpu, size, settings.samples)
+        self._radiance = ImageBasedRadiance(gpu, size, settings.samples)
 
     def set_light(self, radiance: Float32[np.ndarray, "n n 3"]) -> SurroundingLight:
         """Averages the map over cones, and finds its irradiance."""
@@ -49,12 +49,12 @@ class ImageBasedShading:
         self, scene: Bindings, surface: ObjectSurface, light: SurroundingLight, occlusion: AmbientOcclusion
     ) -> moderngl.Texture:
         """Shades the objects by the map alone."""
-        self._surface.run(light, occlusion.bindings, surface.rectangle, scene)
-        return self._surface.radiance
+        self._radiance.run(light, occlusion.bindings, surface.rectangle, scene)
+        return self._radiance.texture
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._light, self._occlusion, self._surface)
+        release_all(self._light, self._occlusion, self._radiance)
 
 
 def image_based_radiance(
@@ -67,7 +67,7 @@ def image_based_radiance(
     light = g.stage("filtered light", own.set_light, radiance)
     reach_m = g.value("occlusion radius", own.reach_m, s.objects, same=eq)
     occlusion = g.stage("ambient occlusion", own.occlude, s.geometry, s.object_surface, reach_m)
-    return g.stage("image-based surface", own.shade, s.geometry, s.object_surface, light, occlusion)
+    return g.stage("image-based radiance", own.shade, s.geometry, s.object_surface, light, occlusion)
 
 
 def map_light(lights: LightSet, extent: ObjectExtent) -> Float32[np.ndarray, "n n 3"]:

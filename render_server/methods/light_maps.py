@@ -12,8 +12,8 @@ from jaxtyping import Float64
 from deltalight.protocol import short_axis
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState, ObjectExtent
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.light_models import Light
 from deltalight.render_server.lights.lights import LightSet

@@ -10,10 +10,10 @@ import numpy as np
 
 from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.frame import FrameResources
+from deltalight.render_server.geometry_state import ObjectExtent
 from deltalight.render_server.gpu.clearing import clear_buffer
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
-from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import (
     LitScene,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.render_server.gpu_scene import ObjectExtent
+from deltalight.render_server.geometry_state import ObjectExtent
 from deltalight.render_server.passes.volumes import MOST_VOLUMES
 
 

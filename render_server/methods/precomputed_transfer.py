@@ -8,17 +8,17 @@ from jaxtyping import Float32, Float64
 
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.frame import FrameResources, ObjectSurface
+from deltalight.render_server.geometry_state import GeometryState, PlacedObject
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.light_map import coefficients_around, distant_coefficients
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import turned_harmonics
 from deltalight.render_server.methods.image_based import map_light
 from deltalight.render_server.methods.light_maps import object_extent
-from deltalight.render_server.passes.image_based import ImageBasedSurface, SurroundingLight
+from deltalight.render_server.passes.image_based import ImageBasedRadiance, SurroundingLight
 from deltalight.render_server.passes.precomputed_transfer import TransferMesh, TransferredLight
 from deltalight.render_server.precomputation.light_transfers import ObjectTransfers, transfer_settings
 from deltalight.render_server.scene.precomputed_transfer import ObjectTransfer
@@ -39,7 +39,7 @@ class TransferShading:
         self._meshes: dict[ObjectTransfer, TransferMesh] = {}
         self._transferred: TransferredLight | None = None
         self._light = SurroundingLight(gpu)
-        self._surface = ImageBasedSurface(gpu, size, settings.samples, precomputed=True)
+        self._radiance = ImageBasedRadiance(gpu, size, settings.samples, precomputed=True)
 
     def find(self, objects: GeometryState) -> Found:
         """Returns the objects' transfer, None for that still being computed.
@@ -92,12 +92,12 @@ class TransferShading:
         self, scene: Bindings, surface: ObjectSurface, light: SurroundingLight, transferred: TransferredLight
     ) -> moderngl.Texture:
         """Shades the objects by the map and their transfer alone."""
-        self._surface.run(light, transferred.bindings, surface.rectangle, scene)
-        return self._surface.radiance
+        self._radiance.run(light, transferred.bindings, surface.rectangle, scene)
+        return self._radiance.texture
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(*self._meshes.values(), self._transferred, self._light, self._surface)
+        release_all(*self._meshes.values(), self._transferred, self._light, self._radiance)
         self._meshes = {}
 
 
@@ -112,7 +112,7 @@ def precomputed_radiance(
     found = g.polled("found transfer", "objects", lambda: own.find(s.objects.value), eq)
     distant = g.value("light coefficients", own.project, s.lights, same=np.array_equal)
     transferred = g.stage("transferred light", own.transfer, s.objects, found, s.lights, distant, s.view)
-    return g.stage("precomputed surface", own.shade, s.geometry, s.object_surface, light, transferred)
+    return g.stage("precomputed radiance", own.shade, s.geometry, s.object_surface, light, transferred)
 
 
 def _middle(item: PlacedObject) -> Float64[np.ndarray, "3"]:

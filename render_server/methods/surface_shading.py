@@ -8,10 +8,10 @@ import moderngl
 
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.caustic_beams import TracedBeams, beam_stages, casts_caustics
 from deltalight.render_server.methods.light_maps import SELF_SHADOW_TEXELS, LitScene, Points, object_bvh
@@ -29,7 +29,7 @@ from deltalight.render_server.passes.reflections import (
     ScreenCones,
     TransmittedLight,
 )
-from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
+from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, ObjectRadiance
 from deltalight.render_server.passes.volumes import PlacedVolume
 from deltalight.render_server.passes.voxels import VoxelMipmap, VoxelsOnDemand
 from deltalight.render_server.view import CameraView, Rectangle
@@ -155,7 +155,7 @@ class SurfaceShading:
         self._history: LightHistory | None = None
         if self.reuses_light:
             self._history = LightHistory(gpu, self.grid, direct, self.cones, options.tier.refresh_tiles)
-        self._surface = VirtualSurface(gpu, size)
+        self._radiance = ObjectRadiance(gpu, size)
         self._change = ChangeRatio(gpu, self.grid.size)
         self._caustics: Caustics | None = None
         if options.caustics:
@@ -322,8 +322,8 @@ class SurfaceShading:
         screen: moderngl.Texture | None,
     ) -> moderngl.Texture:
         """Shades the objects."""
-        self._surface.run(cones, grid, scene, screen=screen, caustics=caustics)
-        return self._surface.radiance
+        self._radiance.run(cones, grid, scene, screen=screen, caustics=caustics)
+        return self._radiance.texture
 
     def add_transmitted(
         self,
@@ -357,7 +357,7 @@ class SurfaceShading:
             self.cones,
             self._direct,
             self._unchanged,
-            self._surface,
+            self._radiance,
             self._change,
             self._caustics,
             self._screen,
@@ -478,7 +478,7 @@ def _surface_stages(
     objects, scene, _, cones, bvh, _, marching = rays
     mirrored = g.stage("mirrored objects", shading.mirror_objects, objects, scene, grid, bvh, marching)
     screen = g.stage("screen cones", shading.trace_screen, *rays, mirrored)
-    return g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
+    return g.stage("object radiance", shading.shade_objects, scene, grid, cones, caustics, screen)
 
 
 def _light_state(g: Graph, s: FrameResources, lit: LitScene, *bounces: Resource[Any]) -> Resource[LightState]:

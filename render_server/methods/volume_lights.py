@@ -7,9 +7,9 @@ import numpy as np
 
 from deltalight.protocol.quality import QualityTier
 from deltalight.render_server.frame import FrameResources
+from deltalight.render_server.geometry_state import GeometryState, ObjectExtent
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import release_all
-from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.light_models import DirectionalLight, Light
 from deltalight.render_server.lights.lights import LightSet

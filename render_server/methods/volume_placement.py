@@ -9,8 +9,8 @@ from jaxtyping import Float64
 
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources
+from deltalight.render_server.geometry_state import GeometryState, ObjectExtent
 from deltalight.render_server.gpu.kernel import Binding
-from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.methods.light_maps import object_extent
 from deltalight.render_server.methods.object_groups import group_near, relative_gaps

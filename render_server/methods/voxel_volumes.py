@@ -12,12 +12,12 @@ import numpy as np
 
 from deltalight.protocol.scene_method import DvctMethod, VoxelConeSettings
 from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.clearing import clear_ahead
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
 from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu.uniform_block import UniformBlock
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.caustic_beams import casts_caustics

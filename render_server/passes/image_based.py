@@ -62,7 +62,7 @@ class AmbientOcclusion:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """The binding of image_based_surface.comp.glsl."""
+        """The binding of image_based_radiance.comp.glsl."""
         return {"ambient_occlusion": self.open}
 
     def release(self) -> None:
@@ -70,8 +70,8 @@ class AmbientOcclusion:
         release_all(self.open, self._kernel)
 
 
-class ImageBasedSurface:
-    """Radiance of the virtual surfaces (RGBA16F) under a map of all light, on the picture's grid.
+class ImageBasedRadiance:
+    """Radiance of the objects (RGBA16F) under a map of all light, on the picture's grid.
 
     `precomputed`: what the objects hide of it comes by their transfer, not by ambient occlusion.
     """
@@ -80,15 +80,15 @@ class ImageBasedSurface:
         self, gpu: GpuContext, size: tuple[int, int], samples: int, *, precomputed: bool = False
     ) -> None:
         self._samples = samples
-        self.radiance = texture_2d(gpu, size, 4, "f2")
-        self._kernel = Kernel(gpu, "image_based_surface", **({"PRECOMPUTED": 1} if precomputed else {}))
+        self.texture = texture_2d(gpu, size, 4, "f2")
+        self._kernel = Kernel(gpu, "image_based_radiance", **({"PRECOMPUTED": 1} if precomputed else {}))
 
     def run(self, light: SurroundingLight, hidden: Bindings, rectangle: Rectangle, scene: Bindings) -> None:
         """Shades the objects in the rectangle; `hidden` binds what they hide of the light."""
         if min(rectangle[2:]) > 0:
             own: Bindings = {"rectangle": rectangle, "sample_count": self._samples}
-            self._kernel.run(rectangle[2:], own, light.bindings, hidden, scene, radiance_out=self.radiance)
+            self._kernel.run(rectangle[2:], own, light.bindings, hidden, scene, radiance_out=self.texture)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.radiance, self._kernel)
+        release_all(self.texture, self._kernel)

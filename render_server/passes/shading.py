@@ -296,13 +296,13 @@ class DirectLightPair(DirectLight):
         super().release()
 
 
-class VirtualSurface:
-    """Radiance of the virtual surfaces (RGBA16F) on the picture's grid, where objects cover it."""
+class ObjectRadiance:
+    """Radiance of the objects (RGBA16F) on the picture's grid, where objects cover it."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._walk = ListWalk(gpu, size[0] * size[1])
-        self.radiance = texture_2d(gpu, size, 4, "f2")
-        self._kernel = Kernel(gpu, "virtual_surface")
+        self.texture = texture_2d(gpu, size, 4, "f2")
+        self._kernel = Kernel(gpu, "object_radiance")
 
     def run(
         self,
@@ -319,7 +319,7 @@ class VirtualSurface:
             grid.shown_pixels,
             _caustics_on(grid, caustics),
             scene,
-            radiance_out=self.radiance,
+            radiance_out=self.texture,
             ShownPixels=grid.shown_pixels,
             cone_irradiance=cones.virtual,
             cone_specular=cones.virtual_specular,
@@ -329,7 +329,7 @@ class VirtualSurface:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.radiance, self._kernel, self._walk)
+        release_all(self.texture, self._kernel, self._walk)
 
 
 def _caustics_on(grid: LowResGrid, caustics: Caustics | None) -> dict[str, Binding]:

@@ -24,7 +24,7 @@ from deltalight.protocol.cached_files import (
     write_cached,
 )
 from deltalight.protocol.errors import DeltalightError
-from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.scene.occlusion_field import ProgressCallback
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 

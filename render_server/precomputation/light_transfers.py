@@ -10,7 +10,7 @@ import numpy as np
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.protocol.scene_output import Shading
-from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.precomputation.job_cache import Job, Precomputations, load_arrays, store_arrays
 from deltalight.render_server.scene.precomputed_transfer import (
     ObjectTransfer,

@@ -10,7 +10,7 @@ from jaxtyping import Float32
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.protocol.scene_objects import SceneObject
-from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.precomputation.job_cache import (
     Checkpoint,
     Job,

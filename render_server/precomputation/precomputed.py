@@ -10,7 +10,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.protocol.scene_objects import SceneObject
-from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.precomputation.light_transfers import (
     ObjectTransfers,
     require_rigid_transfer,

@@ -30,7 +30,7 @@ DARK_LINEAR = 0.005
 CELLS = 64  # per edge of the cube: 5 cm in a room of 3 m, finer than bounce light resolves
 MARGIN = 1.1  # of the cube over the scene's bounds
 MAX_WEIGHT = 200.0  # samples a cell keeps: as many new ones replace an outdated albedo
-ALBEDO_RANGE = (0.02, 0.95)
+ALBEDO_RANGE = (0.02, 0.95)  # as in common/albedo_range.glsl
 MEAN_ALBEDO = 0.5  # before any observation
 
 

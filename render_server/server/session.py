@@ -8,7 +8,6 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import structlog
@@ -17,7 +16,7 @@ from jaxtyping import Float64, UInt8
 from deltalight.protocol.documents import nearest, validate
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.message_fields import as_counts, as_sentence
+from deltalight.protocol.message_fields import Matrix4, as_counts, as_sentence, matrix_rows
 from deltalight.protocol.messages import (
     CamerasMessage,
     CameraStatus,
@@ -453,8 +452,8 @@ class RenderSession:
         self._last_fault = sentence
 
 
-def _rows(matrix: Float64[np.ndarray, "4 4"] | None) -> Any:  # noqa: ANN401 - pydantic makes tuples of four of it
-    return None if matrix is None else matrix.tolist()
+def _rows(matrix: Float64[np.ndarray, "4 4"] | None) -> Matrix4 | None:
+    return None if matrix is None else matrix_rows(matrix)
 
 
 def needs_depth(scene: SceneDocument) -> bool:

@@ -38,14 +38,16 @@ class RoomStatus(StrictModel):
         description="`waiting` (for a slot, or drained), `starting`, `running`, or `failed` until it is "
         "restarted."
     )
-    why: str = Field("", description="Why the room is waiting, failed, or shows nothing; else empty.")
+    why: str = Field(default="", description="Why the room is waiting, failed, or shows nothing; else empty.")
     waits_for: Reason | None = Field(
-        None, description="`slot` = until one is free; `drained`, `failed` = until it is restarted."
+        default=None, description="`slot` = until one is free; `drained`, `failed` = until it is restarted."
     )
-    slot: str | None = Field(None, description="Slot in which its render server runs.")
+    slot: str | None = Field(default=None, description="Slot in which its render server runs.")
     endpoints: RoomEndpoints | None = None
-    moving_to: str | None = Field(None, description="Slot in which its next render server will start.")
-    restarts: int = Field(0, ge=0, description="How often its render server was lost and replaced.")
+    moving_to: str | None = Field(
+        default=None, description="Slot in which its next render server will start."
+    )
+    restarts: int = Field(default=0, ge=0, description="How often its render server was lost and replaced.")
 
 
 class SlotStatus(StrictModel):
@@ -55,7 +57,9 @@ class SlotStatus(StrictModel):
     device: str = Field(description="Device on which it renders.")
     room: str | None = Field(description="Room in this slot; null = free.")
     host: str = Field(description="Host of the device.")
-    drained: bool = Field(False, description="Whether its host is drained, so that no room starts there.")
+    drained: bool = Field(
+        default=False, description="Whether its host is drained, so that no room starts there."
+    )
 
 
 class RoomList(StrictModel):

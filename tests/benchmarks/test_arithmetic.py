@@ -1,6 +1,6 @@
 """What shaders execute is counted exactly where a closed form tells it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import moderngl
@@ -14,7 +14,7 @@ from deltalight.benchmarks.speed.peaks import FLOPS_OF_ROUND
 from deltalight.benchmarks.speed.peaks import SHADERS as PEAK_SHADERS
 from deltalight.benchmarks.speed.spirv import Instruction, counting, decoded, encoded
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.kernel import Binding, Kernel
 from deltalight.render_server.gpu.textures import release_all
 from tests.benchmarks.small_demo import needs_tools
 
@@ -53,7 +53,7 @@ def executed(
     (folder / "counted.comp.glsl").write_text(HEAD + body)
     kernel, out = Kernel(gpu, folder / "counted"), gpu.ctx.buffer(bytes(4 * threads))
     counter.reset()
-    given = {
+    given: dict[str, Binding] = {
         "turn": np.eye(3),
         "wide": tuple(map(float, range(6))),
         "v": (1.0, 2.0, 3.0, 4.0),
@@ -107,7 +107,7 @@ def test_an_expression_costs_what_it_is_defined_by(
     assert executed(counting_gpu, tmp_path, body) == Cost(THREADS * once.flops, THREADS * once.special)
 
 
-CONTROL = {  # bodies, and the cost of invocation `i`
+CONTROL: dict[str, Callable[[int], int]] = {  # bodies, and the cost of invocation `i`
     "for (int k = 0; k < rounds; ++k) sum = sum * x + 1.0;": lambda _: 2 * ROUNDS,
     "for (int k = 0; k < rounds; ++k) { if (k == 3) continue; sum += x; }": lambda _: ROUNDS - 1,
     "for (int k = 0; k < i % 5; ++k) sum += x;": lambda i: i % 5,

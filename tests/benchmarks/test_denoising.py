@@ -29,7 +29,7 @@ def noisy_edge(size: int = 64) -> tuple[GuidedPicture, np.ndarray]:
     clean = np.full((size, size, 3), 0.2, np.float32)
     clean[:, : size // 2] = 3.0
     noise = np.random.default_rng(3).gamma(1.0, 1.0, clean.shape).astype(np.float32)
-    normal = np.broadcast_to(np.float32([0, 0, 1]), clean.shape)
+    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), clean.shape)
     return GuidedPicture(clean * noise, np.full_like(clean, 0.5), normal), clean
 
 

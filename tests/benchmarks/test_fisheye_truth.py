@@ -14,6 +14,7 @@ from deltalight.benchmarks.variants import FIXED, parse_variants
 from deltalight.protocol.frames import LUMINANCE, ViewFrame
 from deltalight.protocol.scene_lights import Lights
 from deltalight.protocol.scene_lights import SphereLight as GivenSphere
+from deltalight.protocol.scene_method import DvctMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.lights.light_models import IncidentLight, SphereLight, incident_light
 from deltalight.render_server.lights.lights import LightSet
@@ -116,4 +117,5 @@ def test_fisheye_is_a_method_to_compare(case: SceneCase) -> None:
     changed = variant.applied(case.truth.document(0), 64)
     assert changed.lights.mode == "fisheye"
     assert changed.lights.resolved_registration == "auto"
+    assert isinstance(changed.method, DvctMethod)
     assert changed.method.volume_size == 64

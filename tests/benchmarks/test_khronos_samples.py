@@ -41,7 +41,9 @@ def test_each_model_is_drawn_beside_its_screenshot(
     assert broken.startswith("1/2 Broken: refused: ")
     assert plate.startswith("2/2 Plate: drawn in part: ")
     assert plate.endswith("is shown without KHR_materials_iridescence.")
-    pair = cv2.imread(str(out / "Plate.png"))[..., ::-1].astype(int)
+    written = cv2.imread(str(out / "Plate.png"))
+    assert written is not None
+    pair = written[..., ::-1].astype(int)
     assert pair.shape[0] == EDGE
     drawn, screenshot = pair[:, :EDGE], pair[:, EDGE:]
     redness = drawn[..., 0] - drawn[..., 1] > 60
@@ -51,6 +53,7 @@ def test_each_model_is_drawn_beside_its_screenshot(
     assert drawn[0, 0] == pytest.approx([GROUND] * 3, abs=1)
     assert screenshot[0, 0] == pytest.approx(SCREENSHOT_RED)
     sheet = cv2.imread(str(out / "sheet.png"))
+    assert sheet is not None
     assert sheet.shape[0] == EDGE
 
 

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,12 +137,17 @@ def test_a_run_goes_on_where_it_was_cut_off(tmp_path: Path, monkeypatch: pytest.
     damaged = next((tmp_path / ".quality.partial").glob("*.npz"))
     damaged.write_bytes(damaged.read_bytes()[:-1])
     measured.clear()
-    (again,) = measure_quality(job, Progress(disable=True), kept).scenes
+    scenes: Any = measure_quality(job, Progress(disable=True), kept).scenes  # of what is patched
+    (again,) = scenes
     assert kept.taken == 1
     assert len(measured) == 2
     taken, wanted = again["exact"], result().scenes[0].variants["exact"]
     np.testing.assert_equal({**vars(taken)}, {**vars(wanted)})
+
+    def fail() -> VariantResult:
+        raise ZeroDivisionError
+
     with pytest.raises(ZeroDivisionError):
-        kept.result(lambda: 1 // 0, "another renderer", "scene-0123", job.variants[0], None)
+        kept.result(fail, "another renderer", "scene-0123", job.variants[0], None)
     kept.remove()
     assert list(tmp_path.iterdir()) == []

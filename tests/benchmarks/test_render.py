@@ -218,9 +218,15 @@ def test_truths_coats_and_sheens_keep_the_light(coat: tuple[float, float], sheen
     choose_variant()
     from deltalight.benchmarks.ground_truth.coated_bsdf import coated
 
-    over = {"coat": coat, "sheen": (sheen,) * 3, "sheen_roughness": 0.5}
     for metallic in (0.0, 1.0):
-        bsdf = coated((1.0, 1.0, 1.0), roughness=0.5, metallic=metallic, **over)
+        bsdf = coated(
+            (1.0, 1.0, 1.0),
+            roughness=0.5,
+            metallic=metallic,
+            coat=coat,
+            sheen=(sheen, sheen, sheen),
+            sheen_roughness=0.5,
+        )
         kept = reflected(bsdf)
         print(f"coat {coat}, sheen {sheen}, metallic {metallic}: {np.round(kept[:, 0], 3)}")
         assert kept == pytest.approx(1.0, abs=0.03)

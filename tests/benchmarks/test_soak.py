@@ -292,7 +292,11 @@ def test_a_load_is_compared_with_calm_spans_beside_which_their_own_difference_is
 
 def test_what_a_spare_costs_others_is_shown_and_what_was_not_waited_for_is_not() -> None:
     flow = {"frames_per_s": 52.0, "unwaited_p95_ms": 140.0}
-    outcomes = ({"spare_ready_s": 31.0, "meanwhile": flow}, {"spare_ready_s": None, "meanwhile": flow}, {})
+    outcomes: list[dict[str, object]] = [
+        {"spare_ready_s": 31.0, "meanwhile": flow},
+        {"spare_ready_s": None, "meanwhile": flow},
+        {},
+    ]
     kills = [FaultRecord(name="kill-server", began_s=1, ended_s=9, outcome=each) for each in outcomes]
     figures = {each.what: each for each in all_figures(soaked(faults=kills))}
     assert figures["spare ready"].result == "31 s"

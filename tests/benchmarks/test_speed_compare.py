@@ -96,7 +96,7 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(
 
 def write_quality(file: Path, **db: float | None) -> Path:
     means = {name: {"changed_psnr_db": value, "frame_ms": 1.0} for name, value in db.items()}
-    scenes = {"tabletop": {}, "cornell": {}}
+    scenes: dict[str, object] = {"tabletop": {}, "cornell": {}}
     about = {"kind": "deltalight quality report", "size": [16, 12], "spp": 8, "cpus": 2}
     file.write_text(json.dumps({**about, "means": means, "scenes": scenes}))
     return file

@@ -38,6 +38,7 @@ from deltalight.protocol.fisheye_lens import FisheyeCalibration
 from deltalight.protocol.frames import FisheyePictures
 from deltalight.protocol.hemisphere import texel_solid_angles
 from deltalight.protocol.pictures import decode_rgb
+from deltalight.protocol.scene_method import DvctMethod
 from deltalight.protocol.source import open_source
 from deltalight.sensor_node.fisheye import radiance_map
 
@@ -239,7 +240,8 @@ def test_document_says_where_and_what_the_objects_are(truth: Truth) -> None:
     assert item.world_from_object() == pytest.approx(SCENE.objects[0].world_from_object[0])
     assert [light.type for light in document.lights.manual] == ["sphere", "ambient"]
     assert document.lights.resolved_registration == (1.0, 1.0, 1.0)
-    assert document.method.volume_edge_m == 0.4  # type: ignore[union-attr]
+    assert isinstance(document.method, DvctMethod)
+    assert document.method.volume_edge_m == 0.4
 
 
 def test_moving_object_has_a_document_a_frame_and_a_still_room(tmp_path: Path) -> None:

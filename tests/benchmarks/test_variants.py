@@ -31,7 +31,9 @@ def test_variant_changes_its_settings_only() -> None:
     method = variant.applied(SCENE, 128).method
     assert method == DvctMethod(operator="exact", cone_count=32, volume_edge_m=0.7, volume_size=128)
     (own_size,) = parse_variants("exact:volume_size=64")
-    assert own_size.applied(SCENE, 128).method.volume_size == 64
+    own_method = own_size.applied(SCENE, 128).method
+    assert isinstance(own_method, DvctMethod)
+    assert own_method.volume_size == 64
     (hurried,) = parse_variants("exact:output.frame_budget_ms=125")
     assert hurried.applied(SCENE, None).output.frame_budget_ms == 125
     assert isinstance(parse_variants("none")[0].applied(SCENE, None).method, NoneMethod)
@@ -40,7 +42,7 @@ def test_variant_changes_its_settings_only() -> None:
 def test_the_floor_is_a_method_that_no_document_may_name() -> None:
     (raster,) = parse_variants("raster:quality=live", RENDERED)
     document = raster.applied(SCENE, 64)
-    assert (document.method.name, document.method.quality) == ("raster", "live")
+    assert (document.method.method_name(), document.method.quality) == ("raster", "live")
     assert choose_method(document.method, software=True).resolved.triangle_budget < 40_000
     with pytest.raises(DeltalightError, match="raster"):
         parse_scene({"method": {"name": "raster"}})

@@ -62,9 +62,9 @@ class Release:
             (folder / name).mkdir()
         self._others = {inside: str(folder / name) for inside, name in places.items()}
         self._others |= {"5604": str(directory), "6379": str(gcs), "fleet-keeper": KEEPER}
-        self._own_ports = {
-            "keeper": {"6380": raylets[0], "6381": raylets[1], "=8000": f"={self.page}"},
-            "render": {"6380": raylets[2], "6381": raylets[3]},
+        self._own_ports: dict[str, dict[str, str]] = {
+            "keeper": {"6380": str(raylets[0]), "6381": str(raylets[1]), "=8000": f"={self.page}"},
+            "render": {"6380": str(raylets[2]), "6381": str(raylets[3])},
             "web": {"=8000": f"={self.web}"},
         }
         (rooms_file,) = of_kind(resources, "ConfigMap")
@@ -94,7 +94,7 @@ class Release:
 
     def _here(self, pod: str, text: str) -> str:
         for inside, outside in (self._others | self._own_ports[pod]).items():
-            text = text.replace(inside, str(outside))
+            text = text.replace(inside, outside)
         return text
 
     def client(self, port: int) -> httpx.Client:

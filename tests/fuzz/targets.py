@@ -66,7 +66,8 @@ def packed(pieces: Sequence[bytes]) -> bytes:
 
 def pieces_of(data: bytes) -> list[bytes]:
     """Returns the pieces of an input; the last takes what is left."""
-    pieces, place = [], 0
+    pieces: list[bytes] = []
+    place = 0
     while place + 4 <= len(data) and len(pieces) < MOST_PIECES:
         (length,) = struct.unpack_from("<I", data, place)
         pieces.append(data[place + 4 : place + 4 + length])

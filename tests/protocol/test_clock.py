@@ -171,7 +171,7 @@ def test_offset_over_real_sockets() -> None:
 @pytest.mark.parametrize("time_ns", [-1, 2**63])
 def test_a_clock_that_no_message_can_follow_is_refused(time_ns: int) -> None:
     def reply(asked: ControlRequest, _timeout_s: float) -> ControlReply:
-        payload = {"received_ns": time_ns, "sent_ns": time_ns}
+        payload: dict[str, object] = {"received_ns": time_ns, "sent_ns": time_ns}
         return ControlReply(node="server", id=asked.id, ok=True, payload=payload)
 
     with pytest.raises(DeltalightError, match="centuries off"):

@@ -2,6 +2,7 @@
 
 import random
 import struct
+from typing import Literal
 
 import blosc2
 import cv2
@@ -25,7 +26,9 @@ from deltalight.protocol.codecs import (
     jpeg_size,
 )
 from deltalight.protocol.envelope import EnvelopeError
+from deltalight.protocol.messages import DType
 
+Coding = Literal["raw", "blosc2"]
 pictures = hnp.arrays(np.uint8, st.tuples(st.integers(1, 24), st.integers(1, 24), st.just(3)))
 
 
@@ -65,7 +68,9 @@ def test_jpeg_that_is_turned_by_its_metadata_is_read_as_stored() -> None:
     tiff = b"II*\0\x08\0\0\0" + struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, 6, 0, 0)
     exif = b"Exif\0\0" + tiff
     turned = code[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + code[2:]
-    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (64, 48, 3)
+    shown = cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    assert shown.shape == (64, 48, 3)
     np.testing.assert_array_equal(
         decode_color(turned, "jpeg", (48, 64, 3)), decode_color(code, "jpeg", (48, 64, 3))
     )
@@ -76,7 +81,7 @@ def test_jpeg_that_is_turned_by_its_metadata_is_read_as_stored() -> None:
     st.sampled_from([0.0002, 0.001, 1 / 5000, 0.00025]),
     st.sampled_from(["raw", "blosc2"]),
 )
-def test_depth_that_was_made_of_steps_is_exact(steps: np.ndarray, scale: float, encoding: str) -> None:
+def test_depth_that_was_made_of_steps_is_exact(steps: np.ndarray, scale: float, encoding: Coding) -> None:
     depth = steps.astype(np.float32) * np.float32(scale)
     back, valid = decode_depth(encode_depth(depth, steps > 0, encoding, scale), encoding, steps.shape, scale)
     np.testing.assert_array_equal(back, depth)
@@ -84,7 +89,7 @@ def test_depth_that_was_made_of_steps_is_exact(steps: np.ndarray, scale: float, 
 
 
 @pytest.mark.parametrize("encoding", ["raw", "blosc2"])
-def test_depth_is_right_to_half_a_step(encoding: str) -> None:
+def test_depth_is_right_to_half_a_step(encoding: Coding) -> None:
     depth = smooth_depth()
     part = encode_depth(depth, np.ones_like(depth, bool), encoding)
     back, valid = decode_depth(part, encoding, depth.shape, DEFAULT_DEPTH_SCALE_M)
@@ -109,7 +114,7 @@ def test_depth_that_cannot_be_told_is_unknown_and_never_near() -> None:
     st.sampled_from(["raw", "blosc2"]),
 )
 def test_arrays_of_every_type_are_exact(
-    dtype: str, rows: int, columns: int, seed: int, encoding: str
+    dtype: DType, rows: int, columns: int, seed: int, encoding: Coding
 ) -> None:
     values = np.random.default_rng(seed).integers(0, 1000, (rows, columns)).astype(dtype)
     values[: seed % rows] = 0

@@ -116,7 +116,9 @@ def test_response_file_goes_before_the_one_in_the_calibration(tmp_path: Path) ->
     table = np.linspace(0, 1, 768, dtype=np.float32).reshape(256, 3)
     np.savetxt(tmp_path / "a" / "fisheye_response.txt", table, fmt="%.9g")
     assert reader[0].fisheye is not None
-    assert np.array_equal(np.asarray(reader[0].fisheye.calibration.response), calibration().response)
+    assert np.array_equal(
+        np.asarray(reader[0].fisheye.calibration.response), np.asarray(calibration().response)
+    )
     found = fisheye_of(tmp_path / "a").calibration
     assert np.array_equal(np.asarray(found.response), table)
     assert found.lens.to_dict() == equidistant().to_dict()

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from deltalight.protocol.envelope import EnvelopeError, decode, encode, pack_header, unpack_header
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.message_fields import matrix_rows
 from deltalight.protocol.messages import (
     MAX_HEADER_BYTES,
     MESSAGE_TYPES,
@@ -25,6 +26,7 @@ from deltalight.protocol.messages import (
     ControlRequest,
     DepthMessage,
     FisheyeMessage,
+    LampEntry,
     LampsMessage,
     Message,
     PoseMessage,
@@ -33,7 +35,7 @@ from deltalight.protocol.messages import (
 from deltalight.protocol.vectors import FOLDER, unframe_pieces
 
 CAMERA: dict[str, object] = {"width": 4, "height": 2, "distortion": [0.1, 0.0]}
-IDENTITY = np.eye(4).tolist()
+IDENTITY = matrix_rows(np.eye(4))
 
 nodes = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", fullmatch=True)
 counts = st.integers(0, 2**63 - 1)
@@ -262,6 +264,10 @@ def test_a_pose_must_be_a_rigid_transform(matrix: np.ndarray) -> None:
         unpack_header(header_of(good, world_from_camera=matrix.tolist()))
 
 
+def lamps_message(base: dict[str, Any], **lamp: object) -> LampsMessage:
+    return LampsMessage.model_validate({**base, "lamps": [lamp]})
+
+
 @pytest.mark.parametrize(
     "build",
     [
@@ -270,13 +276,11 @@ def test_a_pose_must_be_a_rigid_transform(matrix: np.ndarray) -> None:
         lambda base: ControlReply(**base, id="a", ok=False),
         lambda base: ControlReply(**base, id="a", ok=True, error="no"),
         lambda base: FisheyeMessage(**base, encoding="jpeg", shape=(2, 2, 3), dtype="float32", camera={}),
-        lambda base: LampsMessage(**base, lamps=[{"marker": 1, "world_from_marker": IDENTITY}] * 65),
-        lambda base: LampsMessage(
-            **base, lamps=[{"marker": 1, "world_from_marker": np.diag([1, 1, 1, 2.0]).tolist()}]
-        ),
-        lambda base: LampsMessage(**base, lamps=[{"marker": -1, "world_from_marker": IDENTITY}]),
+        lambda base: LampsMessage(**base, lamps=(LampEntry(marker=1, world_from_marker=IDENTITY),) * 65),
+        lambda base: lamps_message(base, marker=1, world_from_marker=np.diag([1, 1, 1, 2.0]).tolist()),
+        lambda base: lamps_message(base, marker=-1, world_from_marker=IDENTITY),
         lambda base: StatsMessage(**base, state="running", rates={"color": -1.0}),
-        lambda base: StatsMessage(**base, state="running", drops={"color": 1.5}),
+        lambda base: StatsMessage.model_validate({**base, "state": "running", "drops": {"color": 1.5}}),
     ],
 )
 def test_fields_that_contradict_each_other_are_refused(build: Callable[[dict[str, Any]], Message]) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from deltalight.protocol import growing_file
 from deltalight.protocol.growing_file import GrowingFile
 
 
@@ -19,8 +18,8 @@ class Disk:
         self.path, self.error, self.room = path, 0, 0
         self.loses_from: int | None = None
         self._pwrite: Callable[[int, bytes, int], int] = os.pwrite
-        monkeypatch.setattr(growing_file.os, "pwrite", self.pwrite)
-        monkeypatch.setattr(growing_file.os, "fsync", self.fsync)
+        monkeypatch.setattr(os, "pwrite", self.pwrite)
+        monkeypatch.setattr(os, "fsync", self.fsync)
 
     def pwrite(self, handle: int, data: bytes, position: int) -> int:
         if not self.error:

@@ -165,7 +165,7 @@ def lights_message(multipart: list[bytes]) -> tuple[LightsMessage, list[memoryvi
 
 def test_lights_come_back_to_the_bit_and_name_their_map() -> None:
     of_map = STAMPS | {"frame_id": 5, "capture_ns": NOW - 70}
-    message, parts = lights_message(lights_multipart(sample_lights(), STAMPS, of_map))  # type: ignore[arg-type]
+    message, parts = lights_message(lights_multipart(sample_lights(), STAMPS, of_map))
     assert_same_lights(sky_lights(message, parts), sample_lights())
     assert (message.frame_id, message.radiance_frame_id, message.radiance_capture_ns) == (7, 5, NOW - 70)
 
@@ -253,7 +253,13 @@ def test_a_camera_that_is_none_is_refused() -> None:
     header, parts = fisheye_message(fisheye_multipart(coded(NOW), STAMPS, "raw", JPEG_QUALITY))
     lens = dict(header.camera["lens"])  # type: ignore[call-overload]
     wild = {"lens": lens | {"distortion": [1e300, -1e300, 1e308, 1e-300]}}
-    for camera in ({}, {"lens": {}}, {"lens": {"distortion_model": "cubic"}}, wild):
+    cameras: tuple[dict[str, object], ...] = (
+        {},
+        {"lens": {}},
+        {"lens": {"distortion_model": "cubic"}},
+        wild,
+    )
+    for camera in cameras:
         with pytest.raises(DeltalightError):
             fisheye_pictures(header.model_copy(update={"camera": camera}), parts)
     with pytest.raises(DeltalightError, match="response"):

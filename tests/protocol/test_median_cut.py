@@ -71,7 +71,11 @@ def irradiance_of_lights(lights: tuple[RegionLight, ...]) -> np.ndarray:
     return total
 
 
-def require_the_map(split: Split, sky: HemisphereMap | EnvironmentMap, within: float = 0.01) -> None:
+def require_the_map(
+    split: Split[HemisphereMap] | Split[EnvironmentMap],
+    sky: HemisphereMap | EnvironmentMap,
+    within: float = 0.01,
+) -> None:
     """Lights and residual are the map within 0.1 % of its flux, and within 1 % as irradiance of any normal."""
     lights = sum((light.irradiance for light in split.lights), np.zeros(3))
     assert flux(split.residual) + lights == pytest.approx(flux(sky), rel=1e-3)

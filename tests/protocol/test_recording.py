@@ -33,7 +33,7 @@ LENS = np.array([0.1, -0.05, 0.001, -0.002, 0.01])
 
 def camera(width: int = WIDTH, height: int = HEIGHT, distortion: np.ndarray | None = None) -> CameraModel:
     matrix = np.array([[60.5, 0, width / 2], [0, 61.25, height / 2], [0, 0, 1]])
-    return CameraModel(width, height, matrix, "plumb_bob", distortion)
+    return CameraModel(width, height, matrix, "plumb_bob", np.zeros(0) if distortion is None else distortion)
 
 
 def board() -> BoardSpec:

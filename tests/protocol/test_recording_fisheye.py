@@ -208,7 +208,9 @@ def test_a_real_bracket_comes_through_dataset_wire_and_recording(shared_data: Pa
     office = shared_data / "fisheye" / "indoor_hdr_bracket_office"
     rows = [line.split(",") for line in (office / "exposures.csv").read_text().splitlines()[1:]]
     files = [office / "jpeg_quarter" / row[0].replace(".JPG", ".jpg") for row in rows]
-    height, width = cv2.imread(str(files[0])).shape[:2]
+    picture = cv2.imread(str(files[0]))
+    assert picture is not None
+    height, width = picture.shape[:2]
     focal = height / np.pi
     matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     lens = EquidistantLens(CameraModel(width, height, matrix, "equidistant", np.zeros(4)))

@@ -30,6 +30,16 @@ def request(**fields: object) -> ControlRequest:
     return ControlRequest.model_validate({"node": "api", "id": "r1", "op": "set_scene", **fields})
 
 
+def noting(done: list[ControlRequest]) -> Callable[[ControlRequest], dict[str, object]]:
+    """Keeps what it carries out, and answers how much that is."""
+
+    def handler(control: ControlRequest) -> dict[str, object]:
+        done.append(control)
+        return {"n": len(done)}
+
+    return handler
+
+
 def test_request_and_reply(opened: Callable[[Any], Any]) -> None:
     server = opened(ReplyServer(ANY, lambda control: {"echo": control.payload, "op": control.op}, node="gpu"))
     client = opened(RequestClient(server.endpoint))
@@ -61,14 +71,14 @@ def test_a_payload_beyond_4_mb_is_refused_before_it_is_sent(opened: Callable[[An
 
 
 def test_a_long_payload_is_not_carried_out_twice(opened: Callable[[Any], Any]) -> None:
-    done: list[str] = []
-    server = opened(ReplyServer(ANY, lambda control: {"n": done.append(control.id)}))
+    done: list[ControlRequest] = []
+    server = opened(ReplyServer(ANY, noting(done)))
     client = opened(RequestClient(server.endpoint))
     payload: dict[str, object] = {"text": "x" * 100_000}
     for name in ("r1", "r1", "r2"):
         assert client.request(request(id=name, revision=3, payload=payload), 30).ok
     assert not client.request(request(id="r3", revision=3, payload={"text": "y" * 100_000}), 30).ok
-    assert done == ["r1"]
+    assert [control.id for control in done] == ["r1"]
 
 
 @pytest.mark.parametrize(
@@ -107,7 +117,12 @@ def test_a_server_that_is_closed_by_a_request_still_answers_it(opened: Callable[
 
     server = ReplyServer(ANY, handler)
     client = opened(RequestClient(server.endpoint))
-    owner = threading.Thread(target=lambda: (asked.wait(30), server.close()))
+
+    def close_when_asked() -> None:
+        asked.wait(30)
+        server.close()
+
+    owner = threading.Thread(target=close_when_asked)
     owner.start()
     assert client.request(request(op="shutdown"), 30).payload == {"op": "shutdown"}
     owner.join()
@@ -140,13 +155,13 @@ def test_refusals_faults_and_bad_answers_are_sentences_and_the_server_lives_on(
 
 
 def test_repeats_are_not_carried_out_twice(opened: Callable[[Any], Any]) -> None:
-    done: list[int | None] = []
-    server = opened(ReplyServer(ANY, lambda control: {"n": len(done), "done": done.append(control.revision)}))
+    done: list[ControlRequest] = []
+    server = opened(ReplyServer(ANY, noting(done)))
     client = opened(RequestClient(server.endpoint))
     first = client.request(request(revision=3, payload={"name": "a"}), 30)
     again = client.request(request(revision=3, payload={"name": "a"}), 30)
     renamed = client.request(request(id="r2", revision=3, payload={"name": "a"}), 30)
-    assert done == [3]
+    assert [control.revision for control in done] == [3]
     assert first == again
     assert (renamed.id, renamed.payload) == ("r2", first.payload)
     older = client.request(request(id="r3", revision=2), 30)
@@ -156,14 +171,12 @@ def test_repeats_are_not_carried_out_twice(opened: Callable[[Any], Any]) -> None
     assert "send 4 or higher" in str(older.error)
     assert client.request(request(id="r5", revision=4), 30).ok
     assert client.request(request(id="r6", op="other", revision=1), 30).ok
-    assert done == [3, 4, 1]
+    assert [control.revision for control in done] == [3, 4, 1]
 
 
 def test_revisions_hold_for_one_scene(opened: Callable[[Any], Any]) -> None:
-    done: list[tuple[str | None, int | None]] = []
-    server = opened(
-        ReplyServer(ANY, lambda control: {"n": done.append((control.scene_id, control.revision))})
-    )
+    done: list[ControlRequest] = []
+    server = opened(ReplyServer(ANY, noting(done)))
     client = opened(RequestClient(server.endpoint))
     sent: list[tuple[str | None, int | None]] = [
         ("a", 3),
@@ -177,7 +190,7 @@ def test_revisions_hold_for_one_scene(opened: Callable[[Any], Any]) -> None:
         assert client.request(request(id=f"r{number}", scene_id=scene_id, revision=revision), 30).ok
     assert client.request(request(id="again", revision=1), 30).ok
     assert not client.request(request(id="older", revision=0), 30).ok
-    assert done == sent
+    assert [(control.scene_id, control.revision) for control in done] == sent
 
 
 def test_memory_forgets_old_ids_and_a_refused_revision_may_come_again() -> None:
@@ -201,16 +214,16 @@ def test_memory_of_long_replies_is_bounded() -> None:
 
 
 def test_a_silent_server_is_named_in_time_and_its_queue_is_forgotten(opened: Callable[[Any], Any]) -> None:
-    done: list[str] = []
-    server = ReplyServer(ANY, lambda control: {"x": done.append(control.id)})
+    done: list[ControlRequest] = []
+    server = ReplyServer(ANY, noting(done))
     client = opened(RequestClient(server.endpoint))
     assert client.request(request(), 30).ok
     server.close()
     with pytest.raises(DeltalightError, match=r"no answer from tcp://127.0.0.1:\d+ within 0.3 s"):
         client.request(request(id="lost"), 0.3)
-    opened(ReplyServer(server.endpoint, lambda control: {"x": done.append(control.id)}))
+    opened(ReplyServer(server.endpoint, noting(done)))
     assert client.request(request(id="found"), 30).ok
-    assert done == ["r1", "found"]
+    assert [control.id for control in done] == ["r1", "found"]
 
 
 def test_a_late_answer_does_not_meet_the_next_request(opened: Callable[[Any], Any]) -> None:

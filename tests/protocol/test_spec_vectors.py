@@ -4,7 +4,7 @@ import base64
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -17,12 +17,17 @@ from deltalight.protocol.messages import (
     MAX_PART_BYTES,
     MESSAGE_TYPES,
     SCHEMA_VERSION,
+    FisheyeMessage,
+    LampsMessage,
+    LightsMessage,
     Message,
+    RadianceMessage,
 )
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import Region
 from deltalight.protocol.vectors import FOLDER, frame_pieces, unframe_pieces
 
+MessageT = TypeVar("MessageT", bound=Message)
 NAMES = sorted(path.stem for path in Path(FOLDER).glob("*.bin"))
 SPEC = (Path(FOLDER).parent / "SPEC.md").read_text()
 
@@ -32,6 +37,12 @@ def load(name: str) -> tuple[list[bytes], dict[str, Any]]:
         unframe_pieces((FOLDER / f"{name}.bin").read_bytes()),
         json.loads((FOLDER / f"{name}.json").read_text()),
     )
+
+
+def decoded(kind: type[MessageT], name: str) -> tuple[MessageT, list[memoryview]]:
+    message, parts = decode(load(name)[0])
+    assert isinstance(message, kind)
+    return message, parts
 
 
 def pictures(message: Message, parts: list[memoryview]) -> list[np.ndarray]:
@@ -48,6 +59,7 @@ def pictures(message: Message, parts: list[memoryview]) -> list[np.ndarray]:
     if message.stream == "lights":
         sky = sky_lights(message, parts)
         return [sky.residual, sky.seen]
+    assert message.stream in ("color", "composite")
     return [decode_color(parts[0], message.encoding, message.shape)]
 
 
@@ -90,17 +102,16 @@ def test_the_response_vector_is_the_straight_line() -> None:
 
 
 def test_the_light_vectors_tell_lens_response_and_places() -> None:
-    message, parts = decode(load("fisheye_coded_raw")[0])
-    calibration = fisheye_pictures(message, parts).calibration
+    calibration = fisheye_pictures(*decoded(FisheyeMessage, "fisheye_coded_raw")).calibration
     assert (calibration.lens.width, calibration.lens.height, calibration.vignetting) == (4, 2, (-0.05,))
     assert np.asarray(calibration.response)[51, 0] == pytest.approx(0.2)
-    lamps = lamp_poses(decode(load("lamps")[0])[0])
+    lamps = lamp_poses(decoded(LampsMessage, "lamps")[0])
     assert [lamp.marker for lamp in lamps] == [40, 41]
     assert lamps[1].world_from_marker[:3, 3].tolist() == [0.25, -0.5, 0.75]
-    light = radiance_map(*decode(load("radiance_raw")[0]))
+    light = radiance_map(*decoded(RadianceMessage, "radiance_raw"))
     assert light.clipped_share == 0.125
     assert light.world_from_fisheye.tolist() == lamps[0].world_from_marker.tolist()
-    sky = sky_lights(*decode(load("lights_raw")[0]))
+    sky = sky_lights(*decoded(LightsMessage, "lights_raw"))
     assert sky.cut == LightCut()
     assert [one.identity for one in sky.lights] == [3, 5]
     assert sky.lights[0].to_light.tolist() == [0, 0.6, 0.8]

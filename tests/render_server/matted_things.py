@@ -1,6 +1,7 @@
 """Things with known mattes before a background, hair and a hand, as a colour camera and a depth camera see them."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ class Thing:
     color: np.ndarray
     depth: DepthImage
 
-    def view(self, **changes: object) -> ViewFrame:
+    def view(self, **changes: Any) -> ViewFrame:  # noqa: ANN401
         return frame(self.color, depth=self.depth, **changes)
 
     def again(self, seed: int) -> "Thing":

@@ -262,4 +262,6 @@ def golden_of(case: Case) -> np.ndarray:
         FileNotFoundError: the method's sheet is missing.
     """
     encoded = np.fromfile(sheet_path(case.method), np.uint8)
-    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1][tile(case)])
+    sheet = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    assert sheet is not None
+    return np.asarray(sheet[..., ::-1][tile(case)])

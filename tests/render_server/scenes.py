@@ -214,10 +214,10 @@ class Fields:
 
 def with_neighbours(pixels: np.ndarray) -> np.ndarray:
     """Those of the pixels (h, w; bool) whose eight neighbours are among them too: joined cones look there."""
-    return np.asarray(binary_erosion(pixels, np.ones((3, 3)), border_value=1))
+    return np.asarray(binary_erosion(pixels, np.ones((3, 3), bool), border_value=1))
 
 
-OWN_RADIANCE = ("image-based surface", "precomputed surface", "virtual surface")
+OWN_RADIANCE = ("image-based radiance", "precomputed radiance", "object radiance")
 """Stages that shade the objects; the first of them in a graph does."""
 
 

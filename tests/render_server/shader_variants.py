@@ -266,13 +266,13 @@ def image_based(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     for defines in ({}, {"lens_bends": 1}):
         Kernel(gpu, "ambient_occlusion", **defines).release()
     for switches in SURFACES:
-        Kernel(gpu, "image_based_surface", **switches).release()
+        Kernel(gpu, "image_based_radiance", **switches).release()
 
 
 def precomputed_transfer(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     """Compiles shading by precomputed transfer, without and with materials that have maps or are measured."""
     for switches in SURFACES:
-        Kernel(gpu, "image_based_surface", PRECOMPUTED=1, **switches).release()
+        Kernel(gpu, "image_based_radiance", PRECOMPUTED=1, **switches).release()
     Kernel(gpu, "transfer_light").release()
     RasterKernel(gpu, "transfer_raster").release()
 

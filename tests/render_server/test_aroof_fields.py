@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from jaxtyping import Float64
 
-from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.lights.octahedral import even_directions, harmonics
 from deltalight.render_server.precomputation.job_cache import Checkpoint
 from deltalight.render_server.precomputation.occlusion_fields import (

@@ -32,7 +32,9 @@ def scene(seed: int = 0) -> np.ndarray:
 def from_camera(picture: np.ndarray, quality: int, halved: tuple[bool, bool]) -> np.ndarray:
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, SAMPLING[halved]]
     _, code = cv2.imencode(".jpg", picture[..., ::-1], options)
-    return cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1]
+    shown = cv2.imdecode(code, cv2.IMREAD_COLOR)
+    assert shown is not None
+    return shown[..., ::-1]
 
 
 @pytest.mark.parametrize("halved", SAMPLING)

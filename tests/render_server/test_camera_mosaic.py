@@ -18,6 +18,7 @@ from deltalight.render_server.post_effects.camera_blur import (
     blurred,
     measure_blur,
 )
+from deltalight.render_server.post_effects.camera_compression import SAMPLING
 from deltalight.render_server.post_effects.camera_edges import edge_steps
 from deltalight.render_server.post_effects.camera_mosaic import (
     GREEN_VARIANCE,
@@ -33,7 +34,7 @@ from deltalight.render_server.post_effects.camera_mosaic import (
 from deltalight.render_server.post_effects.camera_noise import estimate_noise
 from tests.render_server import test_camera_blur as board
 from tests.render_server.test_camera_blur import FINE, PIXEL_VARIANCE, edge_picture, linear, spread_px
-from tests.render_server.test_camera_compression import SAMPLING, from_camera
+from tests.render_server.test_camera_compression import from_camera
 
 NOISE = 0.01
 

@@ -117,7 +117,7 @@ def test_correlated_noise_of_a_camera_is_found() -> None:
         srgb_bytes((LINEAR + 0.01 * cv2.sepFilter2D(each, -1, kernel, np.ones(1))).astype(np.float32))
         for each in white
     ]
-    found = estimate_noise(*pictures, None)
+    found = estimate_noise(pictures[0], pictures[1], None)
     assert found is not None
     assert found.correlation[0] == pytest.approx(0.6 / 1.18, abs=0.05)
     assert found.correlation[1] < 0.05
@@ -142,7 +142,7 @@ def test_noise_behind_another_curve_is_found() -> None:
     rng, read, shot = np.random.default_rng(9), 0.002, 1e-4
     exposed = [LINEAR + rng.normal(size=LINEAR.shape) * np.sqrt(read**2 + shot * LINEAR) for _ in range(2)]
     steeper = [srgb_bytes((3 * y**2 - 2 * y**3).astype(np.float32)) for y in exposed]
-    found = estimate_noise(*steeper, None)
+    found = estimate_noise(steeper[0], steeper[1], None)
     assert found is not None
     y = np.linspace(0.2, 0.7, 8)
     truth = (6 * y * (1 - y)) ** 2 * (read**2 + shot * y)

@@ -34,7 +34,9 @@ def coded(linear: np.ndarray) -> np.ndarray:
     return np.rint(np.interp(linear, LUT[:, 0], np.arange(256))).astype(np.uint8)
 
 
-def shots(falloff: float, count: int = 12, **more: object) -> list[ViewFrame]:
+def shots(
+    falloff: float, count: int = 12, exposure_s: float | None = 0.01, board: BoardSpec | None = BOARD
+) -> list[ViewFrame]:
     """The camera looks down on the board, which is lit from one side, and goes round; corners of its pictures lack
     the share `falloff` of their light."""
     rng = np.random.default_rng(3)
@@ -51,8 +53,9 @@ def shots(falloff: float, count: int = 12, **more: object) -> list[ViewFrame]:
             light[((place >= low) & (place <= high)).all(axis=-1)] = 0.05
         seen = light * (1 - falloff * radii() ** 2) + rng.normal(0, 0.004, light.shape)
         color = coded(np.repeat(seen[..., None], 3, axis=-1))
-        known = {"exposure_s": 0.01, "pose": BoardPose(pose), "board": BOARD, **more}
-        frames.append(ViewFrame(number, number, color, CAMERA, **known))
+        frames.append(
+            ViewFrame(number, number, color, CAMERA, exposure_s=exposure_s, pose=BoardPose(pose), board=board)
+        )
     return frames
 
 

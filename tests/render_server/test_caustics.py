@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_objects import Material
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
@@ -173,9 +174,10 @@ def test_beams_of_white_metal_carry_all_light_that_meets_it(
     document = stage.document([item], [directional((0.0, 0.0, -1.0), IRRADIANCE)], floor())
     met = IRRADIANCE * edge * (edge * np.cos(tilt) + thickness * np.sin(tilt))
     renderer, (plate_,) = SceneRenderer(gpu, document), document.objects
+    assert isinstance(plate_.material, Material)
     shares = []
     for roughness in (0.02, 0.17, 0.18, 0.35, 0.41):  # of mirrors, and from 0.177 on of sampled lobes
-        material = {**dict(plate_.material), "roughness": roughness}
+        material = plate_.material.replaced(roughness=roughness)
         renderer.set_scene(document.replaced(objects=(plate_.replaced(material=material),)))
         renderer.render(frame())
         shares.append(sent_flux(renderer) / met)

@@ -115,7 +115,8 @@ def test_what_was_used_up_is_cleared_once_when_the_next_frame_begins(gpu: GpuCon
         assert len(seen) == 5
     assert not words(short).any()
     assert not words(buffers[3]).any()
-    for each in (image, *buffers):
+    image.release()
+    for each in buffers:
         each.release()
 
 

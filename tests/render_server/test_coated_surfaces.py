@@ -229,8 +229,8 @@ def test_a_coat_darkens_the_shadow_of_glass(
                 even(*texture)
             )
         made.material["extensions"]["KHR_materials_transmission"] = {"transmissionFactor": 1.0}
-        asset = {"asset": str(made.write(tmp_path / f"{coat}.glb")), "up_axis": "z"}
-        asset["pose"] = {"translation_m": [0, 0, 0.3]}
+        path, pose = str(made.write(tmp_path / f"{coat}.glb")), {"translation_m": [0, 0, 0.3]}
+        asset = {"asset": path, "up_axis": "z", "pose": pose}
         document = Stage(tmp_path).document([asset], [directional((0, 0, -1))], floor(), caustics=False)
         found = solve(gpu, document)
         at_middle = (np.abs(found.position[..., :2]) < 0.1).all(axis=-1) & (found.matte == 0)
@@ -276,7 +276,7 @@ def test_in_even_light_white_plates_show_it(
     asset = {"asset": str(made.write(tmp_path / "plate.glb")), "up_axis": "z"}
     document = unlit(Stage(tmp_path).document([asset], [ambient(EVEN)]))
     renderer = SceneRenderer(
-        gpu, document.replaced(shading=Shading(name=shading, rays=64, bounces=0)), with_linear=True
+        gpu, document.replaced(shading=Shading(rays=64, bounces=0).replaced(name=shading)), with_linear=True
     )
     try:
         linear = renderer.render(seen_from_above(GREY)).linear
@@ -303,6 +303,7 @@ def test_a_smooth_coat_mirrors_objects(gpu: GpuContext, tmp_path: Path, bumps: b
     ]
     view = frame(plain(0))
     found = solve(gpu, Stage(tmp_path).document(assets, [], floor()), view)
+    assert view.pose is not None
     matrix = view.pose.world_from_camera
     rays = np.dstack([camera().rays(), np.ones((HEIGHT, WIDTH))]) @ matrix[:3, :3].T
     point = matrix[:3, 3] + floor_depth(view.pose, height)[..., None] * rays
@@ -322,8 +323,8 @@ def test_beams_and_voxels_share_what_coated_metal_reflects(gpu: GpuContext, tmp_
     for coat in (0.0, 1.0):
         made = coated({"clearcoatFactor": coat, "clearcoatRoughnessFactor": 0.6}, color=1.0)
         made.material["pbrMetallicRoughness"] |= {"metallicFactor": 1, "roughnessFactor": 0.1}
-        asset = {"asset": str(made.write(tmp_path / f"{coat}.glb")), "up_axis": "z"}
-        asset["pose"] = {"translation_m": [0, 0, 0.1]}
+        path, pose = str(made.write(tmp_path / f"{coat}.glb")), {"translation_m": [0, 0, 0.1]}
+        asset = {"asset": path, "up_axis": "z", "pose": pose}
         renderer = SceneRenderer(gpu, Stage(tmp_path).document([asset], [directional((0, 0, -1))], floor()))
         renderer.render(frame())
         sent.append(sent_flux(renderer))

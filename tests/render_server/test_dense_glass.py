@@ -57,7 +57,7 @@ def behind_heap(points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
 def test_every_pixel_of_glass_and_of_its_shadow_is_computed(renderer: SceneRenderer) -> None:
     graph = renderer.graph
     assert graph is not None
-    shown = array_of(graph["virtual surface"])[..., 3] > 0
+    shown = array_of(graph["object radiance"])[..., 3] > 0
     assert np.count_nonzero(shown) > 1000
     np.testing.assert_array_equal(array_of(graph["transmitted light"])[..., 3] > 0, shown)
     found, light = fields_of(renderer), graph["direct light"].light

@@ -22,6 +22,7 @@ from deltalight.render_server.view import CameraView
 from tests.render_server.test_real_surface import room, shown_normals
 from tests.render_server.test_scene_depth_mesh import LENS, NORMAL, PINHOLE, image, plane_depth
 from tests.render_server.test_scene_threads import floor_from
+from tests.render_server.voxel_lab import solid_buffer
 
 WORLD_FROM_CAMERA = np.array([[0, 0, 1.0, 0.3], [-1, 0, 0, 0.2], [0, -1, 0, 0.1], [0, 0, 0, 1]])
 SHAPE = PINHOLE.height, PINHOLE.width
@@ -56,7 +57,7 @@ def made_by_gpu(
     buffers = MeshBuffers(gpu)
     mesher.fill(buffers, merge_for_gpu([EMPTY_MESH]))
     assert buffers.triangle_count <= budget
-    vertices, indices = (buffers.solid[name].read() for name in ("Vertices", "Indices"))
+    vertices, indices = (solid_buffer(buffers, name).read() for name in ("Vertices", "Indices"))
     buffers.release()
     triangles = np.frombuffer(indices, np.int32).reshape(-1, 3)[: buffers.triangle_count]
     return np.frombuffer(vertices, np.float32).reshape(-1, 12), triangles[triangles[:, 0] != triangles[:, 1]]

@@ -76,7 +76,7 @@ def test_a_picture_of_a_lost_context_is_not_returned(gpu: GpuContext, stage: Sta
 def fill_memory(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Makes the driver report once that its memory is full; some say nothing until memory is written."""
     reports: list[str] = []
-    ask = moderngl.Context.error.fget
+    ask = vars(moderngl.Context)["error"].fget
     monkeypatch.setattr(
         moderngl.Context, "error", property(lambda ctx: reports.pop() if reports else ask(ctx))
     )

@@ -16,6 +16,7 @@ from deltalight.protocol.frames import BoardPose, ViewFrame, decode_lut
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu import kernel
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.shader_source import shader_source
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.passes.voxels import VoxelMipmap
 from deltalight.render_server.renderer import SceneRenderer
@@ -334,9 +335,9 @@ def test_rounding_of_a_lights_map_moves_no_light_to_the_voxel_below(
     """The floor, at z = 0 on the lower border of its voxels, has its underside in those below."""
     (case,) = (one for one in cases() if str(one) == "paper-model-plain")
     exact, _ = pictures_of(gpu, case, tmp_path)
-    read, place = kernel.shader_source, "vec3 p = ray_point(view, s, depth);"
+    place = "vec3 p = ray_point(view, s, depth);"
     monkeypatch.setattr(
-        kernel, "shader_source", lambda *args: read(*args).replace(place, f"{place} p.z -= 5e-5;")
+        kernel, "shader_source", lambda *args: shader_source(*args).replace(place, f"{place} p.z -= 5e-5;")
     )
     rounded, _ = pictures_of(gpu, case, tmp_path)
     assert any(not np.array_equal(*pair) for pair in zip(exact, rounded, strict=True))

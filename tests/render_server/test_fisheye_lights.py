@@ -85,7 +85,8 @@ def seen(
 
 
 def source(**settings: object) -> FisheyeSource:
-    return FisheyeSource(documents.Lights(mode="fisheye", fisheye=documents.FisheyeLights(**settings)))
+    lights = documents.FisheyeLights().replaced(**settings)
+    return FisheyeSource(documents.Lights(mode="fisheye", fisheye=lights))
 
 
 def followed(one: FisheyeSource | TrackedSource, view: ViewFrame) -> LightSet:
@@ -169,7 +170,8 @@ def changing_light() -> list[ViewFrame]:
 
 def test_lights_of_the_node_are_those_of_a_cut_here_for_all_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     views, cutter = changing_light(), LightCutter(documents.LightCut())
-    own, sent, newest = source(), [], None
+    own, newest = source(), None
+    sent: list[SkyLights] = []
     expected = [own.update(view) for view in views]
     for view in views:
         newest = cutter.update(view)
@@ -292,7 +294,7 @@ def tracked(**settings: object) -> documents.Lights:
     lamp = documents.TrackedLamp(
         marker=7, offset_m=(0.1, 0, -0.05), intensity=3.0, color_linear=(1, 0.9, 0.8)
     )
-    return documents.Lights(mode="tracked", tracked=(lamp,), **settings)
+    return documents.Lights(mode="tracked", tracked=(lamp,)).replaced(**settings)
 
 
 def test_a_lamp_stands_where_its_marker_says() -> None:
@@ -320,7 +322,7 @@ def test_a_lamp_out_of_sight_stays_and_one_never_seen_is_said() -> None:
     assert followed(one, frame()).lights == ()
     assert "No picture has shown the marker of lamp 7 yet" in one.remarks[0]
     followed(one, frame(lamps=(lamp_pose(0.5), lamp_pose(1.0, marker=3))))
-    assert one.remarks == ()
+    assert list(one.remarks) == []
     assert one.update(frame()) is None
     assert "lamp 7 is out of sight" in one.remarks[0]
 

@@ -146,7 +146,7 @@ def test_uniforms_arrive_and_removed_ones_do_not_matter(gpu: GpuContext, tmp_pat
 def test_readback_gives_each_texture_once_and_in_order(gpu: GpuContext) -> None:
     rng = np.random.default_rng(0)
     reader = AsyncReadback(gpu)
-    arrays = [
+    arrays: list[np.ndarray] = [
         rng.integers(0, 255, (7, 5, 4), dtype=np.uint8),
         rng.normal(size=(3, 9, 2)).astype(np.float16),
         rng.normal(size=(7, 5, 1)).astype(np.float32),

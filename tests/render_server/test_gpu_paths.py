@@ -5,7 +5,6 @@ the frame makes the CPU wait; and some paths are taken only there.
 """
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import pytest
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Program
 from tests.render_server.protected_scenes import METHODS, Case, pictures_of
-from tests.render_server.test_golden import psnr_db
+from tests.render_server.scenes import psnr_db
 from tests.unwritten_memory import POISON, FilledContext
 
 pytestmark = [pytest.mark.slow(seconds=8), pytest.mark.usefixtures("clean_gl")]
@@ -63,7 +62,7 @@ def test_what_new_memory_holds_does_not_show(
 
 
 @pytest.fixture
-def audit(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def audit(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Kernels and names that bind something that they may write twice."""
     faults: list[str] = []
     bind = Program.bind

@@ -99,6 +99,7 @@ def test_the_mesh_closes_the_lid_with_triangles_that_face_up_and_join_nothing_el
     counts = []
     for mesh in (open_, closed):
         corners = mesh.positions[mesh.triangles]
+        assert mesh.uv is not None
         column, row = mesh.uv[mesh.triangles].mean(axis=1).round().astype(int).T
         on_lid = inside[row, column]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -19,7 +19,8 @@ from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_objects import Material
 from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.kernel import Binding, Kernel
+from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.lights.environment import load_environment
 from deltalight.render_server.lights.light_map import irradiance_coefficients, light_map
 from deltalight.render_server.lights.light_models import DirectionalLight, SphereLight
@@ -127,7 +128,12 @@ def lobes(gpu: GpuContext) -> Iterator[Callable[..., Float32[np.ndarray, "n 4"]]
         light.set_map(radiance)
         views = views_of()
         given, found = gpu.ctx.buffer(views.tobytes()), gpu.ctx.buffer(reserve=16 * len(views))
-        own = {"samples": samples, "f0": f0, "directions": directions, "count": len(views)}
+        own: dict[str, Binding] = {
+            "samples": samples,
+            "f0": f0,
+            "directions": directions,
+            "count": len(views),
+        }
         kernels[not filtered].run((len(views),), light.bindings, Views=given, Found=found, **own)
         values = np.frombuffer(found.read(), np.float32).reshape(-1, 4).copy()
         for item in (given, found):
@@ -135,8 +141,7 @@ def lobes(gpu: GpuContext) -> Iterator[Callable[..., Float32[np.ndarray, "n 4"]]
         return values
 
     yield trace
-    for item in (light, *kernels):
-        item.release()
+    release_all(light, *kernels)
 
 
 def views_of() -> Float32[np.ndarray, "n 8"]:
@@ -202,7 +207,7 @@ def test_filtered_samples_in_real_rooms(
 
 
 def image_based(document: SceneDocument, **settings: object) -> SceneDocument:
-    return document.replaced(shading=Shading(name="image_based", **settings), method=NoneMethod())
+    return document.replaced(shading=Shading(name="image_based").replaced(**settings), method=NoneMethod())
 
 
 @dataclass
@@ -231,7 +236,7 @@ def shaded_by(renderer: SceneRenderer, view: ViewFrame) -> Shaded:
     pixels &= with_neighbours(with_neighbours(pixels))
     open_ = uniform_filter(array_of(graph["ambient occlusion"].open)[..., 0], 4)
     return Shaded(
-        array_of(graph["image-based surface"])[pixels, :3],
+        array_of(graph["image-based radiance"])[pixels, :3],
         array_of(surface.buffer.normal)[pixels, :3],
         array_of(surface.buffer.position)[pixels, :3],
         open_[pixels],
@@ -322,8 +327,8 @@ def test_method_does_not_shade_the_objects_too(gpu: GpuContext, tmp_path: Path) 
     graph = renderer.graph
     assert graph is not None
     unshaded = array_of(graph["object surface"].coverage.texture)[..., 0] == 0
-    assert "image-based surface" in graph
-    assert graph.resource("virtual surface").version == 0
+    assert "image-based radiance" in graph
+    assert graph.resource("object radiance").version == 0
     assert not np.array_equal(plain[~unshaded], other[~unshaded])
     assert np.array_equal(plain[unshaded], other[unshaded])
     renderer.release()

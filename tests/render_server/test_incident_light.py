@@ -14,7 +14,7 @@ from deltalight.render_server.lights.light_models import (
 
 WHITE = np.ones(3, np.float32)
 DOWN, HIGH = np.array([0, 0, -1], np.float32), np.array([0, 0, 2], np.float32)
-LIGHTS = {
+LIGHTS: dict[str, Light] = {
     "directional": DirectionalLight(DOWN, 3 * WHITE, 0.005),
     "sphere": SphereLight(HIGH, 8 * WHITE, 0.1),
     "spot": SpotLight(HIGH, DOWN, 8 * WHITE, 0.1, float(np.radians(30)), 0.5),

@@ -14,6 +14,7 @@ from deltalight.render_server.gpu import kernel as kernel_module
 from deltalight.render_server.gpu import raster_kernel
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, watched
+from deltalight.render_server.gpu.program_slots import Value
 from deltalight.render_server.gpu.raster_kernel import RasterKernel
 from deltalight.render_server.gpu.shader_source import SHADERS
 from deltalight.render_server.gpu.textures import release_target, texture_2d
@@ -242,8 +243,16 @@ def turned(x: float, y: float) -> np.ndarray:
     return matrix
 
 
-FIRST = {"a": 0.5, "b": -3, "c": True, "d": (1, 2, 3), "e": (4, 8), "m": turned(5, 6), "f": 7}
-SECOND = {
+FIRST: dict[str, Value] = {
+    "a": 0.5,
+    "b": -3,
+    "c": True,
+    "d": (1, 2, 3),
+    "e": (4, 8),
+    "m": turned(5, 6),
+    "f": 7,
+}
+SECOND: dict[str, Value] = {
     "a": np.float32(1.5),
     "b": np.int64(4),
     "c": np.bool_(False),
@@ -275,9 +284,9 @@ def test_only_values_that_changed_are_written(
 
     monkeypatch.setattr(moderngl.Uniform, "write", write_bytes)  # which setting a value calls, too
 
-    def names_written(**changes: object) -> list[str]:
+    def names_written(**changes: Value) -> list[str]:
         written.clear()
-        kernel.run((1,), {**FIRST, **changes}, Out=out)  # type: ignore[arg-type]
+        kernel.run((1,), {**FIRST, **changes}, Out=out)
         return sorted(written)
 
     assert names_written() == sorted(FIRST)

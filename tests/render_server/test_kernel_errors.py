@@ -99,12 +99,13 @@ def test_what_was_released_is_not_bound_though_it_was_before(
 ) -> None:
     """OpenGL gives its name to what is made next, which the kernel would read or overwrite instead."""
     kernel = make(PARTS, USES)
-    mine = {
+    makers: dict[str, Callable[[], moderngl.Texture | moderngl.Buffer | UniformBlock[CameraBlock]]] = {
         "picture": lambda: gpu.ctx.texture((4, 4), 4, dtype="f4"),
         "filled": lambda: texture_2d(gpu, (4, 4), 4, "f2"),
         "Out": lambda: gpu.ctx.buffer(reserve=16),
         "Camera": lambda: UniformBlock(gpu, CameraBlock((1, 2, 3, 4), 5.0)),
-    }[name]()
+    }
+    mine = makers[name]()
     kernel.run((1,), {**given, name: mine})
     mine.release()
     with pytest.raises(BindingError, match=f"Kernel tiny: `{name}` was released; bind what replaces it"):
@@ -198,7 +199,11 @@ def test_a_wrong_image_format_is_told(
     ],
 )
 def test_a_value_that_a_uniform_cannot_take_is_told(
-    make: MakeKernel, given: dict[str, Any], out: moderngl.Buffer, name: str, value: object
+    make: MakeKernel,
+    given: dict[str, Any],
+    out: moderngl.Buffer,
+    name: str,
+    value: Any,  # noqa: ANN401 - wrong
 ) -> None:
     kernel = make(PARTS, USES)
     kernel.run((1,), given)

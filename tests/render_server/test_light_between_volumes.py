@@ -10,8 +10,8 @@ import trimesh
 
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import DlpvMethod
+from deltalight.render_server.geometry_state import ObjectExtent
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.methods.volume_placement import outside_fractions
 from deltalight.render_server.passes.volumes import VolumePlacement
 from deltalight.render_server.renderer import SceneRenderer

@@ -135,7 +135,7 @@ def test_lambertian_data_are_a_lambertian_surface(objects: ObjectsRenderer, tmp_
 def test_in_even_light_it_reflects_its_albedo(gpu: GpuContext, tmp_path: Path, shading: str) -> None:
     stage = Stage(tmp_path)
     document = stage.document([sphere(stage, PAINT)], [ambient(EVEN)])
-    document = unlit(document).replaced(shading=Shading(name=shading, rays=64, bounces=0))
+    document = unlit(document).replaced(shading=Shading(rays=64, bounces=0).replaced(name=shading))
     renderer = SceneRenderer(gpu, document, with_linear=True)
     try:
         linear = renderer.render(seen(GREY)).linear

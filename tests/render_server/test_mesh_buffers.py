@@ -9,7 +9,7 @@ import trimesh
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.passes.mesh_buffers import MeshBuffers
 from deltalight.render_server.scene.gpu_mesh import GpuMesh
-from tests.render_server.voxel_lab import gpu_mesh
+from tests.render_server.voxel_lab import gpu_mesh, solid_buffer
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
@@ -18,8 +18,7 @@ def held(buffers: MeshBuffers, mesh: GpuMesh) -> bool:
     """Whether the buffers on the GPU begin with a mesh."""
     names = {"Vertices": mesh.vertices, "Indices": mesh.triangles, "Sides": mesh.material_table[:, 12]}
     return all(
-        buffers.solid[name].read(array.nbytes) == array.tobytes()  # type: ignore[union-attr, call-arg, arg-type]
-        for name, array in names.items()
+        solid_buffer(buffers, name).read(array.nbytes) == array.tobytes() for name, array in names.items()
     )
 
 
@@ -37,7 +36,7 @@ def test_buffers_hold_each_mesh_that_is_written(gpu: GpuContext) -> None:
         buffers.write(mesh)
         assert held(buffers, mesh)
     buffers.reserve(len(moved.vertices), len(moved.triangles), opened)
-    buffers.solid["Indices"].write(bytes(moved.triangles.nbytes))  # type: ignore[union-attr, call-arg, arg-type]
+    solid_buffer(buffers, "Indices").write(bytes(moved.triangles.nbytes))
     buffers.write(moved)
     assert held(buffers, moved)
     buffers.release()

@@ -31,7 +31,7 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 SKY = 0.4
 ALBEDO = float(decode_lut(None)[GREY, 0]) / SKY
-POINT = {"type": "point", "intensity": 0.08, "color": [1, 0.5, 0.25]}
+POINT: dict[str, Any] = {"type": "point", "intensity": 0.08, "color": [1, 0.5, 0.25]}
 COLOR = np.array([1, 0.5, 0.25])
 LAMP = np.array([0.05, 0.0, 0.25])
 HOLDER = {"translation": [0, 0.9, 0.03]}  # of a plate that is not in the way
@@ -236,8 +236,10 @@ def shone(gpu: GpuContext, folder: Path, name: str, of: Spot, plate: dict[str, A
         plate,
         edge=of.plate_edge_m,
     )
-    same = {"type": "spot", "position_m": node["translation"], "direction": [0, 0, 1 if of.is_upward else -1]}
-    same |= {
+    same = {
+        "type": "spot",
+        "position_m": node["translation"],
+        "direction": [0, 0, 1 if of.is_upward else -1],
         "intensity": of.intensity,
         "radius_m": 0,
         "angle_deg": 2 * np.degrees(outer),

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,6 +63,13 @@ def picked(gpu: GpuContext, document: SceneDocument, view: ViewFrame, *points: n
     return found
 
 
+def place_of(pick: Pick) -> tuple[np.ndarray, np.ndarray]:
+    """Position and normal of what a pixel shows."""
+    assert pick.point_m is not None
+    assert pick.normal is not None
+    return pick.point_m, pick.normal
+
+
 def with_output(document: SceneDocument, **changes: object) -> SceneDocument:
     return document.replaced(output=document.output.replaced(**changes))
 
@@ -81,16 +89,16 @@ def test_objects_and_the_real_scene_are_where_they_were_put(
     on_ball, on_box, on_floor = picked(gpu, scene, view, BALL_AT, BOX_TOP, FREE_FLOOR)
     pixel_m = 0.012 if changes.get("height") else 0.008  # what a pixel spans here, along the floor
     assert (on_ball.kind, on_ball.object_id, on_ball.frame_id) == ("object", "ball", 7)
-    assert np.linalg.norm(on_ball.point_m - BALL_AT) == pytest.approx(BALL_RADIUS, abs=0.002)
-    outward = (on_ball.point_m - BALL_AT) / np.linalg.norm(on_ball.point_m - BALL_AT)
-    assert on_ball.normal @ outward > 0.99
-    assert (on_box.kind, on_box.object_id) == ("object", "box")
-    np.testing.assert_allclose(on_box.point_m, BOX_TOP, atol=pixel_m)
-    np.testing.assert_allclose(on_box.normal, (0, 0, 1), atol=1e-2)
-    assert (on_floor.kind, on_floor.object_id) == ("real", None)
-    np.testing.assert_allclose(on_floor.point_m, FREE_FLOOR, atol=pixel_m)
-    np.testing.assert_allclose(on_floor.normal, (0, 0, 1), atol=1e-2)
-    assert on_floor.distance_m == pytest.approx(np.linalg.norm(on_floor.point_m - eye))
+    met, normal = place_of(on_ball)
+    outward = (met - BALL_AT) / np.linalg.norm(met - BALL_AT)
+    assert np.linalg.norm(met - BALL_AT) == pytest.approx(BALL_RADIUS, abs=0.002)
+    assert normal @ outward > 0.99
+    for pick, named, where in ((on_box, ("object", "box"), BOX_TOP), (on_floor, ("real", None), FREE_FLOOR)):
+        assert (pick.kind, pick.object_id) == named
+        met, normal = place_of(pick)
+        np.testing.assert_allclose(met, where, atol=pixel_m)
+        np.testing.assert_allclose(normal, (0, 0, 1), atol=1e-2)
+    assert on_floor.distance_m == pytest.approx(np.linalg.norm(place_of(on_floor)[0] - eye))
 
 
 def test_an_object_behind_a_real_thing_is_not_picked(gpu: GpuContext, stage: Stage) -> None:
@@ -112,7 +120,7 @@ def test_an_object_that_is_dragged_is_looked_through(gpu: GpuContext, stage: Sta
     behind, other = renderer.pick(*at, ignore="ball"), renderer.pick(*at, ignore="box")
     renderer.release()
     assert (behind.kind, behind.object_id) == ("real", None)
-    assert abs(behind.point_m[2]) < 0.008, "the floor behind it"
+    assert abs(place_of(behind)[0][2]) < 0.008, "the floor behind it"
     assert (other.kind, other.object_id) == ("object", "ball")
 
 
@@ -132,7 +140,7 @@ def two_materials(folder: Path) -> str:
 
 def test_every_mesh_of_an_object_belongs_to_it(gpu: GpuContext, stage: Stage, tmp_path: Path) -> None:
     two = two_materials(tmp_path)
-    objects = [
+    objects: list[dict[str, Any]] = [
         {"id": "pair", "asset": two, "up_axis": "z"},
         {"id": "hidden", "asset": two, "up_axis": "z", "visible": False},
         stage.virtual(cube(0.06, (0.2, 0, 0)), id="single"),
@@ -151,8 +159,9 @@ def test_a_scene_without_objects_has_places_too(gpu: GpuContext, stage: Stage, h
     view = frame(depth=None if has_model else depth_image(depth))
     (found,) = picked(gpu, document, view, FREE_FLOOR)
     assert found.kind == "real"
-    np.testing.assert_allclose(found.point_m, FREE_FLOOR, atol=0.008)
-    np.testing.assert_allclose(found.normal, (0, 0, 1), atol=0.02)
+    met, normal = place_of(found)
+    np.testing.assert_allclose(met, FREE_FLOOR, atol=0.008)
+    np.testing.assert_allclose(normal, (0, 0, 1), atol=0.02)
 
 
 @pytest.mark.parametrize("has_object", [True, False])

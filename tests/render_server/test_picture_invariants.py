@@ -16,9 +16,9 @@ import trimesh
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import parse_scene
 from deltalight.protocol.scene_method import NoneMethod
-from deltalight.protocol.scene_objects import Pose
+from deltalight.protocol.scene_objects import ModelGeometry, Pose
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.textures import read_texture, texture_2d
+from deltalight.render_server.gpu.textures import read_texture, release_all, texture_2d
 from deltalight.render_server.passes.composite import FILL_RADIUS, ChangeRatio
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
@@ -355,9 +355,9 @@ def test_method_none_shows_objects_and_leaves_every_real_pixel_as_it_was(
 def test_another_real_model_gives_what_a_fresh_renderer_gives(gpu: GpuContext, tmp_path: Path) -> None:
     stage = Stage(tmp_path, COARSE)
     document = everyday(stage)
-    lower = document.real.geometry.model_copy(
-        update={"pose": Pose(translation_m=(0.0, 0.0, -0.05))}  # type: ignore[union-attr]
-    )
+    geometry = document.real.geometry
+    assert isinstance(geometry, ModelGeometry)
+    lower = geometry.model_copy(update={"pose": Pose(translation_m=(0.0, 0.0, -0.05))})
     changed = document.replaced(real=document.real.model_copy(update={"geometry": lower}))
     renderer = SceneRenderer(gpu, document)
     before = renderer.render(frame(checkered())).color
@@ -396,5 +396,4 @@ def test_only_visible_changes_of_light_are_composed(gpu: GpuContext) -> None:
     change.run(grid, light, cones, None)
     listed = np.frombuffer(change.texels.read(), np.uint32)
     assert set(listed[1 : 1 + listed[0]]) == set(range(20 - FILL_RADIUS, 21 + FILL_RADIUS))
-    for item in (*made, seen, change):
-        item.release()
+    release_all(*made, seen, change)

@@ -59,14 +59,15 @@ def outputs(gpu: GpuContext) -> dict[str, Any]:
 
 @pytest.mark.parametrize("doubled", [False, True])
 def test_it_writes_what_the_compute_shader_writes(gpu: GpuContext, shader: Path, *, doubled: bool) -> None:
-    picture, found = codes(gpu), []
-    given: dict[str, Any] = {"codes": picture, "scale": 0.25, "DOUBLED": doubled}
-    for kind, place in ((Kernel, SIZE), (PictureKernel, WHOLE)):
-        kernel, targets = kind(gpu, shader), outputs(gpu)
-        kernel.run(place, targets, given)
-        found.append([read_texels(each) for each in targets.values()])
-        kernel.release()
-    (light, depth), (drawn_light, drawn_depth) = found
+    given: dict[str, Any] = {"codes": codes(gpu), "scale": 0.25, "DOUBLED": doubled}
+    computing, computed = Kernel(gpu, shader), outputs(gpu)
+    computing.run(SIZE, computed, given)
+    light, depth = (read_texels(each) for each in computed.values())
+    drawing, drawn = PictureKernel(gpu, shader), outputs(gpu)
+    drawing.run(WHOLE, drawn, given)
+    drawn_light, drawn_depth = (read_texels(each) for each in drawn.values())
+    computing.release()
+    drawing.release()
     assert np.array_equal(light, drawn_light)
     assert np.array_equal(depth, drawn_depth)
     assert 0 < (depth == -1).mean() < 0.5
@@ -92,7 +93,7 @@ def test_a_part_of_the_picture_is_written_from_its_corner_on(gpu: GpuContext, tm
             depth = depth.copy()
             depth[inside] = 0
             assert not depth.any()
-    assert np.array_equal(*found)
+    assert np.array_equal(found[0], found[1])
 
 
 def test_outputs_are_of_the_declared_format_and_of_one_run_after_another(

@@ -8,11 +8,12 @@ import trimesh
 from jaxtyping import Float64
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_output import Shading
+from deltalight.render_server.geometry_state import PlacedObject
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.lights.light_map import COSINE_BANDS, coefficients_around, distant_coefficients
 from deltalight.render_server.lights.lights import build_lights
 from deltalight.render_server.lights.octahedral import even_directions, harmonics, turned_harmonics
@@ -244,7 +245,7 @@ def test_colours_that_were_passed_over_are_not_computed(tmp_path: Path) -> None:
 
 
 def precomputed(document: SceneDocument, **settings: object) -> SceneDocument:
-    shading = Shading(name="precomputed", **{"rays": 256, **settings})
+    shading = Shading(name="precomputed", rays=256).replaced(**settings)
     return document.replaced(shading=shading, method=NoneMethod())
 
 
@@ -257,12 +258,12 @@ class Shown:
         surface = graph["object surface"]
         pixels = array_of(surface.coverage.texture)[..., 0] == 1
         self.pixels = pixels & with_neighbours(with_neighbours(pixels))
-        self.radiance = array_of(graph["precomputed surface"])[self.pixels, :3]
+        self.radiance = array_of(graph["precomputed radiance"])[self.pixels, :3]
         self.normal = array_of(surface.buffer.normal)[self.pixels, :3]
         self.position = array_of(surface.buffer.position)[self.pixels, :3]
 
 
-def shown(gpu: GpuContext, document: SceneDocument, view: object = None) -> Shown:
+def shown(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None = None) -> Shown:
     renderer = SceneRenderer(gpu, document, checks=True)
     renderer.render(frame() if view is None else view)
     found = Shown(renderer)
@@ -374,7 +375,7 @@ def test_only_the_objects_change(gpu: GpuContext, tmp_path: Path) -> None:
     graph = renderer.graph
     assert graph is not None
     unshaded = array_of(graph["object surface"].coverage.texture)[..., 0] == 0
-    assert graph.resource("virtual surface").version == 0
+    assert graph.resource("object radiance").version == 0
     assert not np.array_equal(plain[~unshaded], other[~unshaded])
     assert np.array_equal(plain[unshaded], other[unshaded])
     renderer.release()

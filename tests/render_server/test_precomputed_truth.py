@@ -25,6 +25,7 @@ from deltalight.render_server.scene.mesh_loading import load_mesh
 from tests.render_server.scenes import (
     COARSE,
     Stage,
+    Vector,
     array_of,
     ball,
     camera,
@@ -56,8 +57,11 @@ def sky(d: np.ndarray) -> Float32[np.ndarray, "a b 3"]:
 
 
 def two_walls() -> trimesh.Trimesh:
-    parts = [((0.36, 0.36, 0.02), (0, 0, 0.01)), ((0.36, 0.02, 0.22), (0, 0.17, 0.13))]
-    parts.append(((0.02, 0.32, 0.22), (0.17, 0, 0.13)))
+    parts: list[tuple[Vector, Vector]] = [
+        ((0.36, 0.36, 0.02), (0, 0, 0.01)),
+        ((0.36, 0.02, 0.22), (0, 0.17, 0.13)),
+        ((0.02, 0.32, 0.22), (0.17, 0, 0.13)),
+    ]
     boxes = [shifted(trimesh.creation.box(size), *at) for size, at in parts]
     return trimesh.util.concatenate([*boxes, ball(0.07, (-0.02, 0.02, 0.09), 4)])
 
@@ -99,7 +103,7 @@ def shaded(gpu: GpuContext, document: SceneDocument, pose: BoardPose) -> tuple[n
     renderer.render(view)
     graph = renderer.graph
     assert graph is not None
-    name = "image-based surface" if document.shading.is_image_based else "precomputed surface"
+    name = "image-based radiance" if document.shading.is_image_based else "precomputed radiance"
     radiance = array_of(graph[name])[..., :3]
     pixels = array_of(graph["object surface"].coverage.texture)[..., 0] == 1
     renderer.release()

@@ -74,7 +74,7 @@ def scene(tmp_path: Path) -> SceneDocument:
 
 @pytest.fixture
 def players(gpu: GpuContext, scene: SceneDocument) -> Iterator[dict[str, Player]]:
-    found = {quality: Player(gpu, scene, quality) for quality in TIERS}
+    found: dict[str, Player] = {quality: Player(gpu, scene, quality) for quality in TIERS}
     yield found
     for player in found.values():
         player.renderer.release()
@@ -122,7 +122,7 @@ BOUNCES = {
     "paper": {"voxelize objects", "split inject"},
     "dlpv": {"voxelize objects", "inject change", "bounces"},
 }
-FOLLOWS = {"object surface", "shadow maps objects", "direct light", "virtual surface"}
+FOLLOWS = {"object surface", "shadow maps objects", "direct light", "object radiance"}
 
 
 @pytest.mark.parametrize("method", BOUNCES)
@@ -178,7 +178,8 @@ def test_at_rest_it_becomes_the_best_picture(players: dict[str, Player]) -> None
 
 def test_the_best_picture_comes_without_a_jump(gpu: GpuContext, players: dict[str, Player]) -> None:
     """It fades in within 0.4 s: eight frames here."""
-    live, fading, kernels = players["live"], [], set[str]()
+    live, kernels = players["live"], set[str]()
+    fading: list[np.ndarray] = []
     for aside in ASIDE:
         before = live.show(aside)
     with watched(gpu, lambda run: kernels.add(run.kernel)):

@@ -191,8 +191,9 @@ def test_a_change_of_light_or_objects_ends_the_history(
     tmp_path: Path, players: tuple[Player, Player], change: str
 ) -> None:
     player, tracing = players
-    changed = silver_things(
-        Stage(tmp_path), **({"irradiance": 1.0} if change == "light" else {"roughness": 0.3})
+    stage = Stage(tmp_path)
+    changed = (
+        silver_things(stage, irradiance=1.0) if change == "light" else silver_things(stage, roughness=0.3)
     )
     for one in players:
         one.shows(PATH[:3])

@@ -8,8 +8,8 @@ import pytest
 
 from deltalight.benchmarks.speed.instruments import counted
 from deltalight.protocol.scene_objects import SceneObject
+from deltalight.render_server.geometry_state import GeometryState
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.passes.mesh_buffers import CORNERS_ROW
 from deltalight.render_server.passes.object_bvh import BVH_WIDTH, ObjectBvh
 from deltalight.render_server.virtual_objects import VirtualObjects
@@ -72,7 +72,7 @@ def test_uploads_of_a_drag_do_not_grow_with_the_objects_that_rest(
 @pytest.mark.parametrize("plays", [False, True], ids=["no clip", "a clip that stands"])
 def test_what_rests_keeps_its_meshes(objects: VirtualObjects, tmp_path: Path, *, plays: bool) -> None:
     asset = str(bent_bar(tmp_path))
-    clip = {"animation": {"speed": 0, "offset_s": 0.3}} if plays else {}
+    clip: dict[str, Any] = {"animation": {"speed": 0, "offset_s": 0.3}} if plays else {}
     rests = thing(asset, 1, **clip)
     before, after = (updated(objects, [thing(asset, 0, x), rests]).drawn.mesh for x in (0.0, 0.01))
     assert after.parts[0] is not before.parts[0]

@@ -165,6 +165,7 @@ def test_real_depth_keeps_the_table_flat(shared_data: Path) -> None:
     matrix = np.array([[607.178, 0, 321.391], [0, 607.234, 241.918], [0, 0, 1]])
     camera = CameraModel(640, 480, matrix)
     picture = cv2.imread(str(min((folder / "depth").glob("*.png"))), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
     depth = DepthImage(picture.astype(np.float32) * 1e-3, picture > 0, camera)
     mesh = depth_mesh(depth, camera, np.eye(4), 40_000)
     assert 25_000 < len(mesh.triangles) <= 40_000

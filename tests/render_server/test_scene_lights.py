@@ -197,7 +197,7 @@ def write_map(path: Path, environment: EnvironmentMap) -> str:
 
 
 def environment_lights(path: str, **settings: object) -> documents.Lights:
-    environment = documents.EnvironmentLights(map=path, **settings)
+    environment = documents.EnvironmentLights(map=path).replaced(**settings)
     return documents.Lights(mode="environment", environment=environment)
 
 
@@ -209,8 +209,9 @@ def test_environment_mode_puts_lamps_where_the_document_turns_them(tmp_path: Pat
     assert light.direction == pytest.approx([0, -np.sqrt(0.5), -np.sqrt(0.5)], abs=0.01)
     assert built.registration.tolist() == [1, 1, 1]
     assert built.environment.shape == (256, 256, 3)
-    single = build_lights(environment_lights(path))
-    assert light.irradiance == pytest.approx(2 * single.lights[0].irradiance, rel=1e-3)
+    single = build_lights(environment_lights(path)).lights[0]
+    assert isinstance(single, DirectionalLight)
+    assert light.irradiance == pytest.approx(2 * single.irradiance, rel=1e-3)
     towards_floor = sample_octahedral(built.environment, np.array([[[0.0, 0, -1]]]))
     assert towards_floor[0, 0] == pytest.approx([0.2] * 3, rel=0.02)
 
@@ -281,5 +282,7 @@ def test_real_maps_split_without_loss(shared_data: Path, name: str) -> None:
     built = build_lights(environment_lights(str(path)))
     assert 1 <= len(built.lights) <= 4
     total = solid_angle_mean(built.environment) * 4 * np.pi
-    total = total + sum(light.irradiance for light in built.lights)
+    for light in built.lights:
+        assert isinstance(light, DirectionalLight)
+        total = total + light.irradiance
     assert total == pytest.approx(flux(environment), rel=0.01)

@@ -1,6 +1,8 @@
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,15 +31,14 @@ def write_sphere(path: Path, radius: float = 0.5) -> Path:
     return path
 
 
-def triangle(**changes: object) -> TriangleMesh:
-    fields = {
-        "positions": np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32),
-        "normals": np.tile(np.array([0, 0, 1], np.float32), (3, 1)),
-        "triangles": np.array([[0, 1, 2]], np.int32),
-        "uv": None,
-        "material": Material(),
-    }
-    return TriangleMesh(**{**fields, **changes})
+def triangle(material: Material | None = None, uv: np.ndarray | None = None) -> TriangleMesh:
+    return TriangleMesh(
+        positions=np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (3, 1)),
+        triangles=np.array([[0, 1, 2]], np.int32),
+        uv=uv,
+        material=material or Material(),
+    )
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".glb"])
@@ -98,7 +99,10 @@ def gltf_scene(tmp_path: Path) -> Path:
     return path
 
 
-def edit_glb(path: Path, edit: object) -> None:
+Edit = Callable[[dict[str, Any]], None]
+
+
+def edit_glb(path: Path, edit: Edit) -> None:
     data = path.read_bytes()
     length = struct.unpack("<I", data[12:16])[0]
     document = json.loads(data[20 : 20 + length])
@@ -113,7 +117,7 @@ def edit_glb(path: Path, edit: object) -> None:
 def test_gltf_nodes_are_placed_and_mirrored_without_turning_inside_out(tmp_path: Path) -> None:
     path = gltf_scene(tmp_path)
 
-    def add_extensions(document: dict) -> None:
+    def add_extensions(document: dict[str, Any]) -> None:
         document["materials"][0]["emissiveFactor"] = [0.5, 0.25, 1.0]
         document["materials"][0]["extensions"] = {
             "KHR_materials_ior": {"ior": 2.0},
@@ -197,32 +201,32 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
         load_mesh(tmp_path / "away.obj")
 
 
-def huge_accessor(document: dict) -> None:
+def huge_accessor(document: dict[str, Any]) -> None:
     document["accessors"][0]["count"] = 400_000_000
 
 
-def huge_without_data(document: dict) -> None:
+def huge_without_data(document: dict[str, Any]) -> None:
     document["accessors"].append({"componentType": 5126, "type": "VEC4", "count": 100_000_000})
 
 
-def negative_offset(document: dict) -> None:
+def negative_offset(document: dict[str, Any]) -> None:
     document["bufferViews"][0]["byteOffset"] = -8
 
 
-def cyclic_nodes(document: dict) -> None:
+def cyclic_nodes(document: dict[str, Any]) -> None:
     document["nodes"][0].setdefault("children", []).append(len(document["nodes"]) - 1)
     document["nodes"][-1].setdefault("children", []).append(len(document["nodes"]) - 1)
 
 
-def instance_bomb(document: dict) -> None:
+def instance_bomb(document: dict[str, Any]) -> None:
     document["nodes"] += [{"mesh": 0}] * 100_000
 
 
-def escaping_image(document: dict) -> None:
+def escaping_image(document: dict[str, Any]) -> None:
     document["images"] = [{"uri": "../../../etc/passwd"}]
 
 
-def required_extension(document: dict) -> None:
+def required_extension(document: dict[str, Any]) -> None:
     document["extensionsRequired"] = ["KHR_draco_mesh_compression"]
 
 
@@ -238,7 +242,7 @@ def required_extension(document: dict) -> None:
         required_extension,
     ],
 )
-def test_gltf_that_lies_about_itself_is_refused(tmp_path: Path, edit: object) -> None:
+def test_gltf_that_lies_about_itself_is_refused(tmp_path: Path, edit: Edit) -> None:
     path = gltf_scene(tmp_path)
     load_mesh(path)
     edit_glb(path, edit)

@@ -10,6 +10,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.methods.light_maps import shadow_receivers
 from deltalight.render_server.real_geometry import COARSE_DIVISOR, RealGeometry
 from deltalight.render_server.scene import seen_depth, threads
+from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.scene.depth_surface import depth_surface
 from deltalight.render_server.scene.gpu_mesh import GpuMesh
 from deltalight.render_server.scene.threads import LEAST_BAND_ROWS, by_bands
@@ -94,11 +95,10 @@ def test_the_coarse_mesh_is_made_once_and_when_asked_for(
     gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     budgets: list[int] = []
-    mesh_depth = seen_depth.depth_mesh
 
     def counted(*given: object, **named: object) -> object:
         budgets.append(given[3])  # type: ignore[arg-type]
-        return mesh_depth(*given, **named)  # type: ignore[arg-type]
+        return depth_mesh(*given, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(seen_depth, "depth_mesh", counted)
     real = RealGeometry(gpu, RealScene(), BUDGET, meshes_on_gpu=False)
@@ -123,6 +123,7 @@ def test_a_coarse_mesh_that_is_begun_before_it_is_asked_for_is_that_of_its_frame
         before = coarse
     standing.update([floor_from(0.45)])
     assert standing.state is not None
+    assert before is not None
     assert np.array_equal(standing.state.coarse_mesh.corners, before)
     moving.release()
     standing.release()

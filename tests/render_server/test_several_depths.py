@@ -29,6 +29,7 @@ from tests.render_server.scenes import Stage, look_at, psnr_db
 from tests.render_server.test_depth_mesher import by_corners
 from tests.render_server.test_scene_depth_mesh import LENS, PINHOLE
 from tests.render_server.test_several_views import FACING, document, off_voxel_borders, seen_room
+from tests.render_server.voxel_lab import solid_buffer
 
 SMALL = CameraModel(120, 90, PINHOLE.matrix * np.array([[0.75], [0.75], [1]]))
 EYES = [(0.3, -0.9, 0.7), (-0.4, 0.8, 0.9), (0.5, -0.7, 0.8)]
@@ -81,7 +82,7 @@ class Room:
         """The GPU's mesh, its vertices, and its triangles, with those that are not there."""
         buffers = MeshBuffers(self.gpu)
         self.mesher.fill(buffers, merge_for_gpu([EMPTY_MESH]))
-        vertices, indices = (buffers.solid[name].read() for name in ("Vertices", "Indices"))
+        vertices, indices = (solid_buffer(buffers, name).read() for name in ("Vertices", "Indices"))
         own = buffers.coarse if coarse else range(buffers.triangle_count)
         triangles = np.frombuffer(indices, np.int32).reshape(-1, 3)[own.start : own.stop]
         return buffers, np.frombuffer(vertices, np.float32).reshape(-1, 12), triangles
@@ -97,7 +98,7 @@ class Room:
         return starts[len(sizes) :] if coarse else starts[: len(sizes) + 1]
 
 
-@pytest.fixture(scope="module", params=CAMERAS.values(), ids=CAMERAS)
+@pytest.fixture(scope="module", params=CAMERAS.values(), ids=list(CAMERAS))
 def room(gpu: GpuContext, request: pytest.FixtureRequest) -> Iterator[Room]:
     frames = [seen_wall(camera, number) for number, camera in enumerate(request.param)]
     seen = SeenDepth(frames, [partial(posed_surface, each) for each in frames])

@@ -107,8 +107,9 @@ def made(gpu: GpuContext, tmp_path: Path) -> Iterator[Callable[..., SceneRendere
     """Makes renderers of the room."""
     renderers: list[SceneRenderer] = []
 
-    def make(geometry: str, **method: object) -> SceneRenderer:
-        renderers.append(SceneRenderer(gpu, document(Stage(tmp_path), geometry, **method), with_linear=True))
+    def make(geometry: str, material: dict[str, float] | None = None, **method: object) -> SceneRenderer:
+        scene = document(Stage(tmp_path), geometry, material, **method)
+        renderers.append(SceneRenderer(gpu, scene, with_linear=True))
         return renderers[-1]
 
     yield make

@@ -14,10 +14,10 @@ import trimesh
 
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import DlpvMethod, DvctMethod
-from deltalight.protocol.scene_objects import Pose
+from deltalight.protocol.scene_objects import Material, Pose
+from deltalight.render_server.geometry_state import ObjectExtent
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
-from deltalight.render_server.gpu_scene import ObjectExtent
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods.dvct import DVCT, state_memory
 from deltalight.render_server.methods.dvct_paper import InjectedVoxels
@@ -268,8 +268,8 @@ def test_the_papers_operator_is_as_good_with_a_second_object_far_away(gpu: GpuCo
     """What the first ball changes of the floor's light around it is as with it alone: bounced and direct light, and
     the error of [P1] eq. 9. Light is injected from maps, so these must be as fine, too."""
 
-    def changes(*balls: Vector, **settings: object) -> list[np.ndarray]:
-        with rendered(gpu, room(stage, *balls, operator="paper", **settings)) as (found, graph):
+    def changes(*balls: Vector, **method: Any) -> list[np.ndarray]:  # noqa: ANN401
+        with rendered(gpu, room(stage, *balls, operator="paper", **method)) as (found, graph):
             error = array_of(graph["delta error"]())
         seen = floor_around(found)
         return [
@@ -346,7 +346,9 @@ def within_cube(
 def test_cones_of_the_papers_operator_go_on_through_the_other_volume(gpu: GpuContext, stage: Stage) -> None:
     """Where the first ball mirrors the second one's volume, it shows what that holds; elsewhere, the surroundings."""
     document = room(stage, (0, 0, 0), (0.36, 0, 0), operator="paper")
-    smooth = document.objects[0].material.model_copy(update={"roughness": 0.05})
+    material = document.objects[0].material
+    assert isinstance(material, Material)
+    smooth = material.model_copy(update={"roughness": 0.05})
     objects = tuple(each.model_copy(update={"material": smooth}) for each in document.objects)
     with rendered(gpu, document.replaced(objects=objects)) as (fields, graph):
         filtered, (home, other) = graph.resource("filter"), graph["volume"].placements

@@ -9,14 +9,16 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
 from deltalight.protocol.scene_lights import LightCut, Lights
 from deltalight.protocol.sky_lights import SkyLights, TrackedLight
+from deltalight.render_server.lights.light_distance import common_inverse
 from deltalight.render_server.lights.light_models import DirectionalLight, SphereLight
-from deltalight.render_server.lights.shading_distance import distance_by_shading
+from deltalight.render_server.lights.shading_distance import Shading
 from deltalight.render_server.lights.sources import FisheyeSource
 
 LOW, HIGH = np.array([-0.12, 0.05, 0.0]), np.array([-0.02, 0.12, 0.1])
 """Corners of the box; the fish-eye camera stands beside it."""
 FISHEYE = np.array([0.05, 0.0, 0.02])
 TO_LIGHT = np.array([0.6, -0.5, 0.7]) / np.linalg.norm([0.6, -0.5, 0.7])
+TO_OTHER = np.array([-0.7, -0.4, 0.6]) / np.linalg.norm([-0.7, -0.4, 0.6])
 AMBIENT, SUN = 0.1, 1.5
 
 
@@ -45,8 +47,25 @@ def enters_box(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray,
     return np.where(hit, near, np.inf), np.nanargmax(enter, axis=-1)
 
 
-def scene(distance_m: float | None, lens: tuple[float, ...] = ()) -> ViewFrame:
-    """A photograph of the box under a lamp, or under the sun: lit, shadowed, of two albedos, with noise."""
+def lamp_light(
+    direction: np.ndarray, distance_m: float | None, points: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Irradiance by a lamp in a direction from the fish-eye camera, with the box's shadow."""
+    inverse = 0.0 if distance_m is None else 1 / distance_m
+    to_lamp = direction - inverse * (points - FISHEYE)
+    far = np.linalg.norm(to_lamp, axis=-1)
+    toward = to_lamp / far[..., None]
+    lit = np.isinf(enters_box(points + 1e-3 * normals, toward)[0])
+    return np.asarray(lit * SUN * np.maximum((toward * normals).sum(axis=-1), 0) / far**2)
+
+
+def scene(
+    distance_m: float | None, lens: tuple[float, ...] = (), *, other_m: float | None = None
+) -> ViewFrame:
+    """A photograph of the box under a lamp, or under the sun: lit, shadowed, of two albedos, with noise.
+
+    A second lamp may shine from the other side.
+    """
     model, world_from_camera = camera(lens), pose()
     rays = np.insert(model.rays().astype(float), 2, 1.0, axis=2) @ world_from_camera[:3, :3].T
     eye = np.broadcast_to(world_from_camera[:3, 3], rays.shape)
@@ -55,12 +74,9 @@ def scene(distance_m: float | None, lens: tuple[float, ...] = ()) -> ViewFrame:
     depth = np.minimum(box, floor)
     points = eye + depth[..., None] * rays
     normals = np.where((box < floor)[..., None], -np.eye(3)[axis] * np.sign(rays), [0, 0, 1.0])
-    inverse = 0.0 if distance_m is None else 1 / distance_m
-    to_lamp = TO_LIGHT - inverse * (points - FISHEYE)
-    far = np.linalg.norm(to_lamp, axis=-1)
-    toward = to_lamp / far[..., None]
-    lit = np.isinf(enters_box(points + 1e-3 * normals, toward)[0])
-    irradiance = AMBIENT * np.pi + lit * SUN * np.maximum((toward * normals).sum(axis=-1), 0) / far**2
+    irradiance = AMBIENT * np.pi + lamp_light(TO_LIGHT, distance_m, points, normals)
+    if other_m is not None:
+        irradiance += lamp_light(TO_OTHER, other_m, points, normals)
     tiles = (np.floor(points[..., 0] / 0.09) + np.floor(points[..., 1] / 0.09)) % 2
     rng = np.random.default_rng(3)
     radiance = irradiance * np.where(tiles, 0.6, 0.25) / np.pi * rng.normal(1, 0.02, depth.shape)
@@ -73,12 +89,23 @@ def scene(distance_m: float | None, lens: tuple[float, ...] = ()) -> ViewFrame:
     return ViewFrame(0, 0, color, model, pose=BoardPose(world_from_camera), depth=image)
 
 
-def sky() -> SkyLights:
+def sky(*directions: np.ndarray) -> SkyLights:
     fisheye = np.eye(4)
     fisheye[:3, 3] = FISHEYE
     residual = np.full((32, 32, 3), AMBIENT, np.float32)
-    light = TrackedLight(0, TO_LIGHT, np.full(3, SUN), 0.005)
-    return SkyLights(LightCut(), fisheye, (light,), (), residual, np.ones((32, 32, 1), np.float32))
+    lights = tuple(
+        TrackedLight(identity, toward, np.full(3, SUN), 0.005)
+        for identity, toward in enumerate(directions or (TO_LIGHT,))
+    )
+    return SkyLights(LightCut(), fisheye, lights, (), residual, np.ones((32, 32, 1), np.float32))
+
+
+def distance_by_shading(frame: ViewFrame, given: SkyLights) -> float | None:
+    """The distance that shading and shadows tell alone; None where they tell nothing."""
+    shading = Shading.of(frame, given)
+    assert shading is not None
+    assert shading.cue is not None
+    return 1 / common_inverse([shading.cue]) if shading.cue.tells_near else None
 
 
 @pytest.mark.parametrize("distance_m", [0.5, 0.8, 1.4])
@@ -118,7 +145,7 @@ def test_frames_that_show_nothing_say_nothing() -> None:
         replace(frame, depth=nothing),
         replace(frame, color=black),
     ):
-        assert distance_by_shading(blind, sky()) is None
+        assert Shading.of(blind, sky()) is None
 
 
 def test_lamps_come_near_without_a_board() -> None:
@@ -131,3 +158,32 @@ def test_lamps_come_near_without_a_board() -> None:
         if isinstance(light, SphereLight):
             assert np.linalg.norm(light.position - FISHEYE) == pytest.approx(0.8, rel=0.15)
             assert "shading and shadows" in source.remarks[0]
+
+
+@pytest.mark.parametrize(("one_m", "other_m"), [(0.6, 1.8), (1.5, 0.7)])
+def test_lamps_at_different_distances_each_have_their_own(one_m: float, other_m: float) -> None:
+    source = FisheyeSource(Lights.model_validate({"mode": "fisheye"}))
+    view = replace(scene(one_m, other_m=other_m), sky_lights=sky(TO_LIGHT, TO_OTHER))
+    lights = source.update(view)
+    assert lights is not None
+    for light, distance_m in zip(lights.lights, (one_m, other_m), strict=True):
+        assert isinstance(light, SphereLight)
+        assert np.linalg.norm(light.position - FISHEYE) == pytest.approx(distance_m, rel=0.2)
+    assert source.remarks[0].count(" m") == 2
+
+
+def test_lamps_as_far_as_each_other_share_a_distance() -> None:
+    shading = Shading.of(scene(0.8, other_m=0.8), sky(TO_LIGHT, TO_OTHER))
+    assert shading is not None
+    assert shading.own_inverses() == {}
+
+
+def test_the_lights_of_one_lamp_stay_together() -> None:
+    """A large lamp is cut into lights whose discs touch."""
+    across = np.cross(TO_LIGHT, [0.0, 0, 1])
+    beside = TO_LIGHT + 0.2 * across / np.linalg.norm(across)
+    given = sky(TO_LIGHT, TO_OTHER, beside / np.linalg.norm(beside))
+    wide = replace(given, lights=tuple(replace(light, angular_radius_rad=0.12) for light in given.lights))
+    shading = Shading.of(scene(0.8), wide)
+    assert shading is not None
+    assert [[light.identity for light in lamp] for lamp in shading.lamps] == [[0, 2], [1]]

@@ -1,5 +1,6 @@
 """One frame written in several views and methods: the files, what is refused, and that nothing else changes."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,10 +51,12 @@ def folder(tmp_path: Path) -> Path:
 
 
 def read_png(path: Path) -> np.ndarray:
-    return np.asarray(cv2.imread(str(path))[..., ::-1])
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return np.asarray(picture[..., ::-1])
 
 
-def order(folder: Path, *pictures: dict[str, object], exr: bool = False) -> SnapshotRequest:
+def order(folder: Path, *pictures: Mapping[str, object], exr: bool = False) -> SnapshotRequest:
     data = {"folder": str(folder), "pictures": pictures, "exr": exr}
     return validate(SnapshotRequest, data, "the order")
 
@@ -62,7 +65,7 @@ def with_view(document: SceneDocument, view: str) -> SceneDocument:
     return document.replaced(output=document.output.replaced(view=view))
 
 
-def with_method(document: SceneDocument, method: dict[str, object]) -> SceneDocument:
+def with_method(document: SceneDocument, method: Mapping[str, object]) -> SceneDocument:
     return SceneDocument.model_validate({**document.model_dump(), "method": method})
 
 
@@ -73,7 +76,7 @@ def test_each_picture_is_what_that_view_and_method_alone_would_show(
     document = everyday(stage, cone_scale=2, cone_count=8)
     document = document.replaced(output=document.output.replaced(width=80))
     view = frame(checkered())
-    pictures = [
+    pictures: list[dict[str, object]] = [
         {"name": "plain"},
         {"name": "delta", "view": "delta"},
         {"name": "maps", "view": "rsm"},
@@ -181,7 +184,7 @@ def test_what_is_averaged_over_frames_is_as_if_there_had_been_no_snapshot(
                 assert take_snapshot(renderer, document, CameraFrame.numbered([view]), wanted).errors == {}
         pictures.append(renderer.render(noisy_view(4)).color)
         renderer.release()
-    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_array_equal(pictures[0], pictures[1])
 
 
 @pytest.mark.slow
@@ -199,7 +202,7 @@ def test_another_source_begins_as_if_there_had_been_none(gpu: GpuContext, stage:
                 renderer.pick(1, 1)
         pictures.append([renderer.render(noisy_view(number)).color for number in range(2)])
         renderer.release()
-    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_array_equal(pictures[0], pictures[1])
 
 
 def test_a_frame_without_pose_is_the_cameras_picture_linear_too(

@@ -142,7 +142,7 @@ def gradient_scene(folder: Path, texture: TextureByLight, name: str) -> SceneDoc
     turned = plate(folder, texture, rotation_wxyz=[np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
     document = unlit(Stage(folder).document([turned], []))
     lights = Lights(mode="environment", environment=given, registration=(1.0, 1.0, 1.0))
-    return document.replaced(lights=lights, shading=Shading(name=name, rays=64, bounces=0))
+    return document.replaced(lights=lights, shading=Shading(rays=64, bounces=0).replaced(name=name))
 
 
 @pytest.mark.parametrize("name", ["image_based", "precomputed"])
@@ -158,7 +158,8 @@ def test_a_map_of_light_is_integrated_with_the_texture(gpu: GpuContext, tmp_path
     )
     leant = np.where(codes > 0.04045, ((codes + 0.055) / 1.055) ** 2.4, codes / 12.92)
     steep = np.interp(z, STEPS, relief().layers[:, 0, 0, 0].astype(float))[:, None] * TINT
-    stack = stack_of_halves(*[relief().layers[:, 0, 0, 0].astype(float)] * 2)
+    half = relief().layers[:, 0, 0, 0].astype(float)
+    stack = stack_of_halves(half, half)
     renderer = SceneRenderer(gpu, gradient_scene(tmp_path, stack, name), with_linear=True)
     try:
         for made, response in ((stack, steep), (leaning(), leant)):
@@ -188,7 +189,7 @@ def captured(folder: Path, albedo: float = 0.5, **info: object) -> Path:
 @pytest.mark.parametrize("angles", [{}, {"angles_deg": None}])
 def test_a_folder_of_pictures_is_read(tmp_path: Path, angles: dict[str, None]) -> None:
     """Whether the angles are given, or told by the pictures' means, a Lambertian is one at every step."""
-    found = read_texture_stack(captured(tmp_path / "stack", **angles, f0=0.04, roughness=0.5))
+    found = read_texture_stack(captured(tmp_path / "stack", 0.5, **angles, f0=0.04, roughness=0.5))
     assert (found.layers.shape, found.f0, found.roughness) == ((LAYERS, 6, 9, 3), 0.04, 0.5)
     assert found.layers[:, 3, 4, 1] == pytest.approx(0.5 * STEPS, abs=0.004)
     assert found.albedo == pytest.approx(0.5, abs=0.004)

@@ -139,14 +139,15 @@ def test_a_sample_that_meets_anything_counts_as_occupied(lab: VoxelLab) -> None:
         assert np.array_equal(held[..., : cells + 1], corners)
         half = SIZE // 2
         first += held.size if level == 0 else (half + 1) ** 2 * 32 * (half // 32 + 1)
-        covered = covered.reshape(cells // 2, 2, cells // 2, 2, cells // 2, 2).any(axis=(1, 3, 5))
+        covered = np.any(covered.reshape(cells // 2, 2, cells // 2, 2, cells // 2, 2), axis=(1, 3, 5))
 
 
 @pytest.mark.parametrize("edge", [0.12, 0.07, 0.3])
 def test_faces_on_borders_of_voxels_keep_their_area(gpu: GpuContext, edge: float) -> None:
     """But for rounding."""
     box = trimesh.creation.box((edge,) * 3)
-    placement = place_volume(*box.bounds, SIZE, None)
+    low, high = box.bounds
+    placement = place_volume(low, high, SIZE, None)
     store, volume, voxelize = VoxelStore(gpu, SIZE), PlacedVolume(gpu, placement), Voxelize(gpu)
     mesh = MeshBuffers(gpu)
     mesh.write(gpu_mesh(box))
@@ -331,7 +332,7 @@ def test_isotropic_levels_filtered_together_are_those_of_one_after_the_other(
             for mipmap, texels in zip(mipmaps, level_zero, strict=True):
                 mipmap.resize(size, count)
                 mipmap.texture.write(texels.tobytes(), viewport=(0, 0, 0, count * size, size, size))
-            filtering.run(*mipmaps, volume)
+            filtering.run(mipmaps[0], mipmaps[1], volume)
             found.append([mipmap.texture.read() for mipmap in mipmaps])
         filtering.release()
     assert found[1:] == found[:-1]

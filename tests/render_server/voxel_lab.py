@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import moderngl
 import numpy as np
 import trimesh
 
@@ -38,6 +39,13 @@ def gpu_mesh(mesh: trimesh.Trimesh, radiance: float = 0.0, *, inside_out: bool =
         base_color=np.zeros(3, np.float32), specular=0.0, emission=np.full(3, radiance, np.float32)
     )
     return merge_for_gpu([TriangleMesh(positions[source], normals, triangles, None, material)])
+
+
+def solid_buffer(buffers: MeshBuffers, name: str) -> moderngl.Buffer:
+    """Of a mesh on the GPU."""
+    buffer = buffers.solid[name]
+    assert isinstance(buffer, moderngl.Buffer)
+    return buffer
 
 
 @dataclass

@@ -13,7 +13,7 @@ pytest.importorskip("depthai", reason="the OAK SDK is not installed")
 dai = load_depthai()
 
 WIDTH, HEIGHT, FULL = 64, 36, (4056, 3040)
-SENSOR = [[3000.0, 0, 2030], [0, 3010, 1510], [0, 0, 1]]
+SENSOR: list[list[float]] = [[3000.0, 0, 2030], [0, 3010, 1510], [0, 0, 1]]
 LENS = [-0.3, 0.2, 0.001, -0.002, 0.05, -0.25, 0.15, 0.04, 0, 0, 0, 0, 0, 0]
 PERIOD_MS = 5
 WAIT_S = 20.0

@@ -46,7 +46,7 @@ def test_markers_are_found_better_once_the_lens_is_known() -> None:
     synthetic = SyntheticCamera(camera=CAMERA)
     assert synthetic.board is not None
     target = MarkerBoard(synthetic.board)
-    errors = {"found": [], "refined": []}
+    errors: dict[str, list[np.ndarray]] = {"found": [], "refined": []}
     for index in (0, 20, 50):
         gray = cv2.cvtColor(synthetic.frame_at(index).color, cv2.COLOR_RGB2GRAY)
         found = target.find(gray)

@@ -186,7 +186,8 @@ class HostOnlyDevice(OakDevice):
 
     def __init__(self, *, depth: bool = True, frames: int = 1_000_000) -> None:
         super().__init__("test")
-        self.openings, self.sent = 0, []
+        self.openings = 0
+        self.sent: list[Any] = []  # of the SDK's kind
         self._depth, self._frames = depth, frames
         self._source: Any = None
 
@@ -221,7 +222,7 @@ class HostOnlyDevice(OakDevice):
 
 
 def _source_node() -> Any:  # noqa: ANN401 - a class of the SDK's kind
-    class Source(dai.node.ThreadedHostNode):  # type: ignore[misc,name-defined]
+    class Source(dai.node.ThreadedHostNode):  # type: ignore[misc]
         def __init__(self, frames: int) -> None:
             dai.node.ThreadedHostNode.__init__(self)
             self.color, self.depth, self.imu = (self.createOutput() for _ in range(3))
@@ -310,7 +311,9 @@ def test_rgb_yaml_goes_before_the_devices_own_calibration(oak: Callable[..., Oak
 
 def test_an_rgb_yaml_with_distortion_does_not_fit_corrected_pictures(oak: Callable[..., OakCamera]) -> None:
     matrix = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]])
-    known = LiveCalibration(camera=CameraModel(WIDTH, HEIGHT, matrix, "plumb_bob", [0.1, 0, 0, 0, 0]))
+    known = LiveCalibration(
+        camera=CameraModel(WIDTH, HEIGHT, matrix, "plumb_bob", np.array([0.1, 0, 0, 0, 0]))
+    )
     with pytest.raises(DeltalightError, match=r"take rgb\.yaml out"):
         oak(HostOnlyDevice(), known=known).open()
     with oak(HostOnlyDevice(), known=known, with_depth=False) as camera:

@@ -110,7 +110,7 @@ def test_frames_pass_and_the_lens_is_known_once_it_is_open() -> None:
 def test_after_a_failure_ids_and_times_go_on_rising(fault: str) -> None:
     inner = Scripted({3: fault, 9: fault})
     with reconnecting(inner) as camera:
-        frames = []
+        frames: list[SensorFrame] = []
         while inner.opened < 3 or len(frames) < 12:
             frames.append(camera.read())
     ids, times = ([getattr(frame, name) for frame in frames] for name in ("frame_id", "timestamp_ns"))

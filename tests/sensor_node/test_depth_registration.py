@@ -71,9 +71,10 @@ def test_unknown_and_unseen_depth_stays_unknown() -> None:
 def test_real_near_depth_comes_to_lie_on_the_near_things(shared_data: Path) -> None:
     folder = shared_data / "rgbd" / "visp_castel_realsense"
     color = cv2.imread(str(folder / "image" / "image_0000.png"), cv2.IMREAD_GRAYSCALE)
-    depth_m = (cv2.imread(str(folder / "depth" / "0000.png"), cv2.IMREAD_UNCHANGED) * 0.000124986647).astype(
-        np.float32
-    )
+    steps = cv2.imread(str(folder / "depth" / "0000.png"), cv2.IMREAD_UNCHANGED)
+    assert color is not None
+    assert steps is not None
+    depth_m = (steps * 0.000124986647).astype(np.float32)
     height, width = color.shape
     color_camera = CameraModel(
         width, height, np.array([[615.167, 0, 312.189], [0, 615.168, 243.437], [0, 0, 1]])

@@ -92,7 +92,9 @@ def test_the_offices_illuminance_is_the_measured_one(office: Office) -> None:
 def test_the_office_looks_like_the_finished_picture(office: Office, shared_data: Path) -> None:
     """Median luminance of 10 degree cells within 10 %: the finished picture is turned and scaled by about 1 %."""
     path = shared_data / "fisheye" / "indoor_hdr_bracket_office" / "calibrated_luminance_1000x1000.hdr"
-    finished = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1] @ EFFICACY
+    calibrated = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert calibrated is not None
+    finished = calibrated[..., ::-1] @ EFFICACY
     result = radiance_map(office.pictures, np.eye(4), SIZE)
     directions = texel_directions(SIZE).astype(np.float64)
     angle = np.arccos(directions[..., 2])

@@ -243,6 +243,7 @@ def test_real_apriltag_grid_agrees_with_the_published_poses(shared_data: Path) -
     for frame in reader:
         pose = detector.detect(frame.color)
         assert pose is not None, f"no board in frame {frame.frame_id}"
+        assert pose.reprojection_error_px is not None
         ours.append(np.linalg.inv(pose.world_from_camera))
         theirs.append(np.array(published[2 * frame.frame_id]).reshape(4, 4))
         errors.append(pose.reprojection_error_px)

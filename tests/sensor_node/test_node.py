@@ -140,7 +140,7 @@ def test_colour_comes_after_what_belongs_to_it(endpoint: str, take: Path) -> Non
     socket.subscribe("")
     socket.connect(endpoint)
     with running(NodeConfig(source=str(take), endpoint=endpoint)):
-        order = []
+        order: list[str] = []
         while len(order) < 12:
             message, _ = decode(socket.recv_multipart())
             if message.stream != "stats":

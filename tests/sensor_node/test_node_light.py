@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -279,10 +280,17 @@ def test_a_lost_board_and_old_frames_are_told() -> None:
 
 
 def test_a_repeater_makes_a_message_once_for_each_object(monkeypatch: pytest.MonkeyPatch) -> None:
-    repeats, made, sent = Repeater[list[int]](), [], []
+    made: list[list[int]] = []
+    sent: list[list[bytes]] = []
+
+    def message_of(item: list[int]) -> list[bytes]:
+        made.append(item)
+        return [bytes(item)]
+
+    repeats = Repeater[list[int]]()
     first, second = [1], [1]
     for item in (first, first, second, second, first):
-        repeats.send(item, lambda item=item: made.append(item) or [bytes(item)], sent.append)  # type: ignore[misc]
+        repeats.send(item, partial(message_of, item), sent.append)
     assert len(made) == len(sent) == 3
     monkeypatch.setattr(node, "REPEAT_S", 0.0)
     repeats.send(first, lambda: [b"not made again"], sent.append)

@@ -18,8 +18,8 @@ from deltalight.services.api.serve import http_server, listening
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.storage.assets import Probe
 from deltalight.services.storage.store import Store
+from tests.services.render_server_samples import InvertingRenderer
 from tests.services.storage_samples import trusting_probe
-from tests.services.test_session import InvertingRenderer
 
 UPLOAD = {"Content-Type": "application/octet-stream"}
 
@@ -55,16 +55,14 @@ class RunningApi:
 
 
 @contextmanager
-def running_api(
-    folder: Path, *, probe: Probe = trusting_probe, requests_per_s: float = 1000, **settings: object
-) -> Iterator[RunningApi]:
+def running_api(folder: Path, probe: Probe = trusting_probe, /, **settings: object) -> Iterator[RunningApi]:
     """Serves until the end of the block; `settings` go to `ApiSettings`."""
     port, control_port, stats_port = ports.private_ports(3)
     defaults = {
         "port": port,
         "control": ports.endpoint(control_port),
         "subscribe": [ports.endpoint(stats_port)],
-        "requests_per_s": requests_per_s,
+        "requests_per_s": 1000,
     }
     chosen = ApiSettings.model_validate({**defaults, **settings})
     with Store(folder, database=chosen.database, assets=chosen.assets, probe=probe) as store:

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.codecs import encode_color, encode_depth
 from deltalight.protocol.envelope import encode
+from deltalight.protocol.message_fields import matrix_rows
 from deltalight.protocol.messages import ColorMessage, DepthMessage, PoseMessage
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.cli import run
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 72, 54  # no power of two (CONTRIBUTING.md)
 DATABASES = ("sqlite", "postgres")
-IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
+IDENTITY = matrix_rows(np.eye(4))
 
 RunCli = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -165,7 +166,9 @@ def depth(
     return received(encode(message, [encode_depth(image, image > 0, "raw", 0.001)]), 0)
 
 
-def pose(frame_id: int, capture_ns: int, status: str = "ok", node: str = "cam") -> ReceivedMultipart:
+def pose(
+    frame_id: int, capture_ns: int, status: Literal["ok", "no_board"] = "ok", node: str = "cam"
+) -> ReceivedMultipart:
     matrix = IDENTITY if status == "ok" else None
     message = PoseMessage(
         node=node, frame_id=frame_id, capture_ns=capture_ns, status=status, world_from_camera=matrix

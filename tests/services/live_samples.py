@@ -5,7 +5,7 @@ import json
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +29,13 @@ PERIOD_S = 0.1  # each picture takes 1 ms of its processor, and of that of each 
 PATIENCE_S = 60.0  # on a busy machine
 AGE_S = 0.005
 NOISE = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-LIGHT = {"type": "sphere", "position_m": [0.0, 0.0, 2.0], "intensity": [2.0, 1.0, 1.0], "radius_m": 0.1}
-AROUND = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
+LIGHT: dict[str, object] = {
+    "type": "sphere",
+    "position_m": [0.0, 0.0, 2.0],
+    "intensity": [2.0, 1.0, 1.0],
+    "radius_m": 0.1,
+}
+AROUND: dict[str, object] = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
 
 
 class StandInStream:
@@ -159,13 +164,19 @@ def wait_for_frames(address: str, patience_s: float = PATIENCE_S) -> None:
     pytest.fail("no frame ever came")
 
 
-def live_socket(address: str, query: str = "", **options: object) -> ClientConnection:
-    options = {"compression": None, "open_timeout": PATIENCE_S, **options}
-    return connect(f"ws://{address}/api/v1/live{query}", **options)  # type: ignore[arg-type]
+def live_socket(
+    address: str, query: str = "", additional_headers: Mapping[str, str] | None = None
+) -> ClientConnection:
+    return connect(
+        f"ws://{address}/api/v1/live{query}",
+        compression=None,
+        open_timeout=PATIENCE_S,
+        additional_headers=additional_headers,
+    )
 
 
-def event_socket(address: str, query: str = "", **options: object) -> ClientConnection:
-    return connect(f"ws://{address}/api/v1/events{query}", **{"open_timeout": PATIENCE_S, **options})  # type: ignore[arg-type]
+def event_socket(address: str, query: str = "") -> ClientConnection:
+    return connect(f"ws://{address}/api/v1/events{query}", open_timeout=PATIENCE_S)
 
 
 def read_frame(socket: ClientConnection, timeout_s: float = PATIENCE_S) -> dict[str, Any]:

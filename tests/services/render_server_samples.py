@@ -48,13 +48,13 @@ class Recorder:
         self.gate.set()
         self._server.close()
 
-    def payloads(self, op: str) -> list[dict[str, object]]:
+    def payloads(self, op: str) -> list[dict[str, Any]]:
         return [payload for asked, payload in self.asked if asked == op]
 
     def watched(self) -> list[ShownView]:
         """The views that are ordered."""
         orders = self.payloads("watch")
-        return list(orders[-1]["views"]) if orders else []  # type: ignore[call-overload]
+        return list(orders[-1]["views"]) if orders else []
 
     def _execute(self, request: ControlRequest) -> dict[str, object]:
         self.asked.append((request.op, dict(request.payload)))

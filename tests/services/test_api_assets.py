@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from deltalight.protocol.radiance_files import write_exr
+from deltalight.protocol.scene_objects import PrecomputedMaterial
 from deltalight.render_server.scene.gaussian_brdf import RISE_TERMS, GaussianBrdf
 from deltalight.render_server.scene.material_file import write_material
 from deltalight.render_server.scene.polynomial_texture import TERMS, PolynomialTexture
@@ -57,7 +58,7 @@ def glb_naming(uri: str) -> bytes:
 
 @pytest.fixture(scope="module")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
-    with running_api(tmp_path_factory.mktemp("data"), probe=probe, upload_limit_mb=2) as running:
+    with running_api(tmp_path_factory.mktemp("data"), probe, upload_limit_mb=2) as running:
         yield running
 
 
@@ -129,10 +130,9 @@ def test_precomputed_materials_are_taken_and_used_by_scenes(api: RunningApi, tmp
     item = {"id": "ball", "asset": mesh, "material": {"precomputed": "paint.dlmat"}}
     scene = api.client.post("/scenes", json={"objects": [item]}).json()
     assert scene["document"]["objects"][0]["material"] == {"precomputed": found["asset"]}
-    path = Path(
-        api.store.assets.localised(api.store.scenes.get(scene["id"]).document).objects[0].material.precomputed
-    )  # type: ignore[union-attr]
-    assert path.read_bytes() == paint(tmp_path)
+    local = api.store.assets.localised(api.store.scenes.get(scene["id"]).document).objects[0].material
+    assert isinstance(local, PrecomputedMaterial)
+    assert Path(local.precomputed).read_bytes() == paint(tmp_path)
     assert f"used by scene {scene['id']}" in sentence(api.client.delete(f"/assets/{found['asset']}"), 409)
     for place, wrong in (
         ({"asset": found["asset"]}, "needs a mesh"),

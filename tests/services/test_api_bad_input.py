@@ -39,7 +39,7 @@ WORKERS = 16
 
 @pytest.fixture(scope="module")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
-    with running_api(tmp_path_factory.mktemp("data"), probe=probe, upload_limit_mb=LIMIT_MB) as running:
+    with running_api(tmp_path_factory.mktemp("data"), probe, upload_limit_mb=LIMIT_MB) as running:
         yield running
 
 
@@ -188,7 +188,7 @@ def test_wrong_and_lying_files(api: RunningApi, content: bytes, name: str, expec
 def test_pictures_that_unpack_to_gigabytes(api: RunningApi, tmp_path: Path) -> None:
     for content, name in ((textured_bomb(), "bomb.glb"), (exr_bomb(tmp_path), "bomb.exr")):
         assert len(content) < LIMIT_MB << 20
-        assert name in refused(api, lambda c=content, n=name: upload(api.client, c, n), 422, "rejected-asset")
+        assert name in refused(api, partial(upload, api.client, content, name), 422, "rejected-asset")
 
 
 def request_head(api: RunningApi, *headers: str) -> bytes:
@@ -258,7 +258,7 @@ def test_yaml_that_is_a_trap(api: RunningApi) -> None:
         "name: " + "9" * 5000,
         "name: 2020-13-45",
     ):
-        refused(api, lambda text=text: sent(text), 422, "invalid")
+        refused(api, partial(sent, text), 422, "invalid")
 
 
 @pytest.mark.parametrize("path", ["/scenes", "/recordings"])  # read by this service, and by its framework
@@ -309,7 +309,7 @@ def test_stale_changes_and_assets_in_use(api: RunningApi) -> None:
         ("DELETE", "", None),
     ):
         request = client.build_request(method, address + path, json=body, headers=stale)
-        text = refused(api, lambda request=request: client.send(request), 409, "stale-revision")
+        text = refused(api, partial(client.send, request), 409, "stale-revision")
         assert "the scene is at revision 2 and the change was made to 1" in text
     in_body = refused(api, lambda: client.put(address, json={"revision": 1}), 409, "stale-revision")
     assert "made to 1" in in_body
@@ -333,7 +333,7 @@ def test_tokens_that_nobody_knows_and_too_many_requests(tmp_path: Path) -> None:
 def test_ranges_that_a_file_does_not_have(api: RunningApi) -> None:
     address = "/assets/" + upload(api.client, TETRAHEDRON, "t.obj").json()["asset"] + "/content"
     for wanted, status in (("bytes=5000-", 416), ("bytes=a-b", 400)):
-        refused(api, lambda w=wanted: api.client.get(address, headers={"Range": w}), status, "range")
+        refused(api, partial(api.client.get, address, headers={"Range": wanted}), status, "range")
     part = api.client.get(address, headers={"Range": "bytes=0-5"})
     assert (part.status_code, part.content) == (206, TETRAHEDRON[:6])
 

@@ -107,14 +107,14 @@ def test_viewers_watch_different_cameras_and_turn_to_others(api: CameraApi) -> N
 
 
 def test_an_unknown_camera_is_one_sentence_that_names_those_there_are(api: CameraApi, tmp_path: Path) -> None:
-    asked = {"params": {"camera": "middle"}}
+    asked = {"camera": "middle"}
     for path in ("/live.jpg", "/live.mjpg"):
-        assert sentence(api.client.get(path, **asked), 404) == THERE
+        assert sentence(api.client.get(path, params=asked), 404) == THERE
     pick = {"x": 1, "y": 1, "camera": "middle"}
     assert sentence(api.client.post("/live/pick", json=pick), 404) == THERE
     assert sentence(api.client.post("/snapshots", json={"camera": "middle"}), 404) == THERE
-    offer = {"content": b"", "headers": {"Content-Type": "application/sdp"}}
-    assert sentence(api.client.post("/whep", **asked, **offer), 404) == THERE
+    offer = api.client.post("/whep", params=asked, content=b"", headers={"Content-Type": "application/sdp"})
+    assert sentence(offer, 404) == THERE
     for query, order in (("?camera=middle", "view"), ("", "camera middle")):
         with live_socket(api.address, query) as socket:
             with suppress(websockets.ConnectionClosed):
@@ -153,10 +153,11 @@ def test_a_viewer_of_a_camera_that_is_gone_sees_the_one_there_is(api: CameraApi)
         next_of(socket, "right")
         api.room.statuses = {"left": "live"}  # as where a replay takes the place of the cameras
         wait_for(lambda: statuses(api) == {"left": "live"})
-        message = None
+        message: bytes | None = None
         while message is None or unpack(message)[0].node is not None:
-            message = socket.recv(timeout=10)
-            assert isinstance(message, bytes)
+            received = socket.recv(timeout=10)
+            assert isinstance(received, bytes)
+            message = received
             socket.send("ack")
         assert grey(unpack(message)[1]) == SHADES["left"]
         assert api.shade(camera="left") == SHADES["left"]

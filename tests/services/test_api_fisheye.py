@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,11 +76,14 @@ def test_lights_that_no_render_server_describes_so_are_left_out(wrong: dict[str,
 
 
 def test_lights_are_where_the_lens_shows_them() -> None:
-    directional = {"type": "directional", "direction": [0.0, -np.sin(0.5), -np.cos(0.5)]}
-    directional |= {"irradiance": [1.0, 1.0, 1.0], "angular_radius_deg": 2.0}
-    described = [
+    described: list[dict[str, Any]] = [
         {**SPHERE, "position_m": [0.0, 0.0, 2.0], "id": 4},
-        directional,
+        {
+            "type": "directional",
+            "direction": [0.0, -np.sin(0.5), -np.cos(0.5)],
+            "irradiance": [1.0, 1.0, 1.0],
+            "angular_radius_deg": 2.0,
+        },
         {**SPHERE, "position_m": [0.0, 0.0, -2.0]},  # below: the lens does not see it
         {"type": "environment", "mean_radiance": [1, 1, 1]},
     ]

@@ -150,9 +150,9 @@ def test_answers_keep_to_the_description(full_api: RunningApi, tmp_path: Path) -
     del description["paths"]["/api/v1/whep"]
     (tmp_path / "openapi.json").write_text(json.dumps(with_plain_tuples(description)))
     (tmp_path / "schemathesis.toml").write_text(configuration(fill(full_api)))
-    options = ("--checks", ",".join(CHECKS), "--max-examples", "5", "--generation-deterministic")
-    options += ("--request-timeout", "120")  # of a machine that other tests keep busy
-    options += ("--phases", "examples,fuzzing,stateful", "--continue-on-failure", "--no-shrink")
+    options = ["--checks", ",".join(CHECKS), "--max-examples", "5", "--generation-deterministic"]
+    options += ["--request-timeout", "120"]  # of a machine that other tests keep busy
+    options += ["--phases", "examples,fuzzing,stateful", "--continue-on-failure", "--no-shrink"]
     address = str(full_api.client.base_url).removesuffix("/api/v1/")
     done = subprocess.run(
         [Path(sys.executable).parent / "schemathesis", "run", "openapi.json", "--url", address, *options],

@@ -48,7 +48,7 @@ def api(gate: Gate, tmp_path: Path) -> Iterator[RunningApi]:
         gate.wait()
         return trusting_probe(path, kind, name)
 
-    with running_api(tmp_path, probe=probe) as running:
+    with running_api(tmp_path, probe) as running:
         yield running
 
 

@@ -55,10 +55,10 @@ def wait_for(condition: Callable[[], bool]) -> None:
 def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_path: Path) -> None:
     port, control_port, publish_port, node_port = ports.private_ports(4)
     control = ports.endpoint(control_port)
-    server = ("server", "--control", control, "--publish", ports.endpoint(publish_port))
-    server += ("--subscribe", ports.endpoint(node_port), "--allow-software")
-    rest = ("api", "--port", port, "--data", tmp_path, "--control", control)
-    rest += ("--subscribe", ports.endpoint(publish_port))
+    server = ["server", "--control", control, "--publish", ports.endpoint(publish_port)]
+    server += ["--subscribe", ports.endpoint(node_port), "--allow-software"]
+    rest: list[object] = ["api", "--port", port, "--data", tmp_path, "--control", control]
+    rest += ["--subscribe", ports.endpoint(publish_port)]
     client = httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60)
     control_client = RequestClient(control)
 

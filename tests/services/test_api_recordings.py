@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -114,10 +115,14 @@ def test_it_ends_by_itself_after_its_time(client: httpx.Client) -> None:
 
 def test_relit_pictures_are_kept_where_wanted_and_downloaded_as_a_video(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
+
+    def frames_of(api: RunningApi, name: str) -> bool:
+        return bool(api.client.get(f"/recordings/{name}").json()["frames"])
+
     with feeding(relights=True) as (endpoint, _), running_api(tmp_path, subscribe=[endpoint]) as relit:
         for name, body in (("plain", {}), ("both", {"composites": True})):
             relit.client.post("/recordings", json={"name": name, **body}).raise_for_status()
-            wait_for(lambda name=name: relit.client.get(f"/recordings/{name}").json()["frames"])
+            wait_for(partial(frames_of, relit, name))
             time.sleep(0.3)
             relit.client.post(f"/recordings/{name}/stop").raise_for_status()
         both, plain = (relit.client.get(f"/recordings/{name}").json() for name in ("both", "plain"))

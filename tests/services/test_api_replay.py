@@ -65,9 +65,10 @@ def children() -> list[psutil.Process]:
     return [child for child in psutil.Process().children() if "replay" in child.cmdline()]
 
 
-def source(server: Recorder) -> object:
+def source(server: Recorder) -> list[str] | None:
     """Where the render server was told to read from last."""
-    return server.payloads("set_source")[-1]["endpoints"]
+    endpoints: list[str] | None = server.payloads("set_source")[-1]["endpoints"]
+    return endpoints
 
 
 def test_a_recording_is_shown_moved_through_and_left(
@@ -80,10 +81,12 @@ def test_a_recording_is_shown_moved_through_and_left(
     assert (state["recording"], state["playing"], state["rate"], state["loop"]) == ("take", False, 1.0, True)
     assert state["position_s"] == pytest.approx(0.5, abs=1 / 30)
     assert state["duration_s"] == pytest.approx(LENGTH_S)
-    (endpoint,) = source(server)  # type: ignore[misc]
-    assert str(endpoint).startswith("tcp://127.0.0.1:")
+    endpoints = source(server)
+    assert endpoints is not None
+    (endpoint,) = endpoints
+    assert endpoint.startswith("tcp://127.0.0.1:")
     out = tmp_path_factory.mktemp("out") / "b.mcap"
-    status = StreamRecorder(RecordJob(out, (str(endpoint),), frames=2), print).run(Event())
+    status = StreamRecorder(RecordJob(out, (endpoint,), frames=2), print).run(Event())
     assert status.frames == 2, "while paused the frame is sent again and again"
 
     moved = client.patch("/replay", json={"position_s": 0.2, "rate": 0.05, "playing": True}).json()
@@ -117,7 +120,7 @@ def test_a_recording_that_the_node_plays_is_moved_through_where_no_other_is_show
         stack.callback(server.close)
         stack.enter_context(playback_control(camera, endpoint, None))
         options = {"playback": endpoint, "control": ports.endpoint(control_port)}
-        client = stack.enter_context(running_api(tmp_path, **options)).client  # type: ignore[arg-type]
+        client = stack.enter_context(running_api(tmp_path, **options)).client
         first = client.get("/replay").json()
         assert (first["recording"], first["position_s"], first["playing"]) == (None, 0, False)
         moved = client.patch("/replay", json={"step_frames": 2, "rate": 2}).json()

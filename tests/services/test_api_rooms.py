@@ -47,7 +47,7 @@ class House:
 
     def shows(self, room: str) -> list[object]:
         """Names of the scenes that the room's render server was sent."""
-        return [order["scene"]["name"] for order in self.server(room).payloads("set_scene")]  # type: ignore[index]
+        return [order["scene"]["name"] for order in self.server(room).payloads("set_scene")]
 
     def replaced(self, room: str) -> None:
         """Kills the room's render server and waits until the service talks to the next."""

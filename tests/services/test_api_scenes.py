@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -27,7 +28,7 @@ def client(api: RunningApi) -> httpx.Client:
     return api.client
 
 
-def make(client: httpx.Client, **document: object) -> dict[str, object]:
+def make(client: httpx.Client, **document: object) -> dict[str, Any]:
     response = client.post("/scenes", json=document)
     assert response.status_code == 201, response.text
     return dict(response.json())
@@ -399,7 +400,7 @@ def _ahead(scene_id: str) -> ControlRequest:
     )
 
 
-def _view_request() -> object:
+def _view_request() -> ControlRequest:
     from tests.services.test_session import request
 
     return request("set_view", view="delta")

@@ -85,8 +85,8 @@ def test_the_order_names_views_and_methods(api: RunningApi, server: Recorder, fo
     answer = api.client.post("/snapshots", json={"pictures": wanted, "exr": True})
     assert answer.status_code == 201, answer.text
     order = server.payloads("snapshot")[-1]
-    first, second = order["pictures"]  # type: ignore[misc]
-    assert (first["name"], first["view"], first["method"]["operator"]) == ("paper", "composite", "paper")  # type: ignore[index]
+    first, second = order["pictures"]
+    assert (first["name"], first["view"], first["method"]["operator"]) == ("paper", "composite", "paper")
     assert second == {"name": "d", "view": "delta", "method": None}
     assert order["exr"] is True
     assert str(folder) in str(order["folder"])

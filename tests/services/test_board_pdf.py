@@ -164,7 +164,7 @@ def test_lamp_markers_are_on_pages_of_their_own(tmp_path: Path) -> None:
     with pypdfium2.PdfDocument(tmp_path / "board.pdf") as document:
         assert len(document) == 3
     detector = cv2.aruco.ArucoDetector(spec("aruco_grid").opencv_dictionary())
-    seen = {}
+    seen: dict[int, np.ndarray] = {}
     for number in (1, 2):
         quads, ids, _ = detector.detectMarkers(page(tmp_path / "board.pdf", number))
         seen |= {int(name): quad[0] for quad, name in zip(quads, ids.ravel(), strict=True)}

@@ -30,6 +30,7 @@ from tests.services.test_render_server_sockets import Node
 
 pytestmark = pytest.mark.slow(seconds=20)
 PATIENCE_S = 90.0
+FRAMES_PER_S = 10  # real renderers draw them all
 SERVER = "render server"
 USES_IT = "goes on with the scene that was built ahead"
 COMMAND_LINE = "from deltalight.services.cli import main\nmain()"
@@ -54,7 +55,7 @@ class Station:
         arguments = ("-P", "-c", code, "server", *options, *sockets)
         spec = ChildSpec(SERVER, arguments, warm=PREPARED["server"], rehearsed=True)
         self.supervisor = Supervisor([spec], forward=self.lines.append)
-        self._node = Node(ports.endpoint(node_port))
+        self._node = Node(ports.endpoint(node_port), frames_per_s=FRAMES_PER_S)
         self._receiver = Receiver([ports.endpoint(published)], ["composite"])
         self._client = RequestClient(ports.endpoint(control))
         self._heard = ""
@@ -105,7 +106,9 @@ class Station:
         assert self.ask("set_scene", scene=changed).ok
 
     def shown(self) -> SceneDocument:
-        return parse_scene(self.ask("get_scene").payload["scene"])
+        found = self.ask("get_scene").payload["scene"]
+        assert isinstance(found, dict)
+        return parse_scene(found)
 
 
 def scene(folder: Path) -> SceneDocument:
@@ -141,7 +144,7 @@ def station_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
 def test_a_spare_waits_for_a_frame_of_each_camera_longer_than_a_server_would() -> None:
     one, other, published, control = map(ports.endpoint, ports.private_ports(4))
     settings = ServerSettings(subscribe=(one, other), publish=published, control=control)
-    cameras = RoomCameras(None, pytest.fail, needs_depth=False, endpoints=2)
+    cameras = RoomCameras(None, lambda error: pytest.fail(str(error)), needs_depth=False, endpoints=2)
     nodes = [Node(one, name="left")]
     late = threading.Timer(1.0, lambda: nodes.append(Node(other, name="right")))
     late.start()

@@ -56,8 +56,8 @@ def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Busy]:
     folder = tmp_path_factory.mktemp("busy")
     port, control, stream = ports.private_ports(3)
     (folder / "deltalight.toml").write_text("[api]\nrequests_per_s = 10000\n")
-    words = ("api", "--config", folder / "deltalight.toml", "--data", folder, "--port", port)
-    words += ("--control", ports.endpoint(control), "--subscribe", ports.endpoint(stream))
+    words: list[object] = ["api", "--config", folder / "deltalight.toml", "--data", folder, "--port", port]
+    words += ["--control", ports.endpoint(control), "--subscribe", ports.endpoint(stream)]
     address = f"{ports.LOOPBACK}:{port}"
     with ExitStack() as stack:
         server = stack.enter_context(closing(Recorder(control)))

@@ -71,7 +71,9 @@ def test_camera_writes_rgb_yaml_pictures_and_a_report(shots: Path, tmp_path: Pat
     np.testing.assert_allclose(found.matrix, CAMERA.matrix, rtol=0.01, atol=1.5)
     written = sorted(path.name for path in (tmp_path / "calibration").iterdir())
     assert written == ["rgb.yaml", "rgb_coverage.png", "rgb_residuals.png"]
-    assert cv2.imread(str(tmp_path / "calibration" / "rgb_coverage.png")).shape == (300, 400, 3)
+    coverage = cv2.imread(str(tmp_path / "calibration" / "rgb_coverage.png"))
+    assert coverage is not None
+    assert coverage.shape == (300, 400, 3)
     assert "shot3.png" in done.output
     assert "% of the picture seen" in done.output
 

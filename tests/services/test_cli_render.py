@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -82,7 +83,7 @@ def write_scene(path: Path, **changes: object) -> Path:
     return path
 
 
-def records(out: Path) -> list[dict[str, object]]:
+def records(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
 
 
@@ -103,7 +104,7 @@ def test_writes_pictures_index_and_one_summary_line(cli: RunCli, take: Path, tmp
     lines = records(out)
     assert [line["frame"] for line in lines] == [0, 1, 2]
     assert [line["status"] for line in lines] == ["ok", "ok", "no_pose"]
-    assert np.array(lines[0]["pose"]["world_from_camera"]).shape == (4, 4)  # type: ignore[index]
+    assert np.array(lines[0]["pose"]["world_from_camera"]).shape == (4, 4)
     assert lines[0]["pass_times_ms"]
     assert lines[0]["lights"]
     assert lines[FRAME_WITHOUT_BOARD]["pose"] is None
@@ -172,7 +173,9 @@ def test_size_exr_and_json(cli: RunCli, take: Path, tmp_path: Path) -> None:
 
 def linear_color_of(folder: Path, size: tuple[int, int]) -> np.ndarray:
     """The camera's first picture in linear units at another size."""
-    frame = resized_frame(dl.open(folder)[0], *size)
+    take = dl.open(folder)
+    assert isinstance(take, dl.Take)
+    frame = resized_frame(take[0], *size)
     return linear_color(frame, frame.color)
 
 
@@ -423,7 +426,7 @@ def test_debug_shows_the_traceback(cli_process: RunCli, tmp_path: Path) -> None:
 def test_ctrl_c_is_130_and_leaves_whole_files(take: Path, tmp_path: Path) -> None:
     scene = write_scene(take / "slow.json", method={"name": "dvct", "volume_size": 128})
     out = tmp_path / "out"
-    command = [
+    command: list[str | Path] = [
         sys.executable,
         "-m",
         "deltalight.services.cli",

@@ -12,6 +12,7 @@ import pytest
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.protocol.source import open_source
 from deltalight.services import ports
 from deltalight.services.client import ApiError, Client
@@ -170,7 +171,8 @@ def test_a_scene_is_made_changed_and_deleted(client: Client) -> None:
     scene.set_output(view="delta")
     scene.set_lights(mode="manual", manual=[LIGHT])
     document = scene.document
-    assert (document.method.name, document.output.view, document.lights.mode) == ("dlpv", "delta", "manual")
+    assert isinstance(document.method, DlpvMethod)
+    assert (document.output.view, document.lights.mode) == ("delta", "manual")
     scene.undo()
     assert scene.document.lights != document.lights
     scene.redo()

@@ -56,7 +56,9 @@ def test_each_page_shows_the_camera_that_was_chosen_there(page: Page, api: Camer
         box = page.locator("canvas").first.bounding_box()
         assert box is not None
         page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    assert asked.value.post_data_json["camera"] == "right"
+    body = asked.value.post_data_json
+    assert body is not None
+    assert body["camera"] == "right"
     other = page.context.new_page()
     other.goto(f"http://{api.address}/")
     wait_for_picture(other, "left")

@@ -104,7 +104,7 @@ def test_a_full_disk_refuses_uploads_and_changes_and_goes_on_when_there_is_room(
     served: tuple[httpx.Client, Path],
 ) -> None:
     client, disk = served
-    kept = []
+    kept: list[str] = []
     while (answer := upload(client, f"t{len(kept)}.obj", 1_500_000)).is_success:
         kept.append(answer.json()["asset"])
     assert "No space left" in sentence(answer, 503)

@@ -128,7 +128,7 @@ def test_a_client_receives_every_topic_of_a_recording(recording: Path, tmp_path:
     lamp = {"type": "sphere", "position_m": [0, 1, 2], "intensity": 1}
     scene = parse_scene({"objects": [{"id": "box", "asset": str(asset)}], "lights": {"manual": [lamp]}})
     with ExitStack() as running:
-        answer = {"scene": scene.model_dump(mode="json")}
+        answer: dict[str, object] = {"scene": scene.model_dump(mode="json")}
         control = running.enter_context(closing(ReplyServer("tcp://127.0.0.1:*", lambda _: answer)))
         node = running.enter_context(replaying(recording))
         bridge = running.enter_context(bridging(node, control=control.endpoint))

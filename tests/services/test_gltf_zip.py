@@ -100,7 +100,7 @@ def test_a_gltf_with_its_files_is_kept_as_one_glb(store: Store) -> None:
 
 
 def test_by_rest_it_comes_back_as_glb_and_a_wrong_one_is_a_sentence(tmp_path: Path) -> None:
-    with running_api(tmp_path, probe=probe) as api:
+    with running_api(tmp_path, probe) as api:
 
         def sent(content: bytes) -> httpx.Response:
             return api.client.post("/assets?name=quad.zip", content=content, headers=UPLOAD)

@@ -27,7 +27,7 @@ def imports() -> dict[str, set[str]]:
 
 
 def imported(text: str) -> set[str]:
-    found = set()
+    found: set[str] = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             found.update(each.name for each in node.names)

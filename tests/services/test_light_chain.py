@@ -119,7 +119,9 @@ def test_a_lamp_in_the_bracket_lights_the_composite_from_its_side(tmp_path: Path
     travels = np.array(lamps[0]["direction"], np.float64)
     assert degrees_between(-travels, TURN @ LAMP) < 1  # a pixel of the fish-eye picture is 1.2 degrees
     (light,) = sent.lights
-    assert (-travels).tolist() == np.float32(light.to_light).tolist()  # as the node cut it, to the bit
+    assert (-travels).tolist() == np.array(
+        light.to_light, np.float32
+    ).tolist()  # as the node cut it, to the bit
     assert lamps[0]["angular_radius_deg"] == np.degrees(light.angular_radius_rad)
     assert abs(np.array(lamps[0]["angular_radius_deg"], np.float64) - 3) < 0.5
     assert message.lights[-1]["type"] == "environment"

@@ -217,7 +217,7 @@ def test_rooms_are_the_same_at_all(service: tuple[Service, StandInPlacer]) -> No
     for number in range(PROCESSES):
         one.client.patch(f"/rooms/door/scenes/{scene}", json={"name": f"door {number}"}).raise_for_status()
         orders = placer.servers[placer.of("door").epoch].payloads
-        wait_for(lambda: orders("set_scene")[-1]["scene"]["name"] == f"door {number}")  # type: ignore[index]  # noqa: B023
+        wait_for(lambda: orders("set_scene")[-1]["scene"]["name"] == f"door {number}")  # noqa: B023
     with ExitStack() as open_sockets:
         sockets = one.listeners(open_sockets)
         one.client.post("/rooms/door/drain").raise_for_status()

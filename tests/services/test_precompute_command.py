@@ -73,8 +73,9 @@ def test_a_killed_process_leaves_what_is_done_and_the_next_goes_on(
     scene = str(scene_with(tmp_path, objects=objects, method=method))
     fields = kept.with_name("occlusion-fields")
     command = [sys.executable, "-m", "deltalight.services.cli", "precompute", scene]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(command, cwd=ROOT, text=True, **pipes) as process:
+    with subprocess.Popen(
+        command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
         assert process.stdout is not None
         box = [process.stdout.readline() for _ in range(2)]
         assert "light transfer of" in process.stdout.readline()  # of the ball, whose field comes next

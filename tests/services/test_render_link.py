@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ class Shown:
         return held
 
     def names_sent(self) -> list[object]:
-        return [order["scene"]["name"] for order in self.server.payloads("set_scene")]  # type: ignore[index]
+        return [order["scene"]["name"] for order in self.server.payloads("set_scene")]
 
     def close(self) -> None:
         self.server.gate.set()
@@ -95,7 +96,7 @@ def shown(
 
 def test_the_newest_of_many_changes_is_sent_and_all_are_answered(shown: Shown) -> None:
     held = shown.hold_up()
-    many = [shown.at_once(lambda name=f"change {n}": shown.rename(name)) for n in range(MANY)]
+    many = [shown.at_once(partial(shown.rename, f"change {n}")) for n in range(MANY)]
     wait_for(lambda: sum(each.done() for each in many) == MANY - 1)
     for path in ("/state", "/scenes", f"/scenes/{shown.id}", "/health"):
         assert shown.client.get(path).status_code == 200, "while the renderer is stuck"
@@ -260,6 +261,9 @@ def test_older_changes_are_superseded_in_whatever_order_they_are_told() -> None:
 def test_the_lock_is_held_in_the_order_of_arrival() -> None:
     lock, order = FifoLock(), list[int]()
 
+    def are_waiting(count: int) -> bool:
+        return len(lock._waiting) == count
+
     def take(number: int) -> None:
         with lock:
             order.append(number)
@@ -269,7 +273,7 @@ def test_the_lock_is_held_in_the_order_of_arrival() -> None:
         for number in range(5):
             threads.append(threading.Thread(target=take, args=(number,)))
             threads[-1].start()
-            wait_for(lambda count=number + 1: len(lock._waiting) == count)
+            wait_for(partial(are_waiting, number + 1))
     for thread in threads:
         thread.join()
     assert order == list(range(5))

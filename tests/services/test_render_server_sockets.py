@@ -32,9 +32,8 @@ from deltalight.services import ports
 from deltalight.services.api.streams import ProcessWatch
 from tests.services.api_samples import UPLOAD, running_api
 from tests.services.conftest import camera, color, depth, pose
-from tests.services.render_server_samples import Started
+from tests.services.render_server_samples import InvertingRenderer, Started
 from tests.services.storage_samples import TETRAHEDRON
-from tests.services.test_session import InvertingRenderer
 
 FRAMES_PER_S = 100
 PATIENCE_S = 60.0
@@ -43,8 +42,10 @@ PATIENCE_S = 60.0
 class Node:
     """Publishes numbered frames as `name` until it is closed; `newest` is the last number sent."""
 
-    def __init__(self, endpoint: str, first: int = 0, name: str = "cam") -> None:
-        self.newest, self._name = first, name
+    def __init__(
+        self, endpoint: str, first: int = 0, name: str = "cam", frames_per_s: float = FRAMES_PER_S
+    ) -> None:
+        self.newest, self._name, self._period_s = first, name, 1 / frames_per_s
         self._publisher = Publisher(endpoint)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(first,), daemon=True)
@@ -52,7 +53,7 @@ class Node:
 
     def _run(self, first: int) -> None:
         for number in itertools.count(first):
-            if self._closed.wait(1 / FRAMES_PER_S):
+            if self._closed.wait(self._period_s):
                 return
             self.newest = number
             for message in (color, depth, pose):
@@ -137,6 +138,10 @@ def serving(
         server.close()
 
 
+def behind(frame_id: int) -> Callable[[CompositeMessage], bool]:
+    return lambda message: message.frame_id > frame_id
+
+
 @pytest.mark.parametrize("immediate", [True, False], ids=["software", "gpu"])
 def test_a_rest_change_is_in_the_first_picture_that_is_begun_after_its_answer(
     tmp_path: Path, immediate: bool
@@ -156,7 +161,7 @@ def test_a_rest_change_is_in_the_first_picture_that_is_begun_after_its_answer(
                 assert changed.json()["picture"]["state"] == "shown"
                 shown = server.ask("ping").payload
                 assert renderer.scenes[-1].objects[0].pose.translation_m[2] == height
-                later = server.first(lambda message, begun=begun: message.frame_id > begun)
+                later = server.first(behind(begun))
                 assert (shown["scene_id"], shown["revision"]) == (made["id"], changed.json()["revision"])
                 assert (later.scene_id, later.scene_revision) == (made["id"], changed.json()["revision"])
         node.close()
@@ -216,7 +221,7 @@ def test_a_faulty_node_does_not_end_the_server() -> None:
     with serving() as (server, _, node_port):
         faulty = Publisher(ports.endpoint(node_port))
         wrong = {**camera().to_dict(), "distortion_model": "w" * 5000}
-        while "bad_frames" not in server.ask("stats").payload["stats"]["drops"]:  # type: ignore[index, call-overload, operator]
+        while "bad_frames" not in server.ask("stats").payload["stats"]["drops"]:  # type: ignore[index]
             for number in range(140):
                 faulty.send([f"color.{number:03}{'x' * 110}".encode(), b"no header"])
             for message in (color(1, 1, 0, wrong), depth(1, 1), pose(1, 1)):

@@ -141,9 +141,9 @@ def test_a_new_web_process_follows_an_old_keeper_beside_the_old_one(tmp_path: Pa
     node, directory = ports.endpoint(node_port), ports.endpoint(rooms_port)
     (tmp_path / "rooms.yaml").write_text(ROOMS.format(node=node))
     source = ("node", "--source", take, "--loop", "--publish", node, "--clock", directory, "--name", "desk")
-    up = ("up", "--rooms", tmp_path / "rooms.yaml", "--allow-software", "--no-spares")
     data = ("--data", tmp_path / "data")
-    up += (*data, "--port", old_port, "--rooms-port", rooms_port)
+    up: list[object] = ["up", "--rooms", tmp_path / "rooms.yaml", "--allow-software", "--no-spares"]
+    up += [*data, "--port", old_port, "--rooms-port", rooms_port]
     with ExitStack() as parts:
         for words in (source, up):
             parts.enter_context(running(*words, is_older=True))

@@ -32,10 +32,10 @@ class Station:
             "--clock",
             control,
         )
-        self.server = ("server", "--control", control, "--publish", publish, "--subscribe", node)
-        self.server += ("--allow-software",)
-        self.web = ("api", "--port", page, "--data", folder / "data", "--scene", scene, "--control", control)
-        self.web += ("--subscribe", publish, "--subscribe", node)
+        self.server = ["server", "--control", control, "--publish", publish, "--subscribe", node]
+        self.server += ["--allow-software"]
+        self.web: list[object] = ["api", "--port", page, "--data", folder / "data", "--scene", scene]
+        self.web += ["--control", control, "--subscribe", publish, "--subscribe", node]
         self.client = httpx.Client(base_url=f"http://{ports.LOOPBACK}:{page}/api/v1", timeout=60)
 
     def is_shown(self) -> bool:

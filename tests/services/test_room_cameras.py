@@ -359,7 +359,9 @@ def test_pick_and_snapshot_are_of_the_camera_that_is_asked_for(room: Room, tmp_p
     assert room.ask("snapshot", **order)["frame_id"] == 5
     assert room.ask("snapshot", **order, camera="right")["frame_id"] == 7
     assert room.renderer.rooms[-1] == [("left", 5, False), ("right", 7, True)]
-    assert cv2.imread(str(tmp_path / "a.png"))[0, 0].tolist() == [248] * 3
+    written = cv2.imread(str(tmp_path / "a.png"))
+    assert written is not None
+    assert written[0, 0].tolist() == [248] * 3
     for op, payload in (("pick", {"x": 1, "y": 1}), ("snapshot", order)):
         with pytest.raises(DeltalightError, match=r"No frame|Nothing"):
             room.ask(op, **payload, camera="nobody")

@@ -103,9 +103,15 @@ def live(hall: Installation, camera: str) -> UInt8[np.ndarray, "h w 3"]:
     return decode_rgb(answer.content, camera)
 
 
+def recorded(folder: Path, name: str) -> dl.Take:
+    take = dl.open(folder / f"{name}.mcap")
+    assert isinstance(take, dl.Take)
+    return take
+
+
 def in_process(folder: Path, names: Sequence[str], document: SceneDocument) -> Pictures:
     """What `render_views` makes of the same frames."""
-    takes = [dl.open(folder / f"{name}.mcap") for name in names]
+    takes = [recorded(folder, name) for name in names]
     with dl.Renderer() as renderer:
         for number in range(2):  # the second learns nothing more of frames at rest
             pictures = renderer.render_views([take[number] for take in takes], document)
@@ -153,9 +159,8 @@ def test_each_picture_is_that_of_render_views_also_after_an_object_was_added(
 def test_pick_and_snapshot_are_of_the_camera_that_is_named(hall: Installation, folder: Path) -> None:
     scene = scene_of(hall, folder)
     for name in ("left", "right"):
-        frame = dl.open(folder / f"{name}.mcap")[0]
+        frame = recorded(folder, name)[0]
         assert frame.pose is not None
-        assert frame.camera.distortion is not None
         at = np.array([*scene.objects[0].pose.translation_m, 1.0])
         pixel = frame.camera.matrix @ (np.linalg.inv(frame.pose.world_from_camera) @ at)[:3]
         x, y = (float(value) for value in pixel[:2] / pixel[2])

@@ -217,7 +217,7 @@ def test_set_scene_is_idempotent_by_revision(
 
 def test_revisions_of_one_scene_say_nothing_of_another(session: RenderSession) -> None:
     document = SceneDocument(name="second", revision=9).model_dump(mode="json")
-    shown = []
+    shown: list[object] = []
 
     def show(scene_id: str | None, revision: int | None) -> None:
         session.execute(request("set_scene", revision, scene_id, scene=document))
@@ -290,11 +290,11 @@ def test_views_of_several_senders_are_watched_until_each_is_silent_for_a_minute(
     session.execute(first)
     now_ns += WATCHED_NS
     session.execute(second.model_copy(update={"node": "another"}))
-    assert session.watched == ("delta", "rsm", "volume")
+    assert list(session.watched) == ["delta", "rsm", "volume"]
     now_ns += 1
-    assert session.watched == ("volume", "rsm")
+    assert list(session.watched) == ["volume", "rsm"]
     session.execute(second.model_copy(update={"node": "another", "payload": {"views": []}}))
-    assert session.watched == ()
+    assert list(session.watched) == []
 
 
 def test_set_view_and_get_scene(session: RenderSession) -> None:
@@ -445,9 +445,15 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
     assert renderer.unfinished == []
     with pytest.raises(DeltalightError, match="Nothing has been rendered"):
         session.execute(request("pick", x=1, y=1))
-    for wrong in ({}, {"endpoints": []}, {"endpoints": "tcp://127.0.0.1:1"}, {"endpoints": ["a"] * 17}):
+    wrong_sources: tuple[dict[str, object], ...] = (
+        {},
+        {"endpoints": []},
+        {"endpoints": "tcp://127.0.0.1:1"},
+        {"endpoints": ["a"] * 17},
+    )
+    for wrong in wrong_sources:
         with pytest.raises(DeltalightError, match="the command set_source"):
-            session.execute(request("set_source", **wrong))
+            session.execute(request("set_source", None, None, **wrong))
     for _ in range(2):  # the same again changes nothing
         assert session.execute(request("set_source", endpoints=["x"]))
     assert used == [None, ("x",), ("x",)]

@@ -95,7 +95,7 @@ def test_the_figure_walks(tmp_path: Path) -> None:
 
 
 def test_an_object_is_taken_from_the_shelf(tmp_path: Path) -> None:
-    with running_api(tmp_path, probe=probe) as api:
+    with running_api(tmp_path, probe) as api:
         shelf = api.client.get("/shelf").json()
         assert [each["name"] for each in shelf] == list(SHELF)
         assert [each["clip"] for each in shelf] == [each.clip for each in SHELF.values()]

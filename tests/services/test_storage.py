@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from sqlalchemy import create_engine
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_method import DvctMethod, NoneMethod
 from deltalight.services.storage.asset_kinds import AssetKind, Facts
 from deltalight.services.storage.documents import (
     add_object,
@@ -92,7 +93,8 @@ def test_stale_and_wrong_changes_leave_the_scene_alone(store: Store) -> None:
 @given(steps=st.lists(st.sampled_from(["change", "undo", "redo"]), max_size=25))
 def test_undo_and_redo_walk_as_a_list_of_states_does(store: Store, steps: list[str]) -> None:
     scene_id = store.scenes.create({"name": "0"}).head.id
-    past, future = ["0"], []
+    past = ["0"]
+    future: list[str] = []
     for revision, step in enumerate(steps, start=2):
         if step == "change":
             past.append(str(revision))
@@ -298,9 +300,10 @@ def test_objects_are_edited_by_id(store: Store) -> None:
 def test_another_method_begins_with_its_defaults(store: Store) -> None:
     scene_id = store.scenes.create({"method": {"name": "dvct", "bounces": 3}}).head.id
     kept = store.scenes.change(scene_id, patch_document({"method": {"cone_count": 8}}), "x")
+    assert isinstance(kept.document.method, DvctMethod)
     assert (kept.document.method.bounces, kept.document.method.cone_count) == (3, 8)
     other = store.scenes.change(scene_id, patch_part("method", {"name": "none"}), "x")
-    assert other.document.method.name == "none"
+    assert isinstance(other.document.method, NoneMethod)
 
 
 def test_a_patch_to_another_kind_of_material_replaces_it() -> None:
@@ -375,6 +378,8 @@ def test_a_store_of_the_version_before_is_opened_and_goes_on(tmp_path: Path) -> 
                 store.scenes.change(active.head.id, patch_document({"name": name}), "", None, "drag")
             assert store.scenes.undo(active.head.id).document.name == "new"
     with Store(tmp_path) as store:
+        active = store.scenes.active()
+        assert active is not None
         assert store.scenes.undo(active.head.id).document.name == "old"
 
 
@@ -393,6 +398,8 @@ def test_a_store_that_knew_no_tickets_keeps_all_it_has(tmp_path: Path) -> None:
             assert token is not None
             assert token.name == "wall"
     with Store(tmp_path) as store:
+        active = store.scenes.active()
+        assert active is not None
         assert store.scenes.redo(active.head.id).document.name == "third"
         store.tickets.add("secret", Ticket("view", None, ""), 30.0)
         assert store.tickets.take("secret") == Ticket("view", None, "")

@@ -1,6 +1,7 @@
 """Small pictures of assets: drawn once, with the asset's own colours, the right way up."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -103,7 +104,8 @@ def test_gltf_is_y_up_and_textured(tmp_path: Path) -> None:
 @pytest.mark.parametrize("how", ["plain", "transform", "second set", "mirrored"])
 def test_textures_lie_where_the_file_says(tmp_path: Path, key: str, how: str) -> None:
     """Red on the left and green on the right; half a texture farther, turned round, or mirrored: the other way."""
-    plate, info, sampler = Plate(1.0, 1.0), {}, None
+    plate, sampler = Plate(1.0, 1.0), None
+    info: dict[str, Any] = {}
     if how == "transform":
         info = {"extensions": {"KHR_texture_transform": {"offset": [0.5, 0.0]}}}
     elif how == "second set":

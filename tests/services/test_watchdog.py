@@ -134,8 +134,9 @@ def test_a_stopped_process_is_killed_and_started_again() -> None:
     with Supervisor([spec], forward=lines.append) as supervisor:
         first = psutil.Process(supervisor.process_ids()["render server"])
         deadline_s = time.monotonic() + 60
-        child = supervisor._children[0]
-        supervisor.run(until=lambda: child.watch._heartbeat.reported_s is not None)  # type: ignore[union-attr]
+        before = supervisor._children[0].watch
+        assert isinstance(before, Watchdog)
+        supervisor.run(until=lambda: before._heartbeat.reported_s is not None)
         first.send_signal(signal.SIGSTOP)
         supervisor.run(
             until=lambda: supervisor.restarts()["render server"] == 1 or time.monotonic() > deadline_s
@@ -144,7 +145,7 @@ def test_a_stopped_process_is_killed_and_started_again() -> None:
         assert not first.is_running()
         again = supervisor._children[0].watch
         assert again is not None
-        assert again is not child
+        assert again is not before
         assert again.fault() is None
     assert "render server: gave no sign of life for 2 s; killing it." in lines
 

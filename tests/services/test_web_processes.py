@@ -1,5 +1,6 @@
 """Several web processes of one database: each change is everybody's, once; and a database that goes, and returns."""
 
+import gc
 import json
 import subprocess
 import sys
@@ -147,7 +148,7 @@ def test_a_web_process_tells_of_another_one_with_jobs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, jobs: bool
 ) -> None:
     monkeypatch.setattr(serve, "http_server", lambda _app: SimpleNamespace(run=lambda **_: None))
-    monkeypatch.setattr(serve.gc, "freeze", lambda: None)
+    monkeypatch.setattr(gc, "freeze", lambda: None)
     page, control = ports.private_ports(2)
     settings = ApiSettings(data=tmp_path, port=page, control=ports.endpoint(control), subscribe=(), jobs=jobs)
     with other_with_jobs(tmp_path), capture_logs() as told:

@@ -115,9 +115,13 @@ def test_after_a_while_without_work_it_ends_and_loses_no_request(
             socket.send_fds(ours, [request], [ours.fileno()])
         return [], [], []
 
+    def fork() -> int:
+        forked.append(True)
+        return os.getpid()
+
     monkeypatch.setattr(select, "select", wait)
     monkeypatch.setattr(asset_worker, "_prepare", lambda *_words: None)
-    monkeypatch.setattr(os, "fork", lambda: forked.append(True) or os.getpid())
+    monkeypatch.setattr(os, "fork", fork)
     with ours, theirs:
         asset_worker._fork_workers(theirs)
         assert forked == [True] * is_asked

@@ -6,6 +6,7 @@
 #include "common/surfaces.glsl"
 #include "common/upsample.glsl"
 #include "common/work_list.glsl"
+#include "common/albedo_range.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba8ui) writeonly uniform uimage2D code_out;
@@ -44,8 +45,6 @@ uniform bool relights_real;      // method `none` shows objects and keeps the re
 #pragma switch bool specular_surfaces
 uniform bool whole;              // compose every pixel, not only those near a change
 uniform bool store_linear;       // for views and files; the picture itself needs only codes
-
-const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
 // `gained`: what objects bring into a smooth surface by rays; `hidden`: fraction of what it reflected that they hide.
 // `distant`: relative change of light beyond the objects' volumes.

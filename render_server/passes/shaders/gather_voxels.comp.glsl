@@ -19,6 +19,7 @@
 #endif
 #define GROUP_LIGHT_ACCESS
 #include "common/surfel_groups.glsl"
+#include "common/albedo_range.glsl"
 
 layout(local_size_x = 64) in;
 uniform bool only_unseen;    // groups with surfels that the camera does not see
@@ -41,7 +42,6 @@ const int THREADS = 64;   // = local_size_x
 #else
 layout(std430) buffer TailSums { int tail_sums[]; };
 #endif
-const float WHITEST = 0.95;   // as in light_voxels
 const int SAMPLED = 2;   // groups along each side of a cell
 
 // Groups on a lattice across their main axis stand for all: what is summed is smooth.
@@ -56,7 +56,7 @@ bool is_sampled(uint slot) {
 float take_albedo(int slot) {
     int at = slot * GROUP_SUMS, radiance = group_sums[at + GROUP_RADIANCE], irradiance = group_sums[at + GROUP_IRRADIANCE];
     group_sums[at + GROUP_RADIANCE] = group_sums[at + GROUP_IRRADIANCE] = 0;
-    return min(PI * float(radiance) / float(max(irradiance, 1)), WHITEST);
+    return min(PI * float(radiance) / float(max(irradiance, 1)), ALBEDO_RANGE.y);
 }
 
 // `next`: what one more bounce adds to a group's irradiance; `returned`: which fraction comes back to surfaces.

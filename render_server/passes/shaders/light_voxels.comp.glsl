@@ -21,6 +21,7 @@
 #include "common/surfel_light.glsl"
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
+#include "common/albedo_range.glsl"
 #ifdef VIRTUAL
 #pragma switch TRANSMISSION
 #endif
@@ -42,7 +43,6 @@ uniform float bias_real;      // m
 uniform float bias_object;   // m
 uniform bool keep_light;      // in SurfelLights, for later sums
 uniform bool has_caustics;    // beams carry the lights' reflections in smooth virtual surfaces
-const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no surface reflects more than it receives
 #if defined(REAL_MU) || defined(REAL_RHO)
 #define SOLUTION
 #endif
@@ -182,12 +182,12 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     irradiances(s, n, own, mu, rho);
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb, sqrt(s.position_area.w));
     vec3 diffuse = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness);
-    vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(WHITEST));
+    vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(ALBEDO_RANGE.y));
     bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
     vec3 carried = in_beams ? (albedo - min(diffuse, albedo)) * surfel_light(own, DIRECT_RHO).rgb : vec3(0.0);
 #ifdef EXTENDED
     float below = mean_below(m.over);   // beams carry the base's lobe alone
-    albedo = min(mean_coated_reflectance(m, albedo), vec3(WHITEST));
+    albedo = min(mean_coated_reflectance(m, albedo), vec3(ALBEDO_RANGE.y));
     carried *= below;
     m.emission *= below;
 #endif
@@ -214,7 +214,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 // gained light is reflected by at most the greatest albedo.
 vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
     vec3 change = rho - mu;
-    return change * mix(back, min(back, vec3(WHITEST / PI)), greaterThan(change, vec3(0.0)));
+    return change * mix(back, min(back, vec3(ALBEDO_RANGE.y / PI)), greaterThan(change, vec3(0.0)));
 }
 #endif
 

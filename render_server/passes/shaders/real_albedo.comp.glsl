@@ -5,6 +5,7 @@
 #include "common/volume.glsl"
 #include "common/real_radiance.glsl"
 #include "common/map_texels.glsl"
+#include "common/albedo_range.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D albedo_out;
@@ -13,8 +14,6 @@ uniform sampler2D real_rsm_normal;
 uniform int view_index;
 uniform int filled_volume;
 uniform float bias_real;   // m
-
-const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
 // Irradiance of a light that nothing blocks.
 vec3 unblocked(Light light, vec3 p, vec3 n) {

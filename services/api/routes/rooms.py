@@ -85,7 +85,7 @@ class MoveOrder(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    slot: str | None = Field(None, max_length=64, description="A free slot; null = any.")
+    slot: str | None = Field(default=None, max_length=64, description="A free slot; null = any.")
 
 
 async def _rooms(connection: HTTPConnection) -> Rooms:

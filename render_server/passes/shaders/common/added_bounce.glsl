@@ -2,6 +2,7 @@
 // TAIL: and the bounces beyond it (docs/method.md 5.6), to the sums as well. Each sends about the same share of the light of the one
 // before, so all of them add share / (1 - share) times the last one.
 // CLEARS: the sums before it, which have served, for the next bounce. Needs light_cells.glsl.
+#include "common/albedo_range.glsl"
 #ifdef TAIL
 layout(std430) buffer Injected { int injected[]; };
 layout(std430) readonly buffer Parts { vec2 parts[]; };   // SHARE_PARTS of them (lpv_bounce_share.comp.glsl)
@@ -17,10 +18,9 @@ layout(std430) readonly buffer Before { int before[]; };
 #endif
 
 const int SHARE_PARTS = 64;
-const float GREATEST_SHARE = 0.95;   // the brightest albedo, as in surfel_albedo.glsl
 
-// `amounts`: the sum of all parts.
-float share_of(vec2 amounts) { return min(amounts.y / max(amounts.x, 1.0), GREATEST_SHARE); }
+// At most what the brightest surface sends back. `amounts`: the sum of all parts.
+float share_of(vec2 amounts) { return min(amounts.y / max(amounts.x, 1.0), ALBEDO_RANGE.y); }
 
 int added(int at, float share) {
     int sum = injected[at];

@@ -1,7 +1,6 @@
 // Albedo of surfels: of real ones (REAL), of the objects', or of BOTH. Needs voxel_store.glsl, environment.glsl.
 #include "common/brdf.glsl"
-
-const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
+#include "common/albedo_range.glsl"
 
 #ifdef REAL
 #include "common/lights.glsl"

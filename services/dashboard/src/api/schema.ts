@@ -2314,7 +2314,7 @@ export interface components {
             readonly count: number;
             /**
              * Distance M
-             * @description Distance of the lights from the fish-eye camera, metres; `far` = distant like the sun; `auto` = from the falloff of light over the board's paper, else from shading and shadows; far if neither tells.
+             * @description Distance of the lights from the fish-eye camera, metres; `far` = distant like the sun; `auto` = from the falloff of light over the board's paper and from shading and shadows, which may tell each lamp's own; far if neither tells.
              * @default auto
              */
             readonly distance_m: ("auto" | "far") | number;
