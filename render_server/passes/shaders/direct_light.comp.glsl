@@ -46,7 +46,8 @@ void light(ivec2 pixel, ivec2 size) {
     bool known = kept.a > 0.0 && !shadow_may_reach(position.xyz, normal.xyz, bias);
     if (reached) {
 #ifndef SPARED
-        vec3 v = normalize(camera_position - position.xyz), on_real = on_kept_surface(position.xyz, normal.xyz);
+        vec3 v = normalize(camera_position - position.xyz);
+        vec3 on_real = on_kept_surface(position.xyz, normal.xyz, bias);
         int i = 0;
         if (!known && light_count > 0) do {
             vec3 l; float radius;

@@ -21,8 +21,8 @@ void main() {
     if (s.present) {
         vec4 e = texelFetch(natural, texel, 0);
         vec3 ambient = max(e.rgb / e.a, vec3(0.0)), away = s.position - camera_position;
-        vec3 on_real = on_kept_surface(s.position, s.normal);
         float bias = 3.0 * noise_sigma * dot(away, away);
+        vec3 on_real = on_kept_surface(s.position, s.normal, bias);
         before += ambient;
         after += ambient * texelFetch(unoccluded, texel, 0).rgb;
         for (int i = 0; i < light_count; ++i) {
