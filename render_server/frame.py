@@ -308,7 +308,7 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
         measurement = graph.source("measurement", "world", of_each_view=True)
         measured = graph.stage("measured surface", buffers.measure, measurement, real, declared, surfaces)
     surface = graph.stage("object surface", buffers.draw_objects, objects, observation, camera)
-    geometry = graph.value("geometry", _geometry_bindings, observation, surface, objects)
+    geometry = graph.value("geometry", _geometry_bindings, observation, surface, objects, measured)
     return FrameResources(
         image,
         view,
@@ -357,9 +357,9 @@ class JointMeasurement:
 
 
 def _geometry_bindings(
-    seen: Observation, surface: ObjectSurface, objects: GeometryState
+    seen: Observation, surface: ObjectSurface, objects: GeometryState, measured: Observation
 ) -> dict[str, Binding]:
-    """Returns the shader bindings of both geometry buffers."""
+    """Returns the shader bindings of both geometry buffers, and of the real surface that a kept world shows."""
     return {
         **seen.bindings,
         **surface.buffer.bindings,
@@ -367,4 +367,8 @@ def _geometry_bindings(
         "object_coverage": surface.coverage.texture,
         "edge_correction": surface.coverage.edge_correction,
         "interior_edges": surface.coverage.interior_edges,
+        "KEEPS_WORLD": measured is not seen and measured.scan.depth is not None,
+        "kept_position": measured.surface.position,
+        "kept_normal": measured.surface.normal,
+        "kept_camera_from_world": measured.view.camera_from_world,
     }

@@ -3,6 +3,7 @@
 // theirs falls.
 #include "common/lit_pixels.glsl"
 #include "common/light_reach.glsl"
+#include "common/kept_surface.glsl"
 #include "common/brdf.glsl"
 #include "common/surfaces.glsl"
 #include "common/caustics.glsl"
@@ -21,17 +22,17 @@ layout(rgba16f) writeonly uniform image2D lobe_rho;
 #if defined(TRANSMISSION) && defined(RAY_SHADOWS)
 #include "common/ray_shadows.glsl"
 
-vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) {
-    vec2 seen = visibility(light, p, n, bias, bias);
+vec2 light_visibility(Light light, vec3 p, vec3 on_real, vec3 n, float bias) {
+    vec2 seen = visibility(light, p, on_real, n, bias, bias);
     if (seen.y > 0.0 && seen.y < seen.x && !is_rectangle(light) && !is_image(light)) seen.y = seen.x * unblocked_fraction(light, p);
     return seen;
 }
 #elif defined(SHADOW_CONES)
-vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }
+vec2 light_visibility(Light light, vec3 p, vec3 on_real, vec3 n, float bias) { return cone_visibility(light, p, on_real, n, bias); }
 #elif defined(REAL_SHADOWS)
-vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return real_visibilities(light, p, n, bias); }
+vec2 light_visibility(Light light, vec3 p, vec3 on_real, vec3 n, float bias) { return real_visibilities(light, on_real, n, bias); }
 #else
-vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return visibility(light, p, n, bias, bias); }
+vec2 light_visibility(Light light, vec3 p, vec3 on_real, vec3 n, float bias) { return visibility(light, p, on_real, n, bias, bias); }
 #endif
 
 void light(ivec2 pixel, ivec2 size) {
@@ -46,13 +47,14 @@ void light(ivec2 pixel, ivec2 size) {
     if (reached) {
 #ifndef SPARED
         vec3 v = normalize(camera_position - position.xyz);
+        vec3 on_real = on_kept_surface(position.xyz, normal.xyz, bias);
         int i = 0;
         if (!known && light_count > 0) do {
             vec3 l; float radius;
             vec3 e_perp = light_at(listed_light(i), position.xyz, normal.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
             if (cosine <= 0.0) continue;
-            vec2 seen = light_visibility(listed_light(i), position.xyz, normal.xyz, bias);
+            vec2 seen = light_visibility(listed_light(i), position.xyz, on_real, normal.xyz, bias);
             e_mu += e_perp * cosine * seen.x;
             vec3 arrives = arriving(listed_light(i), position.xyz, seen, beam_alpha);
             e_rho += e_perp * cosine * arrives;

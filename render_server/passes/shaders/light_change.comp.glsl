@@ -2,6 +2,7 @@
 // together: E_rho / E_mu, before the objects' own reflected light.
 #include "common/lights.glsl"
 #include "common/low_res_grid.glsl"
+#include "common/kept_surface.glsl"
 
 #include "common/pixel_group.glsl"
 layout(rgba16f) writeonly uniform image2D changes;
@@ -21,6 +22,7 @@ void main() {
         vec4 e = texelFetch(natural, texel, 0);
         vec3 ambient = max(e.rgb / e.a, vec3(0.0)), away = s.position - camera_position;
         float bias = 3.0 * noise_sigma * dot(away, away);
+        vec3 on_real = on_kept_surface(s.position, s.normal, bias);
         before += ambient;
         after += ambient * texelFetch(unoccluded, texel, 0).rgb;
         for (int i = 0; i < light_count; ++i) {
@@ -28,7 +30,7 @@ void main() {
             vec3 e_perp = light_at(listed_light(i), s.position, s.normal, l, radius);
             float cosine = dot(s.normal, l);
             if (cosine <= 0.0) continue;
-            vec2 seen = visibility(listed_light(i), s.position, s.normal, bias, bias);
+            vec2 seen = visibility(listed_light(i), s.position, on_real, s.normal, bias, bias);
             before += e_perp * cosine * seen.x;
             after += e_perp * cosine * seen.y;
         }

@@ -70,10 +70,14 @@ vec2 real_visibilities(Light light, vec3 p, vec3 n, float bias) {
 float real_visibility(Light light, vec3 p, vec3 n, float bias) { return real_visibilities(light, p, n, bias).x; }
 
 // (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (docs/method.md
-// 3). `bias_real`, `bias_object` (m) move the receiver towards the light.
-vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_object) {
-    Occluder real = occluder(real_rsm_depth, light, light.views.x, light.views.y, p, n, bias_real);
+// 3). `bias_real`, `bias_object` (m) move the receiver towards the light; `on_real`: p where the real scene's maps show it.
+vec2 visibility(Light light, vec3 p, vec3 on_real, vec3 n, float bias_real, float bias_object) {
+    Occluder real = occluder(real_rsm_depth, light, light.views.x, light.views.y, on_real, n, bias_real);
     int views = object_may_block(light, p, bias_object, false) ? light.views.w : 0;
     Occluder object = occluder(object_rsm_depth, light, light.views.z, views, p, n, bias_object);
     return shining_fraction(light, p) * visible_fraction(light, real, object, p, n);
+}
+
+vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_object) {
+    return visibility(light, p, p, n, bias_real, bias_object);
 }

@@ -1,5 +1,5 @@
 // What the last frame saw of a surface that this frame sees. Needs geometry.glsl.
-#include "common/lens.glsl"
+#include "common/earlier_picture.glsl"
 uniform sampler2D last_position;        // world m; w: depth, 0 unknown
 uniform mat4 last_camera_from_world;
 #pragma switch bool has_history
@@ -13,18 +13,7 @@ const float LEAST_WEIGHT = 0.25;
 const int TURN_TILE = 8;                // texels
 const uint STALE_REAL = 1u, STALE_OBJECT = 2u;   // of a texel: where light must be computed
 
-// Position in the last picture (pixel centres at .5), far outside it for what was behind the camera.
-vec2 last_pixel(vec3 p) {
-    vec3 c = (last_camera_from_world * vec4(p, 1.0)).xyz;
-    if (c.z <= 0.0) return vec2(-1e4);
-    vec2 pixel = camera_pinhole.xy * c.xy / c.z + camera_pinhole.zw + 0.5;
-    ivec2 last = textureSize(picture_rays, 0) - 1;
-    for (int i = 0; i < (lens_bends ? 2 : 0); ++i) {
-        ivec2 at = clamp(ivec2(pixel), ivec2(0), last);
-        pixel = vec2(at) + 0.5 + camera_pinhole.xy * (c.xy / c.z - texelFetch(picture_rays, at, 0).xy);
-    }
-    return pixel;
-}
+vec2 last_pixel(vec3 p) { return earlier_pixel(last_camera_from_world, p); }
 
 float bilinear(vec2 at, int j) {
     vec2 f = fract(at);

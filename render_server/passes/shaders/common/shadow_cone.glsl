@@ -73,9 +73,9 @@ bool object_meets_cone_of_sphere(vec3 p, float radius) {
     return meets;
 }
 
-// (V_mu, V_rho)
-vec2 cone_visibility(Light light, vec3 p, vec3 n, float bias) {
-    vec2 seen = real_visibilities(light, p, n, bias);
+// (V_mu, V_rho); `on_real` as for visibility.
+vec2 cone_visibility(Light light, vec3 p, vec3 on_real, vec3 n, float bias) {
+    vec2 seen = real_visibilities(light, on_real, n, bias);
     for (int chosen = 0; chosen < volume_count; ++chosen) {
         work_in_volume(chosen);
         ShadowCone cone = shadow_cone(light, p, n);
