@@ -1,20 +1,27 @@
 """Transparent objects of many triangles: no loop that traces their rays may be cut off (gpu/list_groups.py)."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Bool, Float64
 
+from deltalight.protocol.quality import QualityTier
+from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.methods import surface_shading
+from deltalight.render_server.passes.reflections import TransmittedLight
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
     Stage,
     array_of,
     ball,
+    checkered,
     fields_of,
     floor,
     frame,
@@ -67,3 +74,45 @@ def test_every_pixel_of_glass_and_of_its_shadow_is_computed(renderer: SceneRende
     without, with_glass = array_of(light.mu)[shadow][:, 0], array_of(light.rho)[shadow][:, 0]
     assert (without > 0).all()
     assert np.mean(with_glass < 0.9 * without) > 0.5
+
+
+def bumpy_ball() -> trimesh.Trimesh:
+    """Bumps of a few pixels, each of many triangles: neighbouring rays leave it in all directions."""
+    mesh = ball(0.12, (0.0, 0.0, 0.0), 5)
+    directions = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    bumps = np.sin(30 * directions).prod(axis=1, keepdims=True)
+    place = (0.12 + 0.004 * bumps) * directions + (0.0, 0.0, 0.15)
+    return trimesh.Trimesh(place, mesh.faces, process=False)
+
+
+class ManyRays(TransmittedLight):
+    """As many rays a pixel as a workgroup has threads: nearly converged."""
+
+    def __init__(self, gpu: GpuContext, grid: Any, march: Any, tier: QualityTier) -> None:  # noqa: ANN401
+        super().__init__(gpu, grid, march, replace(tier, reflection_cones=cast("Any", 64)))
+
+
+def shown_through(gpu: GpuContext, document: SceneDocument) -> Float64[np.ndarray, "h w 3"]:
+    """What the glass shows, as a sensor would clip it."""
+    renderer = SceneRenderer(gpu, document)
+    renderer.render(frame(checkered()))
+    assert renderer.graph is not None
+    radiance = array_of(renderer.graph["transmitted light"])
+    renderer.release()
+    return np.where(radiance[..., 3:] > 0, radiance[..., :3].clip(0, 1), np.nan)
+
+
+def test_few_rays_through_dense_glass_come_near_to_many(
+    gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lamp that rays meet by chance does not glitter: each ray stands for the cone that its surfaces spread."""
+    stage = Stage(tmp_path, COARSE)
+    lamp = sphere_light((-0.5, 0.9, 0.9), intensity=1.0, radius=0.03)
+    document = stage.document([glass(stage, bumpy_ball())], [lamp], floor())
+    few = shown_through(gpu, document)
+    monkeypatch.setattr(surface_shading, "TransmittedLight", ManyRays)
+    off = few - shown_through(gpu, document)
+    off = off[np.isfinite(off)]
+    print(f"off by {np.sqrt(np.mean(off**2)):.4f} r.m.s. on {len(off) // 3} pixels")
+    assert len(off) > 2000
+    assert np.sqrt(np.mean(off**2)) < 0.05

@@ -9,6 +9,7 @@
 #include "common/ray_mesh.glsl"
 const int MOST_PENDING = 4;        // paths that are still to be traced
 const float LEAST_WEIGHT = 0.004;  // of a path that goes on: a step of 8-bit codes
+#define FOOTPRINTS
 #include "common/refracted_paths.glsl"
 #include "common/shown_pixels.glsl"
 #include "common/walk.glsl"
@@ -17,13 +18,12 @@ layout(local_size_x = 64) in;
 layout(rgba16f) readonly uniform image2D reflected_radiance;   // of the objects
 layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform float pixel_size;      // m at 1 m depth
-shared vec4 first_normals[64]; // of the transparent surface that each ray meets first; w: 1 if there is one
-shared vec3 of_ray[64];        // radiance along its paths
+shared vec4 of_ray[64];        // radiance along its paths; 1 if it meets a transparent surface first
 #include "common/camera.glsl"
 
 const float NOWHERE = 1e30;        // distance of what a ray does not meet
 const int MOST_SURFACES = 24;      // that the paths of one ray may meet
-const float NARROWEST = 1e-3;      // rad: half-angle of the smallest lamp
+const float NARROWEST = 1e-3;      // rad: half-angle of the smallest lamp; least diameter of a cone at distance 1, where rays run to a focus
 
 // Fraction of a cone around d that a disc of half-angle `radius` around l fills. Both are even discs, which overlap by a smooth step from
 // where one covers the other to where they part, of the same sum. Chords measure: on a sphere, a disc's area is PI times its chord's square.
@@ -49,10 +49,17 @@ vec3 lamps_along(vec3 from, vec3 d, float spread) {
     return sum;
 }
 
-// What a path sees that leaves the transparent objects: the picture where it `shows` the hit there, and what lies beyond; `object`:
-// distance of the next surface of any object.
-vec3 outside(vec3 from, vec3 d, float spread, float object, ScreenHit hit, bool shows) {
-    vec4 seen = shows ? shown_at(hit, spread) : vec4(0.0);
+// Diameter at distance 1 of a cone, `wide` or as wide as rays at a focus, that is blurred too.
+float spread_of(float wide, float blurred) { return max(length(vec2(wide, blurred)), NARROWEST); }
+
+// What a path sees that leaves the transparent objects: the picture where it `shows` the hit there, and what lies beyond; `object`: distance
+// of the next surface of any object.
+vec3 outside(Path path, float blurred, float object, ScreenHit hit, bool shows) {
+    vec3 from = path.from, d = path.direction;
+    Footprint f = path.footprint;
+    float spread = spread_of(width_of(f.turn), blurred);
+    // As far as the hit: a footprint has a width where the path starts, too.
+    vec4 seen = shows ? shown_at(hit, spread_of(width_at(f, hit.distance) / max(hit.distance, 1e-6), blurred)) : vec4(0.0);
     if (seen.a >= 1.0) return seen.rgb;
     float open = 1.0;
 #ifdef VOXELS
@@ -60,17 +67,16 @@ vec3 outside(vec3 from, vec3 d, float spread, float object, ScreenHit hit, bool 
 #else
     vec3 beyond = environment(d, atan(0.5 * spread));
 #endif
-    if (object >= NOWHERE && open > 0.0) beyond += open * lamps_along(from, d, spread);
+    // Lamps are so small and bright that rays through dense curves glitter where a footprint's narrow axis misses them.
+    if (object >= NOWHERE && open > 0.0) beyond += open * lamps_along(from, d, spread_of(longer_width_of(f.turn), blurred));
     return seen.rgb + (1.0 - seen.a) * beyond;
 }
 
-// Radiance along all paths of a ray that meets a transparent surface first.
-vec3 trace_paths(Ray ray, MeshHit hit, float spread) {
+// Radiance along all paths of a ray that meets a transparent surface first; `blurred`: diameter at distance 1 by which its roughness widens
+// them.
+vec3 trace_paths(Path path, MeshHit object, float blurred) {
     vec3 sum = vec3(0.0);
     pending_count = 0;
-    Path path = Path(ray.from, ray.direction, vec3(1.0), -1);
-    MeshHit object = hit;
-    float before = 0.0;   // m, of the way to the ray's start
     int met = 0;
     do {   // one turn for the first surface, too, because drivers compile each call of a long function anew
         bool is_first = met == 0;
@@ -78,20 +84,23 @@ vec3 trace_paths(Ray ray, MeshHit hit, float spread) {
         bool is_last = stops || met == MOST_SURFACES, shown = false;
         ScreenHit real;
         if (!is_first && (is_last || path.medium < 0)) {
-            real = screen_hit(path.from, path.direction, spread);
+            real = screen_hit(path.from, path.direction, spread_of(width_of(path.footprint.turn), blurred));
             shown = real.fraction > 0.0 && real.distance < object.distance;
         }
         if (is_last || shown) {
             float inside_m = object.triangle < 0 ? 0.0 : object.distance;
             sum += path.weight * kept_over(path.medium, inside_m)
-                * outside(path.from, path.direction, spread, object.distance, real, shown);
+                * outside(path, blurred, object.distance, real, shown);
         } else {
             path.weight *= kept_over(path.medium, object.distance);
+            float size = width_at(path.footprint, object.distance);
+            Interface i = interface_at(object, Ray(path.from, path.direction), size);
+            path.footprint = footprint_at(path.footprint, path.direction, i.face, object.distance);
+            i.turn = turn_of_normal(i, object, path.footprint.place);
             // What the first surface reflects is left out: it is the object's own reflection already.
-            split_path(interface_at(object, Ray(path.from, path.direction), pixel_size * (before + object.distance)), path, is_first);
+            split_path(i, path, is_first);
         }
         if (pending_count == 0) break;
-        before = hit.distance;
         path = pending[--pending_count];
         object = closest_hit(Ray(path.from, path.direction));
     } while (++met <= MOST_SURFACES);
@@ -105,12 +114,10 @@ Ray camera_ray(ivec2 pixel, vec2 within) {
 
 vec2 place_within(int j) { return fract(float(j) * vec2(0.7548776662, 0.5698402910) + 0.5) - 0.5; }
 
-// Diameter at distance 1 of what a ray stands for: each of two rough surfaces turns it by n - 1 of the turn of its microfacets, and so
-// do both curved ones from ray to ray, `turned` apart.
-float spread_behind(Interface first, float turned) {
+// Diameter at distance 1 by which roughness widens a ray: each of two surfaces turns it by n - 1 of the turn of its microfacets.
+float blur_behind(Interface first) {
     float bent = max(materials[first.material].medium.w, 1.0) - 1.0;
-    float alpha = first.surface.roughness * first.surface.roughness;
-    return bent * length(vec2(sqrt(2.0) * MEDIAN_DISC * alpha, 2.0 * turned)) + pixel_size;
+    return bent * sqrt(2.0) * MEDIAN_DISC * first.surface.roughness * first.surface.roughness;
 }
 
 // The first surface that a ray meets, if it is transparent.
@@ -124,23 +131,17 @@ bool shows_transparent(ivec2 pixel) {
     return is_transparent(int(texelFetch(virtual_raster_normal, raster_texel(pixel), 0).w));
 }
 
-// Greatest difference of the normals that this ray and the others of its pixel, from invocation `first` on, meet.
-float turn_between(uint inside, uint first) {
-    float turned = 0.0;
-    for (uint k = first; k < first + uint(RAY_COUNT); ++k)
-        if (first_normals[k].w > 0.0) turned = max(turned, distance(first_normals[inside].xyz, first_normals[k].xyz));
-    return turned;
+vec3 mean_of_rays(uint first) {
+    vec4 sum = vec4(0.0);
+    for (uint k = first; k < first + uint(RAY_COUNT); ++k) sum += of_ray[k];
+    return sum.rgb / max(sum.a, 1.0);
 }
 
-vec3 mean_of_rays(uint first) {
-    vec3 sum = vec3(0.0);
-    float count = 0.0;
-    for (uint k = first; k < first + uint(RAY_COUNT); ++k) {
-        if (first_normals[k].w == 0.0) continue;
-        sum += of_ray[k];
-        count += 1.0;
-    }
-    return sum / max(count, 1.0);
+// The differences of rays that divide a pixel among them.
+Footprint footprint_of_ray(vec3 d) {
+    mat3 world = transpose(mat3(camera_from_world));
+    mat2x3 axes = mat2x3(world[0], world[1]);
+    return Footprint(mat2x3(0.0), pixel_size * inversesqrt(float(RAY_COUNT)) * (axes - outerProduct(d, d * axes)));
 }
 
 void main() {
@@ -152,11 +153,11 @@ void main() {
     Ray ray = camera_ray(pixel, place_within(int(j)));
     MeshHit hit = MeshHit(NOWHERE, -1, vec2(0.0));
     if (listed && shows_transparent(pixel)) hit = first_hit(ray);
-    bool enters = hit.triangle >= 0;
-    first_normals[inside] = enters ? vec4(interface_at(hit, ray, 0.0).normal, 1.0) : vec4(0.0);
-    memoryBarrierShared();
-    barrier();
-    if (enters) of_ray[inside] = trace_paths(ray, hit, spread_behind(interface_at(hit, ray, 0.0), turn_between(inside, first)));
+    of_ray[inside] = vec4(0.0);
+    if (hit.triangle >= 0) {
+        Path path = Path(ray.from, ray.direction, vec3(1.0), -1, footprint_of_ray(ray.direction));
+        of_ray[inside] = vec4(trace_paths(path, hit, blur_behind(interface_at(hit, ray, 0.0))), 1.0);
+    }
     memoryBarrierShared();
     barrier();
     if (j != 0u || !listed) return;

@@ -4,7 +4,12 @@
 #endif
 
 // A surface that a ray meets: normals against the ray, of the mesh as it is smoothed and of the triangle itself.
-struct Interface { vec3 position; vec3 normal; vec3 face; int material; Material surface; };
+struct Interface {
+    vec3 position; vec3 normal; vec3 face; int material; Material surface;
+#ifdef FOOTPRINTS
+    mat2x3 turn;   // of the normal, over the ray's footprint
+#endif
+};
 
 const float SKIN = 2e-5;         // of the coordinates: distance of a ray's start from the surface that it leaves
 const float THINNEST = 1e-6;     // m: the same, at least
@@ -23,7 +28,13 @@ Interface interface_at(MeshHit hit, Ray ray, float size) {
     int index = int(vertices[rows.x * VERTEX_FLOATS + 11]);
     vec2 uv = vertex_vector(rows, 6, weights).xy;
     Material surface = material_of(index, uv, vertex_vector(rows, 8, weights), size);
-    return Interface(ray.from + hit.distance * ray.direction, normal, face, index, surface);
+    Interface i;
+    i.position = ray.from + hit.distance * ray.direction;
+    i.normal = normal;
+    i.face = face;
+    i.material = index;
+    i.surface = surface;
+    return i;
 }
 
 // Where a ray in direction d starts from the surface.
