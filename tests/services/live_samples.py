@@ -14,6 +14,7 @@ from typing import Any, get_args
 import httpx
 import numpy as np
 import pytest
+from websockets import Origin
 from websockets.sync.client import ClientConnection, connect
 
 from deltalight.protocol.codecs import encode_color
@@ -165,18 +166,34 @@ def wait_for_frames(address: str, patience_s: float = PATIENCE_S) -> None:
 
 
 def live_socket(
-    address: str, query: str = "", additional_headers: Mapping[str, str] | None = None
+    address: str,
+    query: str = "",
+    *,
+    origin: Origin | None = None,
+    additional_headers: Mapping[str, str] | None = None,
 ) -> ClientConnection:
     return connect(
         f"ws://{address}/api/v1/live{query}",
         compression=None,
         open_timeout=PATIENCE_S,
+        origin=origin,
         additional_headers=additional_headers,
     )
 
 
-def event_socket(address: str, query: str = "") -> ClientConnection:
-    return connect(f"ws://{address}/api/v1/events{query}", open_timeout=PATIENCE_S)
+def event_socket(
+    address: str,
+    query: str = "",
+    *,
+    origin: Origin | None = None,
+    additional_headers: Mapping[str, str] | None = None,
+) -> ClientConnection:
+    return connect(
+        f"ws://{address}/api/v1/events{query}",
+        open_timeout=PATIENCE_S,
+        origin=origin,
+        additional_headers=additional_headers,
+    )
 
 
 def read_frame(socket: ClientConnection, timeout_s: float = PATIENCE_S) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -301,8 +301,9 @@ def test_health_tells_of_the_stream(live: LiveApi) -> None:
 
 
 @pytest.mark.parametrize("open_socket", [live_socket, event_socket])
-def test_pages_of_other_sites_open_no_socket(live: LiveApi, open_socket: object) -> None:
-    assert callable(open_socket)
+def test_pages_of_other_sites_open_no_socket(
+    live: LiveApi, open_socket: Callable[..., ClientConnection]
+) -> None:
     for options in (
         {"origin": websockets.Origin("http://evil.example")},
         {"origin": websockets.Origin("null")},
