@@ -17,7 +17,7 @@ from deltalight.render_server.scene.albedo import MIN_PIXELS, known_albedo, uncl
 
 MOST_POINTS = 1000  # of the paper: noise of more is far less than what they have in common
 FINE_STEPS = 8  # between the neighbours of the best of CANDIDATES: paper tells more than shading
-PATCHES = 16  # per edge of the map of all other light: patches of 13 degrees
+MOST_PATCHES = 16  # per edge of the map of all other light: patches of 13 degrees
 # Near lights are accepted if they explain this fraction of all smooth differences (a plane over the paper) from far
 # lights: shadows do not vary like near lamps by chance.
 MIN_EXPLAINED = 0.75
@@ -102,9 +102,10 @@ def _predicted(paper: PaperLight, sky: SkyLights, inverse: float) -> Float64[np.
 def _patches(sky: SkyLights) -> tuple[Float64[np.ndarray, "t 3"], Float64[np.ndarray, "t 3"]]:
     """Returns the directions of patches of all other light, and radiance times solid angle of what is there."""
     size = len(sky.residual)
+    edge = min(MOST_PATCHES, size)
     flux = sky.residual * texel_solid_angles(size)[..., None].astype(np.float64)
-    flux = flux.reshape(PATCHES, size // PATCHES, PATCHES, size // PATCHES, 3).sum(axis=(1, 3))
-    return octahedral_grid(PATCHES).reshape(-1, 3), flux.reshape(-1, 3)
+    flux = flux.reshape(edge, size // edge, edge, size // edge, 3).sum(axis=(1, 3))
+    return octahedral_grid(edge).reshape(-1, 3), flux.reshape(-1, 3)
 
 
 def _plane(paper: PaperLight, errors: Float64[np.ndarray, " k"], spread: float) -> Float64[np.ndarray, " k"]:

@@ -55,6 +55,15 @@ def test_walls_as_far_as_the_lamp_do_not_make_it_seem_nearer(distance_m: float) 
     assert 1 / common_inverse([cue]) == pytest.approx(distance_m, rel=0.06)
 
 
+@pytest.mark.parametrize("size", [4, 8])
+def test_maps_of_a_few_texels_tell_the_distance_roughly(size: int) -> None:
+    whole = sky()
+    texels = whole.residual.reshape(size, SIZE // size, size, SIZE // size, 3).mean(axis=(1, 3))
+    cue = paper_cue(paper(1.0), replace(whole, residual=texels))
+    assert cue is not None
+    assert 1 / common_inverse([cue]) == pytest.approx(1.0, rel=0.15)
+
+
 def test_the_standard_error_of_the_paper_grows_with_its_noise() -> None:
     little, much = (paper_cue(paper(1.0, noise), sky()) for noise in (0.01, 0.05))
     assert little is not None

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypedDict, Unpack, get_args
 
 import httpx
 import numpy as np
@@ -165,35 +165,18 @@ def wait_for_frames(address: str, patience_s: float = PATIENCE_S) -> None:
     pytest.fail("no frame ever came")
 
 
-def live_socket(
-    address: str,
-    query: str = "",
-    *,
-    origin: Origin | None = None,
-    additional_headers: Mapping[str, str] | None = None,
-) -> ClientConnection:
-    return connect(
-        f"ws://{address}/api/v1/live{query}",
-        compression=None,
-        open_timeout=PATIENCE_S,
-        origin=origin,
-        additional_headers=additional_headers,
-    )
+class SocketOptions(TypedDict, total=False):
+    origin: Origin
+    additional_headers: Mapping[str, str]
 
 
-def event_socket(
-    address: str,
-    query: str = "",
-    *,
-    origin: Origin | None = None,
-    additional_headers: Mapping[str, str] | None = None,
-) -> ClientConnection:
-    return connect(
-        f"ws://{address}/api/v1/events{query}",
-        open_timeout=PATIENCE_S,
-        origin=origin,
-        additional_headers=additional_headers,
-    )
+def live_socket(address: str, query: str = "", **options: Unpack[SocketOptions]) -> ClientConnection:
+    url = f"ws://{address}/api/v1/live{query}"
+    return connect(url, compression=None, open_timeout=PATIENCE_S, **options)
+
+
+def event_socket(address: str, query: str = "", **options: Unpack[SocketOptions]) -> ClientConnection:
+    return connect(f"ws://{address}/api/v1/events{query}", open_timeout=PATIENCE_S, **options)
 
 
 def read_frame(socket: ClientConnection, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
